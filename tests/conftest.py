@@ -30,14 +30,14 @@ def transitions() -> pa.Table:
 
 @pytest.fixture(scope="session")
 def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store of the same three recordings."""
+    """Return a store of the same three recordings."""
     path = tmp_path_factory.mktemp("replay") / "store"
     return write_store(path, [recording_transitions(index) for index in (1, 2, 3)])
 
 
 @pytest.fixture
 def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What off-policy evaluation fits does not matter to the verbs: two updates will do."""
+    """Fit off-policy evaluation by two updates, which is enough for tests of verbs."""
     from support.kept_run import QUICK
 
     from restock.train import loop
@@ -59,7 +59,7 @@ def summaries_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def s3_process() -> Iterator[str]:
-    """The address of a server, which takes seconds to start."""
+    """Yield the address of a server, which takes seconds to start."""
     pytest.importorskip("boto3")
     pytest.importorskip("moto")
     with s3.s3_server() as address:
@@ -68,7 +68,7 @@ def s3_process() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def s3_server(s3_process: str) -> Iterator[str]:
-    """A server with one bucket, that the environment names: its address."""
+    """Yield a server with one bucket, that the environment names: its address."""
     import boto3
 
     with pytest.MonkeyPatch.context() as patch:

@@ -194,7 +194,7 @@ def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(sample_rows, monkey
 
 @pytest.fixture
 def sample_rows(tmp_path):
-    """A store, and a query of 100 rows with a list of 30 and a text of two lines."""
+    """Return a store, and a query of 100 rows with a list of 30 and a text of two lines."""
     from support.driven_robot import Drive, write_bag
 
     bag, store = write_bag(Drive(), tmp_path / "bag"), tmp_path / "store"

@@ -1,5 +1,4 @@
-"""What `--help` prints: prose as wide as the boxes below it, no empty lines in them, and colours
-on a terminal only, where they are wanted."""
+"""`--help` prints prose as wide as its boxes, without empty lines, coloured on terminals only."""
 
 from __future__ import annotations
 

@@ -808,7 +808,7 @@ def test_a_young_run_without_evaluation_still_has_a_page(tmp_path: Path) -> None
 
 
 def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> str:
-    """The page of the run as if it had driven on other floors, its evaluation on `ended_on`."""
+    """Return the page of the run as if it had driven on other floors and ended on `ended_on`."""
     shutil.copytree(run, path)
     document = json.loads((path / "config.json").read_text())
     document["config"]["env"] = {"layouts": layouts}

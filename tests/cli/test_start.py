@@ -1,5 +1,4 @@
-"""`restock start`: a stranger's bag, stage by stage; what is done is not done again; it stops where
-a person must decide."""
+"""`restock start` takes a stranger's bag stage by stage, and stops where a person must decide."""
 
 from __future__ import annotations
 

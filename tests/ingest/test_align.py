@@ -149,7 +149,7 @@ def test_the_offset_between_clocks_does_not_matter(offset_ns):
 
 
 def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str, Any]:
-    """A drive's typed topics with other log times: `log_time_ns(time, place in the topic)`."""
+    """Return a drive's typed topics with log times `log_time_ns(time, place in the topic)`."""
     found = {}
     for name, (kind, topic) in typed_topics(drive).items():
         times = enumerate(topic.log_time_ns.tolist())

@@ -236,8 +236,10 @@ def test_an_image_type_with_other_fields_is_refused(
 
 
 def test_frames_go_and_stay_with_their_recording(bag: Path, tmp_path: Path) -> None:
-    """A second ingest replaces them; labelling again keeps them; the old file outlives its rows by
-    the retention window."""
+    """Check that ingesting again replaces frames and that labelling again keeps them.
+
+    The old file outlives its rows by the retention window.
+    """
     store = tmp_path / "store"
     written(bag, store)
     (first,) = (store / "frames").rglob("*.parquet")

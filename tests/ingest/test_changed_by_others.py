@@ -171,7 +171,7 @@ def test_rows_that_another_tool_changed_are_read_replaced_and_joined(store, way)
 
 
 def same_as_rows(store: Path) -> None:
-    """Views that may come from summaries say what DuckDB finds in the table's active files."""
+    """Check that views from summaries agree with the table's active files."""
     files = DeltaTable(str(store / TRANSITIONS)).file_uris()
     rows, rewards, zones = duckdb.sql(
         "SELECT count(*), sum(reward), list(DISTINCT zone ORDER BY zone)"

@@ -165,7 +165,7 @@ max_age_s = 0.4
 
 
 def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
-    """The same drive, the multiplexer's output republished at 20 Hz by a smoother, as /cmd_vel.
+    """Return the same drive with the multiplexer's output smoothed to 20 Hz, as /cmd_vel.
 
     `limit` is what a collision monitor leaves of it between 9 and 10 s.
     """

@@ -251,7 +251,7 @@ def test_a_killed_process_leaves_whole_groups_and_the_same_again_goes_on(tmp_pat
 
 
 def on_a_full_disk(monkeypatch, name: str) -> None:
-    """Commits to one of the tables fail as Delta's library says it of a full disk."""
+    """Let commits to one of the tables fail as Delta's library does on a full disk."""
     transact = StoreWriter.transact
 
     def full(self, table, actions, *rest):

@@ -80,7 +80,7 @@ COMMON = (
 
 
 def same_as_scanned(path: Path | str) -> None:
-    """The common views say what the views that scan the rows say, on the same store."""
+    """Check that the common views agree with views that scan the rows."""
     with Store(path) as store:
         scanned = duckdb.connect()
         rows = store.sql("FROM stored_transitions").to_arrow_table()
@@ -101,7 +101,7 @@ def same_as_scanned(path: Path | str) -> None:
 
 
 def rounded(relation: duckdb.DuckDBPyRelation) -> list[tuple[object, ...]]:
-    """Sums in another order differ in their last digits."""
+    """Round values, as sums in another order differ in their last digits."""
     return [
         tuple(round(value, 6) if isinstance(value, float) else value for value in row)
         for row in relation.fetchall()

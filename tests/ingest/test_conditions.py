@@ -27,7 +27,7 @@ SHIPPED = list(shipped().values())
 
 
 def steps(count: int, episodes: list[int] | None = None, **signals: object) -> pa.Table:
-    """Steps of a robot that drives at .5 m/s with nothing near, but for these signals."""
+    """Return steps of a robot that drives at .5 m/s with nothing near, but for these signals."""
     usual = {
         "stamp_ns": np.arange(count) * 200_000_000,
         "pose_stamp_ns": np.arange(count) * 200_000_000,
@@ -86,7 +86,7 @@ def test_a_bump_makes_the_step_before_it_a_near_collision():
 
 
 def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray, aside_m: float = 0.0) -> pa.Table:
-    """Steps of a robot that sees something this far ahead of its middle, and who came nearer."""
+    """Return steps of a robot that sees something this far ahead, and what came nearer."""
     seen = np.where(ahead < 2.2, ahead, 4.0)
     driven = np.concatenate([[0.0], drive["wheel_speed_mps"][:-1] * 0.2])
     came = np.concatenate([[0.0], ahead[:-1] - ahead[1:]]) - driven

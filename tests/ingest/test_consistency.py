@@ -112,8 +112,7 @@ def two_publishers(topics: Topics) -> Topics:
 
 
 def two_frames(topics: Topics) -> Topics:
-    """The same, with every third message of the odometry in the frame of another publisher, who
-    agrees with the first one by now."""
+    """Return the same drive with every third odometry message in another publisher's frame."""
     one, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
     frames = np.where(third, "map", "odom").astype(object)
     return {**topics, "/odom": replace(one, fields={**one.fields, "header.frame_id": frames})}
@@ -137,7 +136,7 @@ def written(topics: Topics, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
-    """That of the clean drive."""
+    """Return the profile of the clean drive."""
     bag = written(winding(), tmp_path_factory.mktemp("clean") / "bag")
     with open_recording(bag) as recording:
         return parse_profile(propose_profile(recording, "r", hindsight_goals=True).toml, where="t")

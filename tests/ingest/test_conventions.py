@@ -33,7 +33,7 @@ def covariance(count: int, unknown: Any) -> np.ndarray:
 
 
 def drive(**unknown: Any) -> Topics:
-    """A drive whose wheels turn, and whose IMU says of some messages that it measured nothing."""
+    """Return a drive whose wheels turn, and whose IMU sometimes reports no measurement."""
     topics = typed_topics(Drive(SECONDS))
     fast = np.arange(0, SECONDS, 0.02)
     said = {f"{key}_covariance": covariance(len(fast), rows) for key, rows in unknown.items()}

@@ -45,7 +45,7 @@ HALF_WAY, FURTHER = "lead(pose_x_m) OVER episode > 2.55", "pose_x_m > 2.8"
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of one episode, in a store by a profile with a condition of its own, `soon`."""
+    """Return a recording of one episode in a store, with a condition of its own, `soon`."""
     folder = tmp_path_factory.mktemp("corrections")
     profile(folder, HALF_WAY)
     write_bag(Drive(goals=[(0.0, 11.0, 1.0)]), folder / "a")

@@ -138,8 +138,7 @@ def test_the_usual_names_alone_tell_of_no_kind():
 
 
 def test_the_largest_recordings_of_one_kind_are_read(tmp_path: Path):
-    """Of 12 large drives and a small one of another robot, the small one was not looked at, and
-    its rows were mixed with the others'."""
+    """Check that a small drive of another robot is not mixed with 12 large ones."""
     mine = traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR)
     other = replace(mine, lidar=replace(LIDAR, beams=720))
     reported = [*(mine for _ in range(14)), other, replace(mine, command="")]

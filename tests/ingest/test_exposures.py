@@ -40,7 +40,7 @@ sql = "pose_x_m > 2"
 
 
 def steps(count: int, **signals: object) -> pa.Table:
-    """Steps of one episode of a robot that drives at .5 m/s with nothing near, but for these."""
+    """Return steps of one episode at .5 m/s with nothing near, but for these signals."""
     usual = {"wheel_speed_mps": np.full(count, 0.5), "localised_speed_mps": np.full(count, 0.5),
              "clearance_m": np.full(count, 2.0), "clearance_ahead_m": np.full(count, 2.0),
              "plan_return_m": np.full(count, 4.0)} | signals  # fmt: skip
@@ -190,7 +190,7 @@ def test_a_store_from_before_exposures_opens_and_says_null(store, profile, capsy
 
 
 def _before_exposures(store: Path, out: Path) -> Path:
-    """The same store as it was written before exposures and the signals that they are told by."""
+    """Return the same store as it was written before there were exposures."""
     signals = {"came_nearer_m", "plan_return_m", "plan_gap_m"}
     gone = signals | {"exposures", "true_exposure", "exposures_json"}
 

@@ -73,7 +73,7 @@ def drive(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def recorded(folder: Path, *, heading: bool = False, seconds: float = 20.0) -> Path:
-    """A bag of commands and fixes; of the fixes from 8 s to 9 s none is one, and one is poor."""
+    """Return a bag of commands and fixes: those from 8 s to 9 s are invalid, and one is poor."""
     time_s = np.arange(0, seconds, RATE_S)
     x, y, yaw = drive(time_s)
     latitude, longitude = degrees(x, y)

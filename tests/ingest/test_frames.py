@@ -67,8 +67,11 @@ def at(*seconds: float) -> list[np.ndarray]:
 
 
 def test_a_chain_by_hand():
-    """The map's odom is at (10, 0) turned a quarter left, the robot at (2, 1) in odom, and the
-    body .5 m ahead of it: 2 forward in odom is 2 up in the map, 1 left is 1 back."""
+    """Check a chain of frames worked out by hand.
+
+    The map's odom is at (10, 0) turned a quarter left, the robot at (2, 1) in odom, and the body .5
+    m ahead of it: 2 forward in odom is 2 up in the map, 1 left is 1 back.
+    """
     tree = tree_of(
         Frames(base="body"),
         [(0.0, "map", "odom", 10, 0, 0, np.pi / 2), (0.0, "odom", "base_link", 2, 1, 0, 0.0)],

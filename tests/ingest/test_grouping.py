@@ -36,7 +36,7 @@ PROVENANCE = Provenance("0123456789abcdef", "feedc0de", "logs/run.mcap", "1.2.3"
 
 
 def cut_by(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
-    """Groups of `size` bytes, batches of `rows` messages put together."""
+    """Cut groups at `size` bytes and batches at `rows` messages."""
     patch.setattr(mcap_file, "GROUP_BYTES", size)
     patch.setattr(sqlite_file, "BYTES_PER_BATCH", size)
     patch.setattr(reading, "SMALL_ROWS", rows)

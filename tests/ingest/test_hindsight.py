@@ -60,7 +60,7 @@ class Waiting(Unguided):
 
 
 def proposed(drive: Drive, folder: Path, capsys, *flags: str) -> tuple[Path, Path, dict]:
-    """A bag of the drive, the profile that is proposed for it, and what the proposal said."""
+    """Return a bag of the drive, its proposed profile, and what the proposal printed."""
     bag, file = folder / "bag", folder / "robot.toml"
     if not bag.exists():
         write_bag(drive, bag)

@@ -468,8 +468,10 @@ def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:
 def test_definitions_are_parsed_up_to_a_sum(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Thirty definitions of 40 kB that differ, against a tenth of the limit: the parser takes a
-    second for a MB."""
+    """Check thirty definitions of 40 kB that differ, against a tenth of the limit.
+
+    The parser takes a second for a MB.
+    """
     monkeypatch.setattr(recording, "MAX_DEFINED_BYTES", recording.MAX_DEFINED_BYTES // 10)
     path = tmp_path / "run.mcap"
     with path.open("wb") as file:

@@ -1,5 +1,4 @@
-"""Memory goes with what a profile keeps of a recording, not with the recording's bytes, and what it
-keeps lies in memory once."""
+"""Memory grows with what a profile keeps of a recording, not with the recording's bytes."""
 
 from __future__ import annotations
 
@@ -131,7 +130,7 @@ def test_memory_does_not_grow_with_the_bytes_of_a_recording(kind: str, tmp_path:
 
 
 def most_memory(work: Callable[[], Any]) -> int:
-    """The bytes that some work takes at its peak beside what was there, as NumPy counts them."""
+    """Return the peak bytes that some work adds, as NumPy counts them."""
     work()  # what is kept for the next time is not of the work
     tracemalloc.start()
     try:

@@ -70,7 +70,7 @@ class BlindDrive(Drive):
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recordings: `seeing` with a scan, `blind` without."""
+    """Return recordings: `seeing` with a scan, `blind` without."""
     folder = tmp_path_factory.mktemp("drives")
     write_bag(Drive(), folder / "seeing")
     write_bag(BlindDrive(duration_s=9.0), folder / "blind")

@@ -1,7 +1,4 @@
-"""The ROS 2 node on a stub of rclpy (`support.ros_graph`): it drives the twin to its goal, stops
-for what it cannot rely on, keeps silent in shadow and while a person drives, and what it publishes
-ingests.
-"""
+"""The ROS 2 node on a stub of rclpy: it drives to its goal and stops for what is unreliable."""
 
 from __future__ import annotations
 
@@ -46,7 +43,7 @@ def started(policy: Path, *, drive: bool = True, **parameters: Any) -> tuple[Gra
 
 
 def driven(robot: TwinRobot, each: Callable[[int], None] | None = None, steps: int = 240) -> int:
-    """Steps until the episode ended; `each` is called before each decision."""
+    """Return steps until the episode ended; `each` is called before each decision."""
     for step in range(steps):
         robot.sense()
         if each is not None:

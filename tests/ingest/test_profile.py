@@ -163,7 +163,7 @@ def test_a_proposal_is_not_read_from_the_command_itself():
 
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory):
-    """A bag of a robot with a navigation stack."""
+    """Return a bag of a robot with a navigation stack."""
     from support.driven_robot import Drive, write_bag
 
     return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")

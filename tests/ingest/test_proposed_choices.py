@@ -100,7 +100,7 @@ def test_a_hold_is_read_from_how_long_the_robot_drives_on(tmp_path, capsys):
 
 
 def driven(until_s: float, reported: list[tuple[float, float]]) -> CommandHold:
-    """What is read of commands (time, speed) to a robot that goes .5 m/s until then, and stands."""
+    """Return what is read of commands (time, speed) to a robot that goes .5 m/s, then stands."""
     at = np.arange(0, 30, 0.05)
     x = 0.5 * np.minimum(at, until_s)
     poses = PoseSeries((at * NS).astype(np.int64), x, np.zeros(len(at)), np.zeros(len(at)))

@@ -49,7 +49,7 @@ def taken_over(kind: str = BOOL) -> Topics:
 
 
 def in_shadow() -> Topics:
-    """The node proposes twice as often as the planner drives, and its limiter holds it back."""
+    """Return a drive in which the node proposes and its limiter holds it back."""
     at_s = np.arange(0, 12, 0.1)
     half = np.full(len(at_s), 0.2)
     slow = {"linear.x": half, "angular.z": 0 * half}

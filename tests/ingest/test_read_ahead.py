@@ -54,7 +54,7 @@ def inflating() -> list[str]:
 
 
 def spoilt(path: Path, every: int) -> Path:
-    """Some of its chunks damaged."""
+    """Return the file with some of its chunks damaged."""
     file = McapFile(path)
     chunks = list(file._contents.chunks)
     file.close()

@@ -55,7 +55,7 @@ def called(recording_id: str, path: str) -> tuple[pa.Table, pa.Table]:
 
 
 def aged(place: Path) -> None:
-    """The store's files as if they had been written long ago; Delta's log as it is."""
+    """Age the store's files as if written long ago; Delta's log stays."""
     for file in place.rglob("*.parquet"):
         os.utime(file, (0, 0))
 

@@ -27,7 +27,7 @@ WARM_UP_S = 1.0
 
 
 def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None):
-    """The same messages, received while a simulation ran at `pace` of log time; stamps stay.
+    """Return the same messages, received while a simulation ran at `pace` of log time.
 
     `pause`: at so many seconds of stamped time the simulation stands for so many of log time.
     """

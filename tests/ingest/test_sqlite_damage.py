@@ -1,5 +1,4 @@
-"""Damaged `.db3` files: refused, and with `--salvage` every whole page is read;
-never fewer messages than there are without a word, never one that was not recorded."""
+"""Damaged `.db3` files are refused, and with `--salvage` every whole page is read."""
 
 from __future__ import annotations
 

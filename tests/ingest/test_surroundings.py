@@ -51,7 +51,7 @@ def signals(step: int, clearance: Any, forward_m: float, turn_rad: float) -> dic
 def between(
     discs: list[Disc], then: list[Disc], forward_m: float = 0.0, turn: float = 0.0
 ) -> float:
-    """What came nearer while the robot drove an arc and things moved from `discs` to `then`."""
+    """Return what came nearer while the robot drove an arc and things moved to `then`."""
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
     before = signals(0, scan((0.0, 0.0, 0.0), discs), forward_m, turn)
     now = signals(1, scan(pose, then), forward_m, turn)

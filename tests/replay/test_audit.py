@@ -255,7 +255,7 @@ def far_operator(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def worn_wheel(table: pa.Table, recordings: pa.Table) -> Tables:
-    """The second recording is of a week later, and its wheels report more than was driven."""
+    """Return a store whose second recording, a week later, has wheels that report too much."""
     later = rows_where(table, "recording_id", f"{2:016x}")
     stamp = table["stamp_ns"].to_numpy() + later * 7 * 86_400 * 10**9
     table = replaced(replaced(table, "stamp_ns", stamp), "pose_stamp_ns", stamp)
@@ -270,7 +270,7 @@ def worn_wheel(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def picky_operator(table: pa.Table, recordings: pa.Table) -> Tables:
-    """The operator drives only nominal episodes; in nominal ones all arrive, in others half."""
+    """Return a store whose operator drives only nominal episodes, in which all arrive."""
     episode = np.array(table["episode_id"].to_pylist())
     names = np.unique(episode)
     number = np.searchsorted(names, episode)
@@ -297,7 +297,7 @@ def mostly_easy_operator(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def haste_pays(table: pa.Table, recordings: pa.Table) -> Tables:
-    """The operator always arrives; the planner bumps in half of its episodes, and earns more."""
+    """Return a store whose planner bumps in half of its episodes and still earns more."""
     episode = np.array(table["episode_id"].to_pylist())
     number = np.array([int(name.split("/")[1]) for name in episode])
     last = np.append(episode[1:] != episode[:-1], True)

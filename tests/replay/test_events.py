@@ -125,8 +125,11 @@ def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path: Path) -> No
 
 @dataclass(frozen=True)
 class Case:
-    """One episode: a letter a step, `s` slips, `b` blocked, `x` both, `.` nominal; and its events
-    as condition, first and last step, outcome and when it was recovered from."""
+    """An episode, a letter a step, and its events.
+
+    `s` slips, `b` is blocked, `x` both, `.` nominal. An event is a condition, its first and last
+    step, its outcome, and when it was recovered from.
+    """
 
     labels: str
     events: list[tuple[str, int, int, str, float | None]]

@@ -1,5 +1,4 @@
-"""Which rows a mixture takes: safety, versions, caps an episode, labels, several stores; and its
-schema."""
+"""Which rows a mixture takes, by safety, version, caps, labels and store; and its schema."""
 
 from __future__ import annotations
 
@@ -181,7 +180,7 @@ by = "none"
 
 @pytest.fixture
 def two_stores(tmp_path: Path, store_path: Path) -> Path:
-    """A folder with `other`: recordings 3 (which the first store has too), 7 and, later, 8."""
+    """Return a folder with the store `other` of recordings 3 (also in the first), 7 and later 8."""
     tables = [recording_transitions(index) for index in (3, 7, 8)]
     write_store(tmp_path / "other", tables)
     (tmp_path / "m.toml").write_text(OTHERS + EVERY)

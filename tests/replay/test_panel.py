@@ -432,8 +432,7 @@ share = "equal"
 
 
 def test_packing_gives_the_bytes_of_its_version(transitions: pa.Table, tmp_path: Path) -> None:
-    """Whoever changes what is packed raises PACKING_VERSION, and then the values here. `robot` and
-    `site` are beside it: panels from before they were kept are read as if they were null."""
+    """Check the packed bytes: whoever changes them raises PACKING_VERSION and these values."""
     panel = build_panel(
         transitions, parse_mixture(GOLDEN), tmp_path / "p", task=TASK, conditions=CONDITIONS
     )

@@ -37,8 +37,10 @@ def monday(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def reviewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[DoubtfulEvent]]:
-    """Two synthetic recordings, and all that is doubtful in them. `recovery` has a probability, the
-    other conditions have none."""
+    """Return two synthetic recordings, and all that is doubtful in them.
+
+    `recovery` has a probability, the other conditions have none.
+    """
     path = tmp_path_factory.mktemp("small") / "store"
     for recording in (1, 2):
         StoreWriter(path).write(*one(recording))
@@ -64,7 +66,7 @@ def true_steps(
 
 
 def is_wrong(event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]]]) -> bool:
-    """A labelled event is right with a true step within .4 s, an unlabelled one without any."""
+    """Return whether a label is wrong: no true step within .4 s, or an unlabelled one with any."""
     return bool(true_steps(event, truth, 2 if event.labelled else 0)) != event.labelled
 
 

@@ -33,7 +33,7 @@ STEP = -0.02
 
 
 def earlier(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
-    """A mission as it was paid: -3 a step pressed (two of them), and it goes on to the goal."""
+    """Return a mission as it was paid before: -3 for each of two pressed steps."""
     rewards = [way / steps + STEP] * steps
     if bumps:
         rewards[steps // 2] -= 3.0
@@ -53,7 +53,7 @@ def shipped(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
 
 
 def hasty_and_careful(pay: Callable[..., tuple[list[float], str]], count: int) -> list[Episode]:
-    """The planner touches nothing; an agent is quicker by a third, and bumps in a quarter."""
+    """Return a store with a careful planner, and a quicker agent that bumps in a quarter."""
     rng = np.random.default_rng(0)
     ways = rng.uniform(6, 10, count).tolist()
     careful: list[Episode] = [("planner", *pay(way, round(way * 9), False)) for way in ways]

@@ -18,7 +18,10 @@ BY = [("recording_id", "ascending"), *((key, "ascending") for key in KEYS)]
 
 
 def rows_of(recordings: int, episodes: int, steps: int) -> pa.Table:
-    """Recordings whose ids do not lie in the order of their names; one zone in three is null."""
+    """Return recordings whose ids do not lie in the order of their names.
+
+    One zone in three is null.
+    """
     rng = np.random.default_rng(recordings * 100 + steps)
     count = recordings * episodes * steps
     recording = np.repeat(np.arange(recordings), episodes * steps)

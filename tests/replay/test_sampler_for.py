@@ -207,7 +207,7 @@ def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(
 
 
 def _check_within(panel: Panel, name: str, batches: list[Drawn], counted: np.ndarray) -> None:
-    """A stratum's rows are drawn by its rule."""
+    """Check that a stratum's rows are drawn by its rule."""
     for stratum, members in zip(panel.strata, panel.stratum_rows(), strict=True):
         spread = np.ptp(counted[members])
         if stratum.within == "without_replacement":

@@ -1,5 +1,4 @@
-"""What every sampler does: exact quotas met over time, rows as the rule says, and the same draws
-after a restart."""
+"""Every sampler meets exact quotas over time and draws the same after a restart."""
 
 from __future__ import annotations
 

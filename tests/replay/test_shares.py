@@ -1,5 +1,4 @@
-"""Shares: they sum to one, floors and caps hold, rows bear no more than they can, rows are one
-stratum's; schedules."""
+"""Shares sum to one, hold floors and caps, and ask of rows no more than they bear."""
 
 from __future__ import annotations
 

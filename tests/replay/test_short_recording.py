@@ -103,7 +103,7 @@ def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, gap_
 
 
 def table_of(*lengths: int) -> pa.Table:
-    """Steps of episodes that are so long."""
+    """Return steps of episodes of these lengths."""
     step = np.concatenate([np.arange(length) for length in lengths])
     names = [f"e{number}" for number, length in enumerate(lengths) for _ in range(length)]
     columns = {"step_index": step, "stamp_ns": step * 200_000_000, "admitted": step >= 0}

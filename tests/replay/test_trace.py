@@ -63,7 +63,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Places:
 
 
 def write_run(path: Path, panel: Panel) -> None:
-    """What a run writes of one audited batch: three logged rows and a fresh one."""
+    """Write what a run keeps of one audited batch: three logged rows and a fresh one."""
     path.mkdir()
     fed = {"path": str(panel.path), "id": panel.id}
     (path / "config.json").write_text(json.dumps({"panel": fed, "seeds": {"run": 5}}))

@@ -85,7 +85,7 @@ def test_a_cut_return_sums_what_there_is_and_bootstraps_at_its_last_step(
 
 
 def check(panel: Panel, row: np.ndarray, horizon: int, span: list[dict[str, Any]]) -> None:
-    """A packed row against the raw steps that its return spans."""
+    """Check a packed row against the raw steps that its return spans."""
     part = {name: row[place] for name, place in panel.columns.items()}
     assert horizon == len(span)
     total = sum(GAMMA**k * step["reward"] for k, step in enumerate(span))

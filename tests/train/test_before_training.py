@@ -212,8 +212,10 @@ def test_actions_changed_after_ingest_are_no_fault_of_the_profile(
 def test_a_fault_of_one_robot_is_named_with_its_recording(
     kind: str, tagged: bool, part: str, logs: FedRows, twin: FedRows
 ) -> None:
-    """Of all rows together a third is wrong, by less than what is allowed. A robot that logs a
-    recording a mission is known by its tag; without it, by when it drove."""
+    """Check that a fault in a third of the rows is named with its recording.
+
+    A robot that logs a recording a mission is known by its tag; without it, by when it drove.
+    """
     owner = logs.episode % 3
     third = np.array([f"r{one}" for one in owner])
     fleet = replace(logs, recording=third, logged_ns=1_000 * owner + logs.episode)
@@ -267,8 +269,7 @@ def test_a_lidar_whose_ranges_are_scaled_is_named(logs: FedRows, twin: FedRows) 
 def test_ice_and_aimless_driving_are_no_faults(
     twin: FedRows, logged: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On ice the robot turns later than its wheels; who drives elsewhere does not shorten the way
-    to go by his speed. Both were named as faults of a sensor."""
+    """Check that ice and aimless driving are not named as faults of a sensor."""
     if logged == "ice":
         monkeypatch.setattr(before_training, "KINDS", ("nominal", "wheel_slip"))
     else:

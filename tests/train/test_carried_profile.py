@@ -76,7 +76,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def carrying(folder: Path, text: str) -> Panel:
-    """That panel, with another text of its profile."""
+    """Return that panel with another text of its profile."""
     panel = Panel.open(folder / "panel")
     header = msgspec.structs.replace(panel.header, profile_toml=text)
     return Panel(panel.path, header, panel.rows)

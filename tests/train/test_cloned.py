@@ -26,7 +26,7 @@ ACTIONS = len(TASK.actions)
 
 @pytest.fixture(autouse=True)
 def few_updates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is learnt here is easy."""
+    """Clone by few updates, as what is learnt here is easy."""
     monkeypatch.setattr(cloned, "UPDATES", (50, 100))
 
 

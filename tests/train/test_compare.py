@@ -109,8 +109,11 @@ def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) ->
 
 
 def logs_by(unit: str) -> Logs:
-    """Steps of 20 episodes, three of which slip; strata by the condition of steps, or of episodes:
-    that of a whole episode where a step of it slips."""
+    """Return steps of 20 episodes, three of which slip.
+
+    Strata are by the condition of steps, or of episodes: that of a whole episode if a step of it
+    slips.
+    """
     logs, episodes = toy_logs(), np.arange(200) // 10
     slips = np.zeros(200, np.bool_)
     slips[[3, 57, 58, 121]] = True
@@ -135,7 +138,7 @@ def test_conditions_are_compared_whatever_the_strata_of_that_name_are(tmp_path, 
         (path / "config.json").write_text(json.dumps(whole), "utf-8")
 
     def slipping(column: str) -> list[int]:
-        """Logged rows drawn of either run."""
+        """Return the logged rows that either run drew."""
         counts = []
         for path in paths:
             fed = Run.open(path).table("sampled_episodes").to_pylist()

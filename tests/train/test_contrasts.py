@@ -34,7 +34,7 @@ name = "quotas"
 
 
 def curve(path: Path, seed: int, success: dict[int, float], *, full: bool = True) -> Path:
-    """A finished run whose slipping missions succeed so often at each evaluation; whole tens."""
+    """Return a finished run whose slipping missions succeed so often (tens) at each evaluation."""
     run = Run.create(path, document(seed))
     for step, share in success.items():
         for cell, of in ((("nominal", "none"), 1.0), (("wheel_slip", "none"), share)):

@@ -142,8 +142,11 @@ def action_rows(
     logged: int,
     supplied: float,
 ) -> list[dict[str, Any]]:
-    """Of two actions in a condition: `turn` is wanted in some of the fresh rows, and is in some of
-    the logs' and of the fresh ones."""
+    """Return rows of two actions in a condition.
+
+    `turn` is wanted in some of the fresh rows, and taken in some of the logs' and of the fresh
+    ones.
+    """
     wanted, share = turn or (0.4, 0.4)
     fresh = 0.4 if turn is None else supplied
     rows = []

@@ -68,8 +68,7 @@ def test_a_goal_is_told_by_the_last_look_or_by_distances(
 
 @pytest.fixture(scope="module")
 def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
-    """Three recordings: one goes about the floor, one is of another place altogether, and one is in
-    another frame, in which its ways happen to begin and end on the floor."""
+    """Return a panel of three recordings: on the floor, elsewhere, and in another frame."""
     folder = tmp_path_factory.mktemp("ways")
     tables = []
     for recording, away_m, between_m in ((1, 0.0, 0.0), (2, 300.0, 0.0), (3, 0.0, 50.0)):

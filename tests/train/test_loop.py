@@ -1,5 +1,4 @@
-"""The training loop on a corridor: it learns, repeats itself, resumes bit for bit, and says what
-the critic was fed."""
+"""The training loop on a corridor: it learns, repeats itself, and resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -539,7 +538,7 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
 
 
 def spoilt(live: Session, at: int) -> Any:
-    """A `stop` that makes the policy useless once, at an environment step: it stands still."""
+    """Return a `stop` that makes the policy stand still from an environment step on."""
 
     def stop() -> bool:
         if live.progress.env_steps >= at and not getattr(stop, "done", False):

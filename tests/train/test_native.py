@@ -1,5 +1,4 @@
-"""The compiled update: against autograd in double precision, against PyTorch's operations to the
-bit where they are the same, with and without AVX-512, and what it refuses."""
+"""The compiled update agrees with autograd in double precision, with and without AVX-512."""
 
 from __future__ import annotations
 

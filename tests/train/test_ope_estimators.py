@@ -28,8 +28,10 @@ STATES, ACTIONS, STEPS, DISCOUNT = 5, 2, 30, 0.9
 
 
 class Chain:
-    """States 0 … 4 in a row, the last one absorbs: action 1 goes on with chance 0.8, action 0
-    stays; each step costs 0.1, and arriving pays 1."""
+    """States 0 … 4 in a row, the last one absorbing.
+
+    Action 1 goes on with chance 0.8, action 0 stays; each step costs 0.1, and arriving pays 1.
+    """
 
     def __init__(self) -> None:
         self.move = np.zeros((STATES, ACTIONS, STATES))  # P(s' | s, a)
@@ -42,8 +44,10 @@ class Chain:
         self.move[STATES - 1, :, STATES - 1] = 1.0
 
     def q(self, policy: np.ndarray) -> np.ndarray:
-        """Q of a policy (S, A) for STEPS steps at most is that of the infinite horizon, but for
-        0.9^30 of it: the exact one, by (I - gamma P) Q = R."""
+        """Return Q of a policy (S, A), exact by (I - gamma P) Q = R.
+
+        For STEPS steps at most it is that of the infinite horizon, but for 0.9^30 of it.
+        """
         reward = (self.move * self.reward).sum(axis=2).reshape(-1)
         onward = np.einsum("sat,tb->satb", self.move, policy).reshape(STATES * ACTIONS, -1)
         solved = np.linalg.solve(np.eye(STATES * ACTIONS) - DISCOUNT * onward, reward)
@@ -88,7 +92,7 @@ NO_MODEL = np.zeros((STATES, ACTIONS))
 
 
 def repeated(*, weighted: bool, episodes: int = 50) -> np.ndarray:
-    """Importance sampling over 300 data sets."""
+    """Return importance sampling over 300 data sets."""
     return np.array(
         [
             per_decision(logged(episodes, seed, NO_MODEL), once(episodes), weighted=weighted)[0]

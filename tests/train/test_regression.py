@@ -36,7 +36,7 @@ def evaluated(
     shuffle: int = 0,
     friction: float = 0.5,
 ) -> Path:
-    """A run with an evaluation in which that share of each condition's episodes succeeded."""
+    """Return a run with an evaluation of which that share of each condition succeeded."""
     run = Run.create(path, {"config": {}, "panel": None, "task_hash": task_hash})
     rows = [
         {

@@ -55,7 +55,7 @@ def place() -> Places:
 
 @pytest.fixture
 def saved(tmp_path: Path, place: Places) -> Any:
-    """A DQN in the middle of an episode, saved with its buffer; its run goes on for a while."""
+    """Return a DQN in the middle of an episode, saved with its buffer."""
     panel = make_panel(make_store(tmp_path), tmp_path / "panel", n_step=3)
     model = sb3.DQN(
         "MlpPolicy",

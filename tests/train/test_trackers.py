@@ -162,7 +162,7 @@ def test_mlflow_has_the_curves_config_and_panel(
 
 
 def wandb_records(folder: Path) -> list[Any]:
-    """The records of a run's offline file, when W&B's own process has written the last one."""
+    """Return the records of a run's offline file, once W&B's process has written the last."""
     for _ in range(300):
         records = list(_records(folder))
         if "exit" in (record.WhichOneof("record_type") for record in records):

@@ -1,4 +1,4 @@
-"""Do the logs' sensors and actions answer to each other as the twin's do?
+"""Test whether the logs' sensors and actions answer to each other as the twin's do.
 
 Of each relation the gain, the delay and what is left unexplained, in logs against in the twin; or
 against what holds by definition where no twin can be driven. And of each action the motion that it
@@ -41,7 +41,7 @@ class Response:
 def fit_response(
     x: F64, y: F64, cluster: Ints, lags: Ints, rng: np.random.Generator
 ) -> Response | None:
-    """The response of y (n,) to x (n, L) at `lags` (L,); None where too little is known.
+    """Return the response of y (n,) to x (n, L) at `lags` (L,); None where too little is known.
 
     Rows with a value that is not finite are left out.
     """
@@ -79,7 +79,7 @@ def fit_response(
 
 
 def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> ConfidenceInterval:
-    """A ratio of two statistics with independent draws (R,) each, and the values `at`.
+    """Return a ratio of two statistics with independent draws (R,) each, and the values `at`.
 
     `clusters` are those of the one that has fewer.
     """
@@ -90,7 +90,7 @@ def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> 
 def difference_of(
     first: F64, second: F64, at: tuple[float, float], clusters: int
 ) -> ConfidenceInterval:
-    """A difference of two statistics with independent draws (R,) each, and the values `at`.
+    """Return a difference of two statistics with independent draws (R,) each, and the values `at`.
 
     `clusters` are those of the one that has fewer.
     """
@@ -98,7 +98,7 @@ def difference_of(
 
 
 def interval_of(value: float, draws: NDArray[np.float64], clusters: int) -> ConfidenceInterval:
-    """That of a statistic with draws (R,) over so many clusters; NaN where it is not known."""
+    """Return the interval of a statistic with draws (R,) over clusters; NaN if not known."""
     finite = draws[np.isfinite(draws)]
     if not len(finite) or not np.isfinite(value):
         return ConfidenceInterval(value, float("nan"), float("nan"))
@@ -153,7 +153,7 @@ class Relation:
         return fit_response(lagged(x, before), y, rows.cluster, self.lags, rng)
 
     def slip_to_leave_out(self, rows: FedRows) -> SlipLeftOut:
-        """What of logs to leave out so that a floor does not count as a fault of the robot.
+        """Return what of logs to leave out so that a floor does not count as a fault of the robot.
 
         Where wheels slip, how a robot moves is the floor's, also in the rows around those that are
         labelled: so whole episodes, as long as others remain. But a sensor that is wrong looks
@@ -192,8 +192,10 @@ def _near_slip(rows: FedRows) -> Bools:
 
 
 def _on_ice(rows: FedRows, moves: F64) -> Bools:
-    """The rows (N,) of episodes with slip, in recordings that move without slip as well; those of
-    few episodes are judged together."""
+    """Return the rows (N,) of episodes with slip, in recordings that also move without slip.
+
+    Recordings of few episodes are judged together.
+    """
     if not len(rows):
         return np.zeros(0, np.bool_)
     _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
@@ -229,8 +231,10 @@ def _gained(rows: FedRows) -> F64:
 
 
 def _turned_waypoint(rows: FedRows) -> F64:
-    """The yaw rate that the near waypoint's bearing shows, rad/s; NaN where driving or the plan
-    moved it."""
+    """Return the yaw rate (rad/s) that the near waypoint's bearing shows.
+
+    NaN where driving or the plan moved it.
+    """
     now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
     change = (after - now + np.pi) % (2 * np.pi) - np.pi
@@ -240,8 +244,11 @@ def _turned_waypoint(rows: FedRows) -> F64:
 
 
 def _route_speed(rows: FedRows) -> F64:
-    """How fast the way to go became shorter, m/s; NaN where the plan jumped or reads its most, and
-    where the robot is not headed along it: whoever drives elsewhere does not shorten it."""
+    """Return how fast the way to go became shorter, m/s.
+
+    NaN where the plan jumped or reads its most, and where the robot is not headed along it: whoever
+    drives elsewhere does not shorten it.
+    """
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
     shorter = 10.0 * (now - after)
     aside = (np.abs(rows.now("near_sin")) > _AHEAD) | (rows.now("near_cos") < 0.0)
@@ -418,8 +425,11 @@ def held_motion(rows: FedRows) -> list[F64]:
 
 
 def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comparison, int]]:
-    """Of each action of the logs how far its motion is from that action's in the twin (or from the
-    task's table), and the action (or itself) whose motion most of its rows have."""
+    """Return how far each logged action's motion is from that action's in the twin.
+
+    Without a twin, from the task's table. With it comes the action whose motion most of its rows
+    have.
+    """
     expected = np.array(logs.task.actions, np.float64)
     scale = np.maximum(np.abs(expected).max(axis=0), 1e-9)
     for action, motion in enumerate(held_motion(twin) if twin is not None else []):

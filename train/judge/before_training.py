@@ -53,7 +53,7 @@ _STATUS: dict[str, Status] = {TRUSTED: "ok", UNDECIDED: "undecided", UNTRUSTED: 
 
 
 def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
-    """A row for each condition, of the first of `places` (a run, a store) that has a gap in it."""
+    """Yield a row for each condition of the first of `places` (a run, a store) that has a gap."""
     what = "where the twin ends when it drives what was logged"
     folder = next((p / FOLDER for p in places if (p / FOLDER / DOCUMENT).is_file()), None)
     if folder is None:
@@ -79,7 +79,7 @@ def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
 
 
 def untrusted(rows: Sequence[Comparison]) -> list[str]:
-    """The conditions in which the twin strays from the logs beyond its limits."""
+    """Return the conditions in which the twin strays from the logs beyond its limits."""
     start = f"{GAP_CHECK}: "
     return [
         row.check.removeprefix(start) for row in rows if row.off and row.check.startswith(start)
@@ -96,7 +96,7 @@ _NAMED = 3
 def unlike_recordings(
     logs: FedRows, twin: FedRows | None, seed: int = 0
 ) -> tuple[list[Finding], list[Comparison]]:
-    """What is wrong in some of the recordings alone, and the comparisons that say so."""
+    """Return what is wrong in some of the recordings alone, and the comparisons that say so."""
     recordings = len(np.unique(logs.recording))
     if recordings < 2:
         return [], []
@@ -145,8 +145,10 @@ def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
 
 
 def _by_start(logs: FedRows) -> NDArray[np.str_]:
-    """The group of each row (N,): recordings that started one after the other, in groups of
-    `MIN_ROWS` rows at least, as many as let `MOST` groups hold all."""
+    """Return the group of each row (N,), of recordings that started one after the other.
+
+    A group has `MIN_ROWS` rows at least, or as many as let `MOST` groups hold all.
+    """
     names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
     place = place.reshape(-1)
     start = np.full(len(names), np.iinfo(np.int64).max)
@@ -273,7 +275,7 @@ def _rows(
 def _labels(
     conditions: Sequence[Condition], rows: dict[str, NDArray[Any]], episode: Ints, step: Ints
 ) -> NDArray[np.str_]:
-    """The one condition of each row, by the very rules that label logs."""
+    """Return the one condition of each row, by the very rules that label logs."""
     ends = np.flatnonzero(rows["ended"])
     order = np.argsort(np.concatenate([np.arange(len(episode)), ends + 0.5]), kind="stable")
     columns: dict[str, Any] = {
@@ -372,8 +374,11 @@ def diagnose_rows(
     rows: FedRows, twin: FedRows | None, reason: str = "", *, seed: int = 0,
     more: Sequence[Comparison] = (),
 ) -> RowDiagnosis:  # fmt: skip
-    """The same of rows at hand; `reason` says why there are none of a twin. `more` comparisons,
-    made elsewhere, count like these."""
+    """Diagnose rows at hand.
+
+    `reason` says why there are none of a twin. `more` comparisons, made elsewhere, count like
+    these.
+    """
     compared = answers(rows, twin, seed)
     permuted = list(permuted_actions(rows, twin))
     others = [*outcomes(rows, twin, seed), *row_order(rows), *values(rows, twin, seed), *more]
@@ -403,7 +408,7 @@ def diagnose_rows(
 def open_rows(
     path: Path, profile: Profile | None = None, task_hash: str | None = None
 ) -> OpenedRows:
-    """The rows of a panel or a store.
+    """Open the rows of a panel or a store.
 
     Raises:
         as `diagnose_before_training`.

@@ -101,7 +101,7 @@ def findings(
     others: Iterable[Comparison],
     task: Task,
 ) -> list[Finding]:
-    """What is wrong, worst understood last."""
+    """Return what is wrong, worst understood last."""
     of_rows = _of_rows([row for row in others if row.off])
     first = [one for one in of_rows if one.cause in _FIRST]
     if first:  # what rows are made of, and all that is compared with their next, follows from it
@@ -126,7 +126,7 @@ def findings(
 
 
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
-    """The ends (or groups of them) that relations which are off have in common, each with those."""
+    """Return the ends that faulty relations have in common, each with those relations."""
     left = [one for one in answers if one.off]
     fine = [one for one in answers if one.fine and one.relation.gain is not None]
     names = dict.fromkeys(end for one in left for end in (one.relation.x, one.relation.y))
@@ -274,7 +274,7 @@ def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Findi
 
 
 def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
-    """Findings of the checks that name their cause themselves; a check belongs to the first."""
+    """Return findings of the checks that name their cause themselves; the first claims a check."""
     left = {row.check: row for row in off}
     found = []
     for kind in KINDS:

@@ -89,7 +89,7 @@ class Check:
 
 
 def worst(verdicts: Sequence[Verdict]) -> Verdict:
-    """The verdict of many: one that is incomparable decides."""
+    """Return the verdict of many: one that is incomparable decides."""
     return max(verdicts, key=_ORDER.index, default="comparable")
 
 
@@ -184,7 +184,7 @@ def _distance(
 
 
 def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
-    """The larger share over the smaller; a, b (1 + R,): the figure, then its resamples."""
+    """Return the larger share over the smaller; a, b (1 + R,): the figure, then its resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)
     logs[np.isnan(logs)] = 0.0  # none in both
@@ -203,7 +203,7 @@ def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
 
 
 def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, float, float]:
-    """The interval that shows "the same", and the wider one that must hold for "different".
+    """Return the interval that shows "the same", and the wider one that must hold for "different".
 
     All checks must pass for the same, but any one of them makes a difference: its interval is
     widened for their number (Bonferroni), or noise would make one of thirty now and then.
@@ -382,7 +382,7 @@ class Arm:
 
 
 def refuse_dependent(runs: Sequence[Run]) -> None:
-    """Runs of one method are independent seeds of it, or their spread is too small.
+    """Run of one method are independent seeds of it, or their spread is too small.
 
     Raises:
         RunError: there is none, two are one run (or copies of it) or have one seed, or their
@@ -461,7 +461,7 @@ def _feed(table: pa.Table, cells: list[str]) -> Feed:
 
 
 def differences(first: Run, second: Run) -> list[Difference]:
-    """The settings in which two runs differ, each with what kind of difference it is."""
+    """Return the settings in which two runs differ, each with what kind of difference it is."""
     a, b = _settings(first), _settings(second)
     if a.get("panel.id") is None or b.get("panel.id") is None:
         # One was fed no logs at all: that is one difference of the feed, not one of the store.
@@ -493,7 +493,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def kind_of(setting: str) -> Kind:
-    """What kind of difference a setting makes; the longest known prefix decides."""
+    """Return what kind of difference a setting makes; the longest known prefix decides."""
     parts = setting.split(".")
     for length in range(len(parts), 0, -1):
         if (kind := _KINDS.get(".".join(parts[:length]))) is not None:

@@ -219,7 +219,7 @@ def _known(value: float) -> float | None:
 
 
 def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
-    """What an interval would claim too much of, or None. A, b as of `_outcome`."""
+    """Return what an interval would claim too much of, or None. A, b as of `_outcome`."""
     if np.isnan(difference.value):
         return "the task has no goal: compare the returns"
     runs, episodes = min(len(a), len(b)), a.shape[1]
@@ -254,7 +254,7 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
 
 
 def last_evaluation(run: Run) -> pa.Table:
-    """The last periodic evaluation in training. Raises RunError where there was none."""
+    """Return the last periodic evaluation in training. Raises RunError where there was none."""
     import pyarrow.compute as pc  # slow to import
 
     table = run.table("evaluations")
@@ -273,7 +273,7 @@ _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 
 
 def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[str, Any]:
-    """What is different in `second`, as plain values: what `restock coverage diff --json` prints.
+    """Return what is different in `second`, as `restock coverage diff --json` prints it.
 
     Raises:
         RunError: one of them is missing or damaged, or they are of different tasks.
@@ -320,7 +320,7 @@ def _side(run: Run) -> dict[str, Any]:
 
 
 def _panels(a: Run, b: Run) -> dict[str, Any] | None:
-    """What is different between their panels, where both are still where they were."""
+    """Return what is different between their panels, where both are still where they were."""
     fed = [run.document.get("panel") or {} for run in (a, b)]
     if not all(fed) or fed[0].get("id") == fed[1].get("id"):
         return None
@@ -421,7 +421,7 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], dict[_Key, tuple[float, flo
 
 
 def _verdict(first: Path, second: Path) -> dict[str, Any]:
-    """What `restock compare` says of them, by what may differ: named here, and not obeyed."""
+    """Return the verdict of `restock compare`, by the difference that is allowed."""
     verdict: dict[str, Any] = {}
     for treatment in ("algorithm", "mixture"):
         try:

@@ -21,7 +21,7 @@ _NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
 
 
 def check_place(out: Path) -> None:
-    """Raises RunError where the experiment's run cannot be made at `out`."""
+    """Raise RunError where the experiment's run cannot be made at `out`."""
     try:
         check_free(out)
     except RunError as taken:
@@ -103,7 +103,7 @@ def confirm(
 
 
 def swapped(run: Run, cause: Cause) -> list[str]:
-    """The settings that replace what is suspected."""
+    """Return the settings that replace what is suspected."""
     config = run.document["config"]
     if cause == "DIVERGENCE":
         return [f"optimizer.learning_rate={min(config['optimizer']['learning_rate'] / 10, 3e-4)}"]

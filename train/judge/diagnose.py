@@ -89,21 +89,24 @@ def diagnose(
 
 
 def target_rule(run: Run) -> TargetRule:
-    """The rule that its target followed."""
+    """Return the rule that its target followed."""
     rule: TargetRule = msgspec.convert(run.document["config"]["target"], TargetRule)
     return rule
 
 
 def other_target(rule: TargetRule) -> Polyak:
-    """A target rule that tells whether `rule` is at fault: the default one where `rule` is far too
-    slow or too fast, else one with a quarter of its lag."""
+    """Return a target rule that tells whether `rule` is at fault.
+
+    That is the default rule if `rule` is far too slow or too fast, else one with a quarter of its
+    lag.
+    """
     least, below = _WORKING_LAGS
     lag = rule.effective_lag
     return Polyak(tau=4 / lag) if least <= lag < below else Polyak()
 
 
 def _figures(run: Run, windows: Sequence[Window]) -> Window:
-    """What the last windows of a run show together."""
+    """Return what the last windows of a run show together."""
     before = windows[-WINDOWS - 1].gradient_steps if len(windows) > WINDOWS else 0
     actions = action_symptoms(run, before)
     return replace(median_window(windows[-WINDOWS:]), actions=actions)
@@ -112,7 +115,7 @@ def _figures(run: Run, windows: Sequence[Window]) -> Window:
 def _verdict(
     run: Run, windows: Sequence[Window], figures: Window, limits: DiagnosisLimits
 ) -> tuple[Cause, str]:
-    """What the last windows come to, and what to do where that is UNDETERMINED."""
+    """Return what the last windows come to, and what to do where that is UNDETERMINED."""
     if windows[-1].diverged(limits) and figures.diverged(limits):
         return "DIVERGENCE", ""
     last = windows[-WINDOWS:]
@@ -162,7 +165,7 @@ def _explained(explained: float | None) -> str:
 
 
 def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
-    """What a window shows, for people."""
+    """Return what a window shows, for people."""
     most = f"of at most {window.q_bound:.3g}"
     if isinf(window.q_bound):
         most = "(how large it may be is unknown: no audited row has a reward)"
@@ -222,7 +225,7 @@ _TOGETHER: dict[Cause, Cause] = {  # of a run, where its rows are at fault too
 
 
 def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
-    """The diagnosis of the panel that the runs were fed, or None and why there is none."""
+    """Return the diagnosis of the panel that the runs were fed, or None and why there is none."""
     fed = {run.document["panel"]["path"]: run for run in runs if run.document.get("panel")}
     if len(fed) != 1:
         return None, "the runs were fed several panels" if fed else "there is no panel"
@@ -242,7 +245,7 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
 
 
 def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
-    """The verdict on a run and on its rows together; rows that are not at fault change nothing."""
+    """Return the verdict on a run and its rows together; sound rows change nothing."""
     if not rows.findings:
         return diagnosis
     cause = _TOGETHER.get(diagnosis.cause, diagnosis.cause)

@@ -40,7 +40,7 @@ class Evidence:
 
 
 def twin_evidence(store: Store, config: GapConfig) -> Evidence:
-    """What the verdict of `restock twin gap` on nominal driving needs, of a store's one task.
+    """Return what the verdict of `restock twin gap` on nominal driving needs of a store.
 
     Raises:
         ConfigError: a horizon that is not some control periods, or a robot that the twin cannot
@@ -61,7 +61,7 @@ def twin_evidence(store: Store, config: GapConfig) -> Evidence:
 
 
 def policy_evidence(store: Store, held_out_share: float, gate: EssGate) -> Evidence:
-    """What an estimate by importance weights needs, of a store's one task.
+    """Return what an estimate by importance weights needs, of a store's one task.
 
     Args:
         store: the logs.

@@ -29,8 +29,11 @@ Status = Literal["ok", "off", "undecided", "not run"]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was compared. `effect` is a ratio or a difference, as `measure` says; `status` is by
-    whether its 95 % interval lies within the allowed range, across its end, or beyond it."""
+    """A comparison: `effect` is a ratio or a difference, as `measure` says.
+
+    `status` is by whether its 95 % interval lies within the allowed range, across its end, or
+    beyond it.
+    """
 
     check: str  # a name that causes and docs know it by
     what: str  # for people
@@ -65,8 +68,10 @@ def judged(
     logs: float | None, twin: float | None, least: float = -math.inf, most: float = math.inf,
     logs_rows: int, twin_rows: int = 0, note: str = "",
 ) -> Comparison:  # fmt: skip
-    """A comparison by its interval: off where all of it is beyond the allowed, undecided where the
-    value alone is."""
+    """Return a comparison judged by its interval.
+
+    It is off if all of the interval is beyond the allowed range, undecided if the value alone is.
+    """
     if not math.isfinite(interval.value):
         return not_run(check, what, note or "too few rows")
     within = least <= interval.value <= most
@@ -81,14 +86,14 @@ def judged(
 
 
 def not_run(check: str, what: str, reason: str) -> Comparison:
-    """A check that could not be made, and why."""
+    """Return a check that could not be made, and why."""
     return Comparison(check, what, "", "not run", note=reason)
 
 
 def share_judged(
     check: str, what: str, found: int, of: int, most: float, *, least: float = 0.0, note: str = ""
 ) -> Comparison:
-    """A share of the logs' rows that is known by definition."""
+    """Return a share of the logs' rows that is known by definition."""
     if not of:
         return not_run(check, what, note or "no such rows")
     interval = ConfidenceInterval(found / of, *wilson(found, of))
@@ -102,7 +107,7 @@ def share_judged(
 def shares_compared(
     check: str, what: str, logs: tuple[int, int], twin: tuple[int, int], least: float, most: float
 ) -> Comparison:
-    """The difference of two shares, each (found, of), with Newcombe's interval for it."""
+    """Return the difference of two shares, each (found, of), with Newcombe's interval for it."""
     if not logs[1] or not twin[1]:
         return not_run(check, what, "no such rows in the logs" if twin[1] else "nor in the twin")
     (p, q), ((a, b), (c, d)) = (
@@ -152,7 +157,7 @@ class FedRows:
         return len(self.action)
 
     def take(self, chosen: Bools, **left_out: int) -> FedRows:
-        """Some of the rows; `left_out` says how many are not, by reason."""
+        """Return some of the rows; `left_out` counts the others by reason."""
         arrays: dict[str, Any] = {
             item.name: value[chosen]
             for item in fields(self)
@@ -187,33 +192,33 @@ class FedRows:
         return np.asarray(np.cumsum(~self.joined), np.int64)
 
     def before(self, lag: int) -> tuple[Ints, Bools]:
-        """The row (N,) `lag` steps before each (after, where negative), and whether it is known."""
+        """Return the row (N,) `lag` steps before each (after, if negative), and whether it exists."""
         place = np.arange(len(self)) - lag
         inside = np.clip(place, 0, max(len(self) - 1, 0))
         known = (place == inside) & (self._stretch[inside] == self._stretch)
         return inside, np.asarray(known, np.bool_)
 
     def now(self, name: str) -> F64:
-        """An entry of the observations at t, (N,)."""
+        """Return an entry of the observations at t, (N,)."""
         return self._column(self.observation, name)
 
     def after(self, name: str) -> F64:
-        """An entry of the observations at t + 1, (N,)."""
+        """Return an entry of the observations at t + 1, (N,)."""
         return self._column(self.next_observation, name)
 
     def sectors(self, *, after: bool = False) -> F64:
-        """The clearance entries (N, sectors), in [0, 1], by rising bearing."""
+        """Return the clearance entries (N, sectors), in [0, 1], by rising bearing."""
         return nearness_of(self.task, self.next_observation if after else self.observation)
 
     def previous_action(self, *, after: bool = False) -> Ints:
-        """The action before t (N,), or before t + 1, that the observations hold."""
+        """Return the action before t (N,), or before t + 1, that the observations hold."""
         first = self.task.observation_names.index("previous_action_0")
         rows = self.next_observation if after else self.observation
         held = rows[:, first : first + len(self.task.actions)]
         return np.asarray(held.argmax(axis=1), np.int64)
 
     def command(self) -> F64:
-        """The speed (m/s) and yaw rate (rad/s) of each row's action, (N, 2)."""
+        """Return the speed (m/s) and yaw rate (rad/s) of each row's action, (N, 2)."""
         return np.asarray(self.task.actions, np.float64)[self.action]
 
     def _column(self, rows: F32, name: str) -> F64:
@@ -221,8 +226,10 @@ class FedRows:
 
 
 def of_panel(panel: Panel, most: int = MAX_ROWS) -> FedRows:
-    """The rows of a panel. Those whose next step is not in the panel are left out where its returns
-    are of several steps, and counted.
+    """Return the rows of a panel.
+
+    Rows whose next step is not in the panel are left out if its returns are of several steps, and
+    counted.
 
     Raises:
         PanelError: the task does not have a row's action.
@@ -246,7 +253,7 @@ def of_panel(panel: Panel, most: int = MAX_ROWS) -> FedRows:
 
 
 def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
-    """The rows of a task of a store.
+    """Return the rows of a task of a store.
 
     Raises:
         StoreError: it has none, or the task does not have a row's action.
@@ -312,7 +319,7 @@ def _not_looked_at(rows: int) -> dict[str, int]:
 
 
 def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
-    """What a store and a panel's `meta` have by the same names, as `FedRows` has it."""
+    """Return what a store and a panel's `meta` have by the same names, as `FedRows` has it."""
     episode = np.unique(_text(table, "episode_id")[order], return_inverse=True)[1].reshape(-1)
     kinds: dict[str, Any] = {"action": np.int64, "reward": np.float64, "transition_id": np.int64}
     kinds |= {"terminated": np.bool_, "truncated": np.bool_, "logged_ns": np.int64}

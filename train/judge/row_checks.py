@@ -1,4 +1,4 @@
-"""Do stored labels and ends follow from the stored signals, by the very rules that made them?
+"""Check that stored labels and ends follow from the stored signals, by the rules that made them.
 
 A store keeps the signals that conditions were computed from, so conditions can be computed again,
 and so can terminations. A panel is held against the store that it was made from.
@@ -78,7 +78,7 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
 
 
 def _foresight(rows: FedRows, joined: Bools) -> Comparison:
-    """An observation that holds the action taken at it, where that is not the one before."""
+    """Return an observation that holds the action taken at it, where that is not the one before."""
     before = np.maximum(np.arange(len(rows)) - 1, 0)
     changed = joined & (rows.action != rows.action[before])
     knows = changed & (rows.previous_action() == rows.action)
@@ -90,7 +90,7 @@ def _foresight(rows: FedRows, joined: Bools) -> Comparison:
 
 
 def _still(rows: FedRows) -> Comparison:
-    """Moving rows whose next observation is the observation."""
+    """Count moving rows whose next observation equals the current one."""
     moving = np.abs(rows.now("wheel_speed")) > 0.1
     same = ~_differ(rows.observation, rows.next_observation) & moving
     return share_judged(
@@ -131,7 +131,7 @@ _ARRIVED_M = 0.15  # of plan beyond the goal's radius: the plan is never shorter
 
 
 def implied_reward(rows: FedRows) -> F64:
-    """The reward (N,) that the observations come to; NaN where they do not say."""
+    """Return the reward (N,) that the observations come to; NaN where they do not say."""
     task = rows.task
     clearance = np.full(len(rows), np.nan)
     if task.lidar:
@@ -152,7 +152,7 @@ def implied_reward(rows: FedRows) -> F64:
 
 
 def arrived(rows: FedRows) -> Bools:
-    """The rows (N,) after which the robot is at its goal, as far as its plan says."""
+    """Return the rows (N,) after which the robot is at its goal, as far as its plan says."""
     if rows.task.goal == "none":
         return np.zeros(len(rows), np.bool_)
     to_go = 10.0 * rows.after("goal_distance")
@@ -314,8 +314,10 @@ def _entry(
 
 
 def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
-    """By how many degrees the logs' sectors are turned against the twin's (or a cosine), and how
-    much nearer things come for each metre driven, compared with the twin."""
+    """Return by how many degrees the logs' sectors are turned against the twin's (or a cosine).
+
+    With it comes how much nearer things come for each metre driven, compared with the twin.
+    """
     what = "bearing in which things come nearer when driving on"
     if not logs.task.lidar:
         yield not_run("lidar bearing", what, "the robot has no lidar")
@@ -433,7 +435,7 @@ def _far_commands(store: Store, task_hash: str) -> Comparison:
 
 
 def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
-    """Recordings that these rules labelled and nobody corrected, and what is said of the others."""
+    """Return recordings that these rules labelled and nobody corrected, and notes on others."""
     found = store.connection.sql(
         "SELECT recording_id, labels_version, count(*) FROM transitions WHERE task_hash = ?"
         " GROUP BY ALL ORDER BY ALL",
@@ -454,7 +456,7 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
 
 
 def _whole(steps: LoggedSteps) -> Bools:
-    """The rows (N,) of episodes that are stored whole, their end too."""
+    """Return the rows (N,) of episodes that are stored whole, their end too."""
     ended = np.isin(steps.episode_id, steps.episode_id[steps.ending])
     broken = steps.episode_id[steps.begins & (steps.step_index > 0)]
     return np.asarray(ended & ~np.isin(steps.episode_id, broken), np.bool_)

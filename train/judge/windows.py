@@ -150,7 +150,7 @@ class Window:
         return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
 
     def bad(self, limits: DiagnosisLimits) -> dict[str, list[str]]:
-        """The conditions whose replay is in doubt, with what is wrong, for people."""
+        """Return the conditions whose replay is in doubt, with what is wrong, for people."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
         least = min(follows, default=0.0)
         doubts = {}
@@ -248,7 +248,7 @@ class Window:
         return self.explained < limits.explained
 
     def cause(self, limits: DiagnosisLimits) -> Cause:
-        """The rule."""
+        """Return the rule."""
         if self.diverged(limits):
             return "DIVERGENCE"
         bad = self.bad(limits)
@@ -263,7 +263,7 @@ class Window:
 
 
 def median_window(windows: Sequence[Window]) -> Window:
-    """The median of each figure over windows, of each condition over those in which it was met."""
+    """Return the median of each figure over windows; a condition's over windows that have it."""
 
     def middle(name: str, of: Sequence[Any] = windows) -> Any:
         known = [value for item in of if (value := getattr(item, name)) is not None]
@@ -289,7 +289,7 @@ def median_window(windows: Sequence[Window]) -> Window:
 
 
 def windows_of(run: Run) -> list[Window]:
-    """The windows of a run, one an evaluation that had updates before it."""
+    """Return the windows of a run, one an evaluation that had updates before it."""
     import duckdb
 
     query = files("restock.train.judge").joinpath("diagnose.sql").read_text(encoding="utf-8")

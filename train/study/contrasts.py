@@ -103,7 +103,7 @@ class RunCurve:
         return found
 
     def value(self, measure: str, reach: tuple[float, float] | None = None) -> float:
-        """The run's value of a measure, over a range of environment steps; NaN: not known."""
+        """Return the run's value of a measure over a range of steps; NaN if not known."""
         kind, _, what = measure.partition("_")
         if kind == "success":
             return self._of(self.end, what)
@@ -126,7 +126,7 @@ class RunCurve:
 
 
 def area(steps: F64, values: F64, reach: tuple[float, float] | None = None) -> float:
-    """The area under a curve by trapezoids, divided by its range of steps; NaN from one point.
+    """Return the area under a curve by trapezoids over its range of steps; NaN from one point.
 
     Args:
         steps, values: (n,); `reach` is the range, where the curve is cut or None for all of it.
@@ -147,8 +147,11 @@ def contrast(
     *,
     primary: bool = False,
 ) -> Contrast | None:
-    """One contrast; None where no pair of runs has the measure. Runs are (the arm's, the
-    baseline's) of each seed; curves are compared where all of them have evaluations."""
+    """Return one contrast; None if no pair of runs has the measure.
+
+    Runs are (the arm's, the baseline's) of each seed. Curves are compared at steps where all have
+    evaluations.
+    """
     if not runs:
         return None
     curves = [curve for pair in runs for curve in pair if len(curve.steps)]

@@ -98,8 +98,10 @@ def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:
 
 
 def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
-    """The primary contrast, then every comparison's in the study's measures; those that were
-    refused have none."""
+    """Return the primary contrast, then those of every comparison in the study's measures.
+
+    Refused comparisons have none.
+    """
     study, curves = plan.study, _Curves(plan)
     wanted = [
         (pair.arm, pair.baseline, measure, False)
@@ -119,8 +121,11 @@ def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
 
 
 def arms(plan: StudyPlan) -> list[dict[str, Any]]:
-    """A row an arm and reference: success by cell, and safety and return in the rare missions,
-    unperturbed; each [mean, low, high] over the seeds, the ends None where `paired_t` has none."""
+    """Return a row for each arm and reference: success by cell, and safety and return.
+
+    Safety and return are those of rare missions, unperturbed. A value is [mean, low, high] over the
+    seeds; the ends are None if `paired_t` has none.
+    """
     planner_s, references = _references(plan)
     rows = []
     for arm in plan.study.arms:

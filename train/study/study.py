@@ -215,7 +215,7 @@ def load_study(path: Path | str) -> Study:
 
 
 def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str) -> None:
-    """An arm that makes no update cannot be compared, which would be found after all its runs."""
+    """Refuse an arm that makes no update, which would be found only after all its runs."""
     if arm.library == "sb3-ppo":  # it has no warm-up
         return
     has_logs = arm.mixture is not None or arm.panel is not None
@@ -304,11 +304,11 @@ class StudyPlan:
         return [*as_overrides(self.study.settings), *as_overrides(arm.settings), f"seed={seed}"]
 
     def fingerprint(self, job: StudyJob) -> str:
-        """What a finished run was asked to be, as JSON: another request makes another run."""
+        """Return what a finished run was asked to be, as JSON."""
         return json.dumps(self._request(job), indent=1) + "\n"
 
     def _request(self, job: StudyJob) -> dict[str, Any]:
-        """The panel by its name in the study: a study may be moved, or be run from elsewhere."""
+        """Return a run's request with the panel by its name, so that a study may be moved."""
         own = None if job.arm.mixture is None else f"panels/{job.arm.name}"
         request = {
             "settings": self.settings(job.arm, job.seed),
@@ -321,8 +321,7 @@ class StudyPlan:
 
 
 def check_jobs(plan: StudyPlan) -> None:
-    """Raises RunError where a finished run was made as the study does not ask any more; ConfigError
-    where one that is still to do has no panel, which would be found after those before it."""
+    """Raise RunError if a finished run was made by another request, ConfigError without a panel."""
     for job in plan.jobs:
         if not job.done.exists():
             if job.arm.panel and not (plan.folder / job.arm.panel / "panel.json").is_file():

@@ -181,7 +181,10 @@ def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
 
 
 def _drive_references(plan: StudyPlan, say: Say) -> None:
-    """The planner and the operator on the episodes of the runs, once; kept by the first run."""
+    """Drive the planner and the operator on the episodes of the runs, once.
+
+    The first run keeps them.
+    """
     evaluation, path = plan.study.evaluation, plan.jobs[0].path
     done, requested = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
     if not evaluation.references:
@@ -216,8 +219,10 @@ def _train(plan: StudyPlan, job: StudyJob, log: Path, say: Say) -> None:
 
 
 def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) -> list[str]:
-    """What trains the run at a path, on from its checkpoint where it has one. One that was cut
-    before its first checkpoint has nothing to go on from: it is removed, and begins again."""
+    """Return the command that trains the run at a path, from its checkpoint if there is one.
+
+    A run that was cut before its first checkpoint is removed, and begins again.
+    """
     if (path / "checkpoints" / "latest.safetensors").exists():
         return ["train", "--resume", str(path)]
     if (path / "config.json").exists():
