@@ -192,7 +192,7 @@ class FedRows:
         return np.asarray(np.cumsum(~self.joined), np.int64)
 
     def before(self, lag: int) -> tuple[Ints, Bools]:
-        """Return the row (N,) `lag` steps before each (after, if negative), and whether it exists."""
+        """Return the row (N,) `lag` steps before each (after, if negative), and if it exists."""
         place = np.arange(len(self)) - lag
         inside = np.clip(place, 0, max(len(self) - 1, 0))
         known = (place == inside) & (self._stretch[inside] == self._stretch)
