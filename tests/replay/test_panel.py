@@ -441,7 +441,7 @@ def test_packing_gives_the_bytes_of_its_version(transitions: pa.Table, tmp_path:
         digest.update(json.dumps(table.drop_columns(["robot", "site"]).to_pydict()).encode())
     rows = hashlib.blake2b((panel.path / ROWS).read_bytes(), digest_size=16)
     packed = [PACKING_VERSION, rows.hexdigest(), digest.hexdigest()]
-    assert packed == [3, "8ef3c35f31805b369d555229e0ebe493", "f080192c7ae0da98c3f284b8cc6c0f18"]
+    assert packed == [4, "8ef3c35f31805b369d555229e0ebe493", "f080192c7ae0da98c3f284b8cc6c0f18"]
     assert panel.header.packing_version == PACKING_VERSION
 
 
@@ -454,7 +454,7 @@ def test_the_id_names_the_version_of_the_packing(
         monkeypatch.setattr(module, "PACKING_VERSION", PACKING_VERSION + 1)
     assert build_panel(transitions, uniform(), tmp_path / "c").id != first.id
     with pytest.raises(
-        PanelError, match=r"another version of Restock.*packing 3, not 4"
+        PanelError, match=r"another version of Restock.*packing 4, not 5"
     ) as refused:
         Panel.open(first.path)
     assert "make it again" in str(refused.value)

@@ -77,7 +77,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
     args = ["twin", "record", "--missions", "1", "--seed", "3", "--rates", "odom=10,imu=10,scan=5"]
     for folder in ("first", "second"):
         assert cli.main([*args, "--out", str(tmp_path / folder / name)]) == ExitCode.OK
-    assert cli.main([*args[:4], "4", "--out", str(tmp_path / "third" / name)]) == ExitCode.OK
+    assert cli.main([*args[:5], "4", "--out", str(tmp_path / "third" / name)]) == ExitCode.OK
     first, second, third = (
         {
             str(file.relative_to(tmp_path / folder)): file.read_bytes()

@@ -119,10 +119,9 @@ class InfoCommand:
 
 
 def _is_store(path: str) -> bool:
-    from restock.ingest.store.location import Location
-    from restock.replay.store.store import is_store
-
-    return "://" in path or (path != "" and Path(path).is_dir() and is_store(Location.of(path)))
+    # By its Delta logs alone: the store's own check would import DuckDB for every recording.
+    logs = [Path(path, table, "_delta_log") for table in ("transitions", "recordings")]
+    return "://" in path or all(log.is_dir() for log in logs)
 
 
 def _size(count: int) -> str:
