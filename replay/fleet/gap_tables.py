@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
-from restock.replay.panel.mixture_tables import install_function
+from restock.replay.panel.mixture_tables import check_names, install_function
 from restock.replay.store.store import Store
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def install_gaps(store: Store) -> None:
         return shopping_list(yields, gaps)
 
     install_function(store.bare, "planned_gaps", COLUMNS, gaps_table, planned)
+    store.checks.append(functools.partial(check_names, ("gaps",)))
     text = files("restock.replay.fleet").joinpath("gap_tables.sql").read_text(encoding="utf-8")
     store.bare.execute(text)
 

@@ -8,7 +8,8 @@ its own connection.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -82,8 +83,20 @@ def install_mixtures(store: Store) -> None:
         ("planned_rows", ROWS, rows_table),
     ):
         install_function(store.bare, function, columns, table_of, planned)
+    store.checks.append(functools.partial(check_names, ("mixture", "mixture_rows")))
     text = (files("restock.replay.panel") / "mixture_tables.sql").read_text(encoding="utf-8")
     store.bare.execute(text)
+
+
+def check_names(macros: Sequence[str], text: str) -> None:
+    """Raise ConfigError if a query asks one of these macros for a mixture that cannot be read.
+
+    DuckDB calls a function when rows are fetched, and reports what it raised in its own words.
+    """
+    from restock.replay.mixture.mixture import load_mixture
+
+    for name in re.findall(rf"\b(?:{'|'.join(macros)})\s*\(\s*'([^']*)'\s*\)", text, re.IGNORECASE):
+        load_mixture(name)
 
 
 def install_function(

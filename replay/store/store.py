@@ -133,6 +133,8 @@ class Store:
             ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
+        # Called with a query's text before it runs, to report early what fails as rows are fetched.
+        self.checks: list[Callable[[str], None]] = []
         summaries = self._present_summaries()
         self._definitions = Definitions(
             self.bare,
@@ -188,6 +190,8 @@ class Store:
         try:
             with self._asking:
                 self._definitions.make(text)
+                for check in self.checks:
+                    check(text)
                 return query(self.bare, text, where=str(self.path))
         except (duckdb.Error, QueryError) as error:
             if "connection is busy" not in str(error):

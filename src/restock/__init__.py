@@ -49,9 +49,13 @@ def open(store: str, *, version: int | str | None = None) -> Store:
     `version` opens it as it was: a version's number, or an ISO 8601 time.
     """
     from restock.ingest.store.version import given_version
+    from restock.replay.places import add_computed_tables
     from restock.replay.store.store import Store
 
-    return Store(store, version=given_version(version) if isinstance(version, str) else version)
+    moment = given_version(version) if isinstance(version, str) else version
+    opened = Store(store, version=moment)
+    add_computed_tables(opened)
+    return opened
 
 
 if not TYPE_CHECKING:
