@@ -199,13 +199,12 @@ logs = { schedule = "cosine", start = 0.75, end = 0.25, to_env_steps = 1200 }
 post = "density_ratio"
 [[strata]]
 name = "nominal"
-share = 0.4
+share = { schedule = "linear", start = 0.4, end = 0.5, to_env_steps = 1200 }
 [[strata]]
 name = "wheel_slip"
 within = "per"
 [[strata]]
 name = "recovery"
-share = { schedule = "linear", start = 0.05, end = 0.2, to_env_steps = 1200 }
 [each_condition]
 share = "equal"
 within = "uniform"
@@ -220,7 +219,7 @@ def test_draws_go_on_exactly_where_they_were_saved(table: pa.Table, tmp_path: Pa
         rng = np.random.default_rng(seed)
         found: list[Any] = []
         for number in range(batches):
-            draws.move_to(number * 10)
+            draws.move_to(number * 2)
             count = max(round(64 * draws.controller.logs_share), 1)
             batch = draws.draw(count)
             draws.update(batch.rows, batch.strata, rng.random(len(batch.rows)) * (1 + batch.strata))
@@ -230,11 +229,11 @@ def test_draws_go_on_exactly_where_they_were_saved(table: pa.Table, tmp_path: Pa
     draws = draws_of(built, planned)
     some(draws, 50, 1)
     state = draws.state_dict()
-    going_on = some(draws, 90, 2)
-    assert len({tuple(quota) for *_, quota in going_on}) > 2  # shares did move
+    going_on = some(draws, 450, 2)
+    assert len({tuple(quota) for *_, quota in going_on}) > 5  # shares did move
     again = draws_of(built, planned)
     again.load_state_dict(state)
-    for one, two in zip(going_on, some(again, 90, 2), strict=True):
+    for one, two in zip(going_on, some(again, 450, 2), strict=True):
         for a, b in zip(one, two, strict=True):
             np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(draws.replays, again.replays)
@@ -335,7 +334,7 @@ def test_the_run_records_the_shares_in_force(whole: tuple[Session, Panel]) -> No
     assert live.batches.controller is not None
     np.testing.assert_allclose([row["share"] for row in last], live.batches.controller.shares)
     assert [row["share"] for row in last] != [row["planned_share"] for row in last]
-    assert last[0]["logs_share"] < shares[0]["logs_share"] == pytest.approx(0.75)
+    assert last[0]["logs_share"] < 0.4 < shares[0]["logs_share"]
     # What was asked for is what was drawn.
     strata = pq.read_table(path / "strata.parquet").to_pylist()
     for row in strata:
