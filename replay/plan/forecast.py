@@ -143,7 +143,7 @@ def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator
 
 
 def _drawn(weights: F64, size: int, rng: np.random.Generator) -> Ints:
-    """So many episodes, each with its weight (E,)."""
+    """Return so many drawn episodes, each with its weight (E,)."""
     steps = np.cumsum(weights)
     drawn = np.searchsorted(steps, rng.random(size) * steps[-1], side="right")
     return np.asarray(np.minimum(drawn, len(weights) - 1), np.int64)

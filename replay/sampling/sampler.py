@@ -61,7 +61,7 @@ class Sampler(Protocol):
 
     @property
     def shares(self) -> F64:
-        """Of each stratum, (S,)."""
+        """Return the share of each stratum, (S,)."""
 
     @property
     def drawn_weights(self) -> F32 | None:

@@ -162,7 +162,7 @@ class Behaviour(Stateful):
 
     @property
     def moved(self) -> list[Tensor]:
-        """All that `move` moves."""
+        """Return all tensors that `move` changes."""
         return [*self.optimizer.moved, self._slow]
 
     def _fill_gradient(self, labelled: Labelled) -> None:

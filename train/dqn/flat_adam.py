@@ -172,7 +172,7 @@ class FlatAdam(Stateful):
 
     @property
     def moved(self) -> list[Tensor]:
-        """All that `move` moves, but for the average."""
+        """Return all tensors that `move` changes, without the average."""
         return [self.values, *self._moments, self._step]
 
     @property

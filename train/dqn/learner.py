@@ -167,7 +167,7 @@ class Learner(Stateful):
 
     @property
     def moved(self) -> list[Tensor]:
-        """Return all that `move` moves."""
+        """Return all tensors that `move` changes."""
         slow = [] if self.behaviour is None else self.behaviour.moved
         return [*self.optimizer.moved, self._policy, self._slow, *slow]
 

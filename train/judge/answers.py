@@ -329,7 +329,7 @@ class Answer:
         return all(one.status in ("ok", "not run") for one in self.comparisons)
 
     def is_off(self, figure: str) -> bool:
-        """Whether its `gain`, `delay` or `unexplained` is."""
+        """Return whether the gain, delay or unexplained part is off."""
         return any(one.off and one.check.startswith(figure) for one in self.comparisons)
 
 

@@ -131,7 +131,7 @@ def unlike_recordings(
 
 
 def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
-    """Which part each row (N,) is compared with, and what the parts are called."""
+    """Return the part that each row (N,) is compared with, and the names of the parts."""
     place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)[1:]
     is_short = (rows < MIN_ROWS)[place.reshape(-1)]
     tagged = is_short & (logs.robot != "")
@@ -241,7 +241,7 @@ def drive_twin(
 def _rows(
     task: Task, conditions: Sequence[Condition], taken: Sequence[dict[str, NDArray[Any]]]
 ) -> FedRows:
-    """Of T steps of N robots those whose episode ended, robot by robot."""
+    """Return the rows of episodes that ended, robot by robot, from T steps of N robots."""
     steps = {name: np.stack([step[name] for step in taken], axis=1) for name in taken[0]}
     flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in steps.items()}
     ended = steps["ended"]

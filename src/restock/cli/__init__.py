@@ -162,7 +162,7 @@ def _dispatch(args: list[str]) -> int:
 
         return write_completion(args)
     name, prog, rest = _named(args)
-    if name in ("store", "twin"):  # a verb that has nothing but jobs
+    if name in JOBS and name not in FOLDER_OF:  # a verb that has nothing but jobs
         return _say_jobs(name, rest)
     return _run(name, prog, rest)
 
