@@ -376,6 +376,7 @@ class QuotaSampler(BlockSampler):
             for name, rows in zip(names, members, strict=True)
         ]
         super().__init__(draws, members, quotas, rng, within=names, block=block)
+        self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
         if self._follows_td:
             self._place_rows()
 
@@ -395,17 +396,34 @@ class QuotaSampler(BlockSampler):
             MixtureError: a rule follows them, and one is negative or not finite, or they are not
                 one a row.
         """
-        if not self._follows_td:
+        if self._follows_td:
+            self._learnt.append((np.array(rows), checked_errors(td_abs, rows).copy()))
+
+    def _draw_block(self) -> None:
+        self._pass_on_errors()
+        super()._draw_block()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that decides the draws to come: arrays and JSON values."""
+        self._pass_on_errors()
+        return super().state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Put the draws to come where `state_dict` found them."""
+        self._learnt.clear()
+        super().load_state_dict(state)
+
+    def _pass_on_errors(self) -> None:
+        """Give the rules the errors of a block at once: a call per batch and stratum costs more."""
+        if not self._learnt:
             return
-        errors = checked_errors(td_abs, rows)
-        places: Ints = self._place[rows].astype(np.int64)
-        if len(self.draws) == 1:
-            self.draws[0].update(places, errors)
-            return
-        stratum = self._stratum[rows]
-        for index in np.unique(stratum).tolist():
+        rows, errors = map(np.concatenate, zip(*self._learnt, strict=True))
+        self._learnt.clear()
+        places, stratum = self._place[rows].astype(np.int64), self._stratum[rows]
+        for index, draws in enumerate(self.draws):
             inside = stratum == index
-            self.draws[index].update(places[inside], errors[inside])
+            if inside.any():
+                draws.update(places[inside], errors[inside])
 
 
 def _dealt(values: NDArray[Any], order: Ints) -> NDArray[Any]:

@@ -46,6 +46,8 @@ def priorities(count: int, **numbers: float) -> Per:
 
 
 def now(drawing: QuotaSampler) -> list[np.ndarray]:
+    """Return the priorities of each stratum as the next block will see them."""
+    drawing.state_dict()  # passes on what was learnt since the last block
     return [draws.priority.astype(float) for draws in drawing.draws if isinstance(draws, Per)]
 
 
