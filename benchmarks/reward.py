@@ -41,9 +41,8 @@ from restock.train.twin.physics.episode import EpisodeSpec
 FIRST_SEED = 700_000
 ENVS = 32
 Z = 1.96  # 95 %
-EARLIER = Rewards(
-    slip_per_mps=-0.3, bump=-3.0
-)  # the shipped profile's, before a bump ended episodes
+# The shipped profile's, before a bump ended episodes.
+EARLIER = Rewards(slip_per_mps=-0.3, bump=-3.0)
 
 
 @dataclass(frozen=True)

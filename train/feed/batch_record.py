@@ -46,9 +46,8 @@ from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-_MAX_HELD = (
-    1 << 21
-)  # fresh rows; beyond that, the oldest interval is written without waiting for labels
+# Fresh rows; beyond that, the oldest interval is written without waiting for labels.
+_MAX_HELD = 1 << 21
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
 

@@ -19,10 +19,7 @@ from torch import Tensor
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.share_controller import (
-    PlannedDraws,
-    ShareController,
-)
+from restock.replay.mixture.share_controller import PlannedDraws, ShareController
 from restock.replay.panel.logged_sampler import (
     BatchDraw,
     LoggedSampler,

@@ -88,9 +88,8 @@ class DiagnoseCommand:
             if found is None and self.rows:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
         confirmation = None
-        if (
-            self.confirm is not None
-        ):  # of the run's own figures: no run of the rows' says if they hold
+        # It confirms what the run's own figures show: no further run can tell if rows are at fault.
+        if self.confirm is not None:
             confirmation = confirm(
                 runs[0],
                 own,
