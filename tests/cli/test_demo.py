@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,14 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 from rich.text import Text
 from support.panels import panel_of
+from support.paths import ROOT
 from support.stores import recording_transitions
 
 from restock import cli
-from restock.cli.start import stages
-from restock.cli.start.demo import MARKER, plan_of, prepare, run_demo
+from restock.cli.start import demo, outcomes, stages
+from restock.cli.start.demo import DemoCommand, plan_of
 from restock.cli.start.stages import Settings, Stage
-from restock.errors import RestockError
-from restock.ingest.profile.profile import load_profile, profile_toml
+from restock.cli.start.work import Work
 from restock.train.run.run import FORMAT
 
 SILENT = lambda message: None  # noqa: E731
@@ -92,64 +94,73 @@ def test_the_run_that_is_behind_catches_up(tmp_path: Path) -> None:
     assert ahead[:5] == ["train", "--resume", str(to.uniform), "--env-steps", "512"]
 
 
-def test_what_runs_beside_a_stage_ends_the_demo_where_it_fails(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def verb(command: list[str], code: int = 0) -> int:
+    """Stand in for a verb that prints its document."""
+    sys.stdout.write(json.dumps({"ran": command[0]}))
+    return code
+
+
+def test_what_runs_beside_a_stage_fails_it(tmp_path: Path) -> None:
     def stage(*beside: str) -> Stage:
-        return Stage("x", "x", "x", ["info"], beside=beside)
+        return Stage("x", "x", "x", ["info"], beside=beside, writes=())
 
-    assert run_demo([stage("info", "--help")], lambda command: 0, say=SILENT) == 0
     missing = stage("info", str(tmp_path / "nothing"))
-    assert run_demo([missing], lambda command: 0, say=SILENT) == 2
-    assert "nothing" in capfd.readouterr().err
+    assert Work(tmp_path / "a", verb, SILENT).do(stage("info", "--help")).good
+    ended = Work(tmp_path / "b", verb, SILENT).do(missing)
+    assert (ended.status, ended.exit_code) == ("failed", 2)
+    assert "nothing" in "".join(ended.errors)
     # What is beside one that fails does not go on.
-    assert run_demo([missing], lambda command: 130, say=SILENT) == 130
+    failing = Work(tmp_path / "c", lambda command: verb(command, 2), SILENT).do(missing)
+    assert failing.exit_code == 2
 
 
-def test_an_unexpected_exit_code_stops_the_demo(tmp_path: Path) -> None:
+def test_an_unexpected_exit_code_stops_the_demo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ran: list[str] = []
 
     def dispatch(command: list[str]) -> int:
         ran.append(command[0])
-        return {"audit": 1, "mix": 2}.get(command[0], 0)
+        return verb(command, {"audit": 1, "mix": 2}.get(command[0], 0))
 
+    monkeypatch.setattr(cli, "main", dispatch)
+    monkeypatch.setattr(outcomes, "errors", lambda text: [])
+    plain = [replace(stage, outcome=stages.nothing) for stage in plan(tmp_path)]
+    monkeypatch.setattr(demo, "plan_of", lambda to: plain)
     # A failed audit is expected on sample logs; a mixture that is refused is not.
-    assert run_demo(plan(tmp_path), dispatch, say=SILENT) == 2
+    assert DemoCommand(out=tmp_path / "out").run() == 2
     assert ran[-1] == "mix"
 
 
-def test_an_earlier_demo_is_replaced_and_nothing_else(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    prepare(out)
-    (out / "old").write_text("old")
-    prepare(out)
-    assert sorted(path.name for path in out.iterdir()) == [MARKER]
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "thesis.tex").write_text("precious")
-    with pytest.raises(RestockError, match="not made by a demo"):
-        prepare(mine)
-    assert (mine / "thesis.tex").read_text() == "precious"
+def test_a_stage_decides_its_command_when_its_turn_comes(tmp_path: Path) -> None:
+    ran: list[list[str]] = []
+
+    def dispatch(command: list[str]) -> int:
+        ran.append(command)
+        return verb(command)
+
+    def stage(command: list[str] | None) -> Stage:
+        return Stage("x", "x", "x", ["train", "LATER"], decided=lambda: command)
+
+    assert Work(tmp_path / "out", dispatch, SILENT).do(stage(["train", "now"])).good
+    assert ran == [["train", "now", "--json"]]
+    assert Work(tmp_path / "out", dispatch, SILENT).do(stage(["train", "then"])).status == "kept"
+    assert Work(tmp_path / "none", dispatch, SILENT).do(stage(None)).good
+    assert len(ran) == 1
 
 
-def test_demo_keeps_user_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    prepare(out)
-    (out / "mine.mcap").write_text("precious")
-    (tmp_path / "link").symlink_to(out)
-    profile = out / "mine.toml"
-    profile.write_text(profile_toml(load_profile("turtlebot3")))
-    for given in (
-        ["--logs", str(out / "mine.mcap")],
-        ["--logs", str(tmp_path)],  # which has `out` within it
-        ["--logs", str(tmp_path / "link" / "*.mcap")],
-        ["--profile", str(profile)],
-    ):
-        assert cli.main(["demo", "--out", str(out), *given]) == 2
-        assert "is inside --out" in capsys.readouterr().err
-    for given in (["--logs", str(tmp_path / "lgos")], ["--profile", "turtelbot3"]):
-        assert cli.main(["demo", "--out", str(out), *given]) == 2
-    assert (out / "mine.mcap").read_text() == "precious"
+@pytest.mark.parametrize(
+    "given", [("--logs", "lgos"), ("--profile", "turtelbot3"), ("--out", "mine")]
+)
+def test_a_demo_that_cannot_begin_writes_nothing(tmp_path: Path, given: tuple[str, str]) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("precious")
+    flag, value = given
+    where = value if flag == "--profile" else str(tmp_path / value)
+    out = [] if flag == "--out" else ["--out", str(tmp_path / "out")]
+    assert cli.main(["demo", *out, flag, where]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
 
 
 @pytest.mark.parametrize("given", [("--seconds", "0"), ("--seconds", "nan"), ("--episodes", "0")])
@@ -161,9 +172,9 @@ def test_a_demo_that_could_not_end_does_not_begin(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_name_in_brackets_is_said_as_it_is() -> None:
+def test_a_name_in_brackets_is_said_as_it_is(tmp_path: Path) -> None:
     said: list[str] = []
-    run_demo([Stage("info", "", "", ["info", "a[old].mcap"])], lambda command: 0, say=said.append)
+    Work(tmp_path, verb, said.append).do(Stage("info", "", "", ["info", "a[old].mcap"]))
     assert "info 'a[old].mcap'" in "\n".join(Text.from_markup(line).plain for line in said)
 
 
@@ -171,19 +182,19 @@ def test_a_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFix
     out = tmp_path / "out"
     assert cli.main(["demo", "--out", str(out), "--dry-run"]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert printed[-1] == f"restock report {out / 'run'}"
+    assert printed[-1] == f"$ restock report {out / 'run'}"
     assert not out.exists()
 
 
 def test_logs_of_another_robot_are_ingested_by_their_profile(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["--logs", str(tmp_path), "--profile", "mine.toml"]
+    given = ["--logs", str(ROOT / "sample_logs"), "--profile", "turtlebot3"]
     assert cli.main(["demo", "--out", str(tmp_path / "out"), *given, "--dry-run"]) == 0
     (ingest,) = [
-        line for line in capsys.readouterr().out.splitlines() if line.startswith("restock ingest")
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("$ restock ingest")
     ]
-    assert ingest.endswith("--profile mine.toml")
+    assert ingest.endswith("--profile turtlebot3")
 
 
 @pytest.mark.slow

@@ -1,34 +1,23 @@
 """`restock demo`: the whole way in one command, on recordings that come with Restock.
 
-Each stage says what it does and why, and the command that does it. A stage is a command line that
-a user could type; the demo runs the very same code.
+Each stage says why it is there, and shows the command that does it: one that a user could type.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import shutil
-import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from restock.cli.start import stages, story
 from restock.cli.start.stages import Settings, Stage
-from restock.cli.start.work import escape
-from restock.errors import ConfigError, ExitCode, RestockError
+from restock.cli.start.work import Work, escape
+from restock.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-MARKER = ".restock-demo"
-LAST_LINES = 20  # shown of a command that runs beside another and fails
 
 
 @dataclass
@@ -45,8 +34,8 @@ class DemoCommand:
     """
 
     out: Path = Path("restock-demo")
-    """The folder for store, panel, run and report. The output of an earlier demo there is
-    replaced."""
+    """The folder for store, panel, run and report. Stages that an earlier call finished there are
+    kept."""
     logs: Path | None = None
     """Recordings to use. Default: sample_logs/ of the source tree; if it is missing, the demo
     records some."""
@@ -63,23 +52,55 @@ class DemoCommand:
     dry_run: bool = False
     """Print the commands that would run; run nothing."""
     json: bool = False
-    """At the end, print {"report", "store", "panel", "run"} as JSON."""
+    """At the end, print {"stages": [{"name", "command", "status", …}], "report"} as JSON."""
 
-    def run(self) -> int | None:
+    def run(self) -> int:
         from restock.cli import main
-        from restock.cli.output import print_json, stdout
+        from restock.cli.output import print_json, stderr, stdout
 
         if not 0 < self.seconds < math.inf:
             raise ConfigError(f"must be a number above 0, got {self.seconds:g}", where="--seconds")
         if self.episodes < 1:
             raise ConfigError(f"must be at least 1, got {self.episodes}", where="--episodes")
-        logs = self.logs or find_logs()
-        plan = []
+        self._check()
+        to, plan = self._plan()
+        console = stderr() if self.json else stdout()
+
+        def say(line: str) -> None:
+            console.print(line, soft_wrap=True)
+            console.file.flush()  # what is on stderr comes after it
+
+        work = Work(self.out, main, say, plan=self.dry_run, explain=True)
+        if not self.dry_run:
+            say(f"[bold]What you are about to see[/bold]\n\n{story.OPENING}")
+        for stage in plan:
+            ended = work.do(stage)
+            if not ended.good:
+                return ended.exit_code or int(ExitCode.ERROR)
+        report = to.run / "report.html"
+        if self.json:
+            print_json({"stages": work.summary(), "report": str(report)})
+        elif not self.dry_run:
+            tell(to, console)
+            say(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
+        return int(ExitCode.OK)
+
+    def _check(self) -> None:
+        """Raise RestockError if the user's recordings or profile cannot be found or read."""
+        from restock.ingest.containers.discover import recordings_in
+        from restock.ingest.profile.profile import load_profile
+
+        if self.logs is not None:
+            recordings_in(self.logs)
+        if self.profile is not None:
+            load_profile(self.profile)
+
+    def _plan(self) -> tuple[Settings, list[Stage]]:
+        """Return what the stages share, and the stages."""
+        logs, record = self.logs or find_logs(), []
         if logs is None:
             logs = self.out / "logs"
-            record = ["twin", "record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
-            why = "This installation has no sample recordings: a simulated robot records some."
-            plan.append(Stage("record", "Record", why, record))
+            record.append(stages.record(logs))
         to = Settings(
             logs=(str(logs),),
             out=self.out,
@@ -89,42 +110,7 @@ class DemoCommand:
             device=self.device,
             train=("practice.rule=success",),
         )
-        plan += plan_of(to)
-        if self.dry_run:
-            sys.stdout.writelines(f"{stage.line()}\n" for stage in plan)
-            return None
-        prepare(self.out, self._given())
-        console = stdout()
-        if not self.json:
-            console.print(f"[bold]What you are about to see[/bold]\n\n{story.OPENING}")
-        code = run_demo(plan, main, say=console.print)
-        if code:
-            return code
-        report = self.out / "run" / "report.html"
-        if self.json:
-            parts = {name: str(self.out / name) for name in ("store", "panel", "run")}
-            print_json({"report": str(report), **parts})
-        else:
-            tell(to, console)
-            console.print(
-                f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)"
-            )
-        return None
-
-    def _given(self) -> list[Path]:
-        """Return the user's own files, which must exist: the recordings and the profile.
-
-        Raises:
-            RestockError: they cannot be found or read.
-        """
-        from restock.ingest.containers.discover import recordings_in
-        from restock.ingest.profile.profile import load_profile
-
-        given = [] if self.logs is None else [self.logs, *recordings_in(self.logs)]
-        if self.profile is not None:
-            load_profile(self.profile)
-            given += [Path(self.profile)] if Path(self.profile).is_file() else []
-        return given
+        return to, record + plan_of(to)
 
 
 def tell(to: Settings, console: Console) -> None:
@@ -171,102 +157,10 @@ def plan_of(to: Settings) -> list[Stage]:
     ]
 
 
-def run_demo(
-    plan: list[Stage], dispatch: Callable[[list[str]], int], *, say: Callable[[str], None]
-) -> int:
-    """Run the stages in order; stops at the first unexpected exit code and returns it."""
-    began = time.monotonic()
-    for number, stage in enumerate(plan, start=1):
-        say(f"\n[bold]{number}/{len(plan)}  {stage.title}[/bold]")
-        say(f"[dim]{stage.why}[/dim]")
-        if stage.decided is not None:
-            command = stage.decided()
-            if command is None:
-                say("[dim]They already have: nothing to do.[/dim]")
-                continue
-            stage = replace(stage, command=command)
-        say(f"[cyan]$ {escape(stage.line())}[/cyan]\n")
-        sys.stdout.flush()
-        started = time.monotonic()
-        with _beside(stage, say) as other:
-            code = dispatch(stage.command)
-            sys.stdout.flush()
-            code = code if code not in stage.expected else other() or code
-        if code not in stage.expected:
-            return code
-        if code:
-            say(f"[yellow]exit code {code}: {stage.remark}[/yellow]")
-        say(f"[dim]{time.monotonic() - started:.1f} s[/dim]")
-    say(f"\n[bold]Done in {time.monotonic() - began:.0f} s.[/bold]")
-    return int(ExitCode.OK)
-
-
-@contextmanager
-def _beside(stage: Stage, say: Callable[[str], None]) -> Iterator[Callable[[], int]]:
-    """Run a stage's other command in a process of its own; yields what waits for its exit code.
-
-    Its output is shown if it fails. It does not outlive the block.
-    """
-    if not stage.beside:
-        yield lambda: int(ExitCode.OK)
-        return
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # beside another, each has a core
-    with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "restock", *stage.beside],
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            env=environment,
-        )
-
-        def wait() -> int:
-            if code := process.wait():
-                said.seek(0)
-                say(f"[red]beside it: {escape(stage.line().splitlines()[0])}[/red]")
-                sys.stderr.write("".join(said.readlines()[-LAST_LINES:]))
-            return code
-
-        try:
-            yield wait
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
-
-
 def find_logs() -> Path | None:
-    """`sample_logs/` of the source tree that this code runs from, if it runs from one."""
+    """Return `sample_logs/` of the source tree that this code runs from, if it runs from one."""
     here = Path(__file__).resolve()
     logs = here.parents[4] / "sample_logs"
     if not logs.is_dir() or not any(logs.iterdir()):
         return None
     return logs.relative_to(Path.cwd()) if logs.is_relative_to(Path.cwd()) else logs
-
-
-def prepare(out: Path, given: Sequence[Path] = ()) -> None:
-    """Make an empty directory for the demo, in place of what an earlier demo left.
-
-    Raises:
-
-    Raises:
-        RestockError: there is something at `out` that no demo made, or that is one of the user's
-            files that were given.
-    """
-    for path in given:  # by its name too: a link in `out` to a file elsewhere would be lost
-        if path.absolute().is_relative_to(out.absolute()) or path.resolve().is_relative_to(
-            out.resolve()
-        ):
-            raise RestockError(
-                f"is inside --out {out}, which the demo replaces",
-                where=str(path),
-                remedy="choose another --out",
-            )
-    if out.exists() and not (out / MARKER).exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RestockError(
-            "already exists, and was not made by a demo",
-            where=str(out),
-            remedy="choose another --out",
-        )
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    (out / MARKER).write_text("made by `restock demo`, which may replace it\n", encoding="utf-8")

@@ -34,12 +34,11 @@ class Stage:
     reads: tuple[Path, ...] = ()  # the user's files: the stage is run again if one changes
     writes: tuple[Path, ...] = ()
     expected: tuple[int, ...] = (0,)  # exit codes after which the next stage runs
-    remark: str = ""  # shown by `restock demo` if the exit code is not 0
     outcome: Callable[[Document], list[str]] = nothing  # in a line or two
     shows_progress: bool = False  # it takes minutes
     resume: tuple[str, ...] = ()  # the command that continues an interrupted stage
-    beside: tuple[str, ...] = ()  # a command that `restock demo` runs at the same time
-    # The command for `restock demo` if it depends on earlier stages; None: not needed.
+    beside: tuple[str, ...] = ()  # a command that runs at the same time
+    # The command if it depends on earlier stages; None: there is nothing to do.
     decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
@@ -161,6 +160,16 @@ def own_file(name: Path | str | None) -> tuple[Path, ...]:
     return () if name is None or not Path(name).is_file() else (Path(name),)
 
 
+def record(logs: Path) -> Stage:
+    return Stage(
+        "record",
+        "Record",
+        "This installation has no sample recordings: a simulated robot records some.",
+        ["twin", "record", "--out", str(logs / "sample.mcap"), "--missions", "60"],
+        writes=(logs,),
+    )
+
+
 def info(to: Settings) -> Stage:
     return Stage(
         "info",
@@ -218,7 +227,6 @@ def ingest(to: Settings) -> Stage:
         reads=(*to.read, *to.profile_file),
         writes=(to.store,),
         expected=(0, 3),
-        remark="some data was lost or skipped: see the table above",
         outcome=outcomes.ingest,
     )
 
@@ -242,7 +250,6 @@ def audit(to: Settings) -> Stage:
         " stops you here.",
         ["audit", str(to.store)],
         expected=(0, 1),
-        remark="an audit failed: a pipeline would stop here, the demo continues",
         outcome=outcomes.audit,
     )
 
@@ -251,9 +258,8 @@ def mix(to: Settings) -> Stage:
     return Stage(
         "mix",
         "A replay panel that keeps the rare conditions in stock",
-        "Each stratum holds the whole episodes that met its condition. Its natural, wanted and "
-        "drawn shares and the share after weights are shown side by side, and missing data is "
-        "given in rows and hours of driving. The result is a pinned panel with an id.",
+        "Each stratum holds the whole episodes that met its condition, and gets its share of "
+        "every batch. The result is a pinned panel with an id.",
         ["mix", str(to.store), "--mixture", to.mixture, "--out", str(to.panel)],
         reads=to.mixture_file,
         writes=(to.panel,),
@@ -375,6 +381,8 @@ def train_beside_uniform(to: Settings) -> Stage:
             *("--seconds", f"{to.seconds:g}", "--device", to.device),
             *(word for setting in to.train for word in ("--set", setting)),
         ),
+        writes=(to.run, to.uniform),
+        resume=(),  # one of the two may have ended
     )
 
 

@@ -102,10 +102,9 @@ class StartCommand:
         page = self.out / "run" / "report.html"
         reported = stopped is None or any(e.name == "report" and e.good for e in work.ended)
         if self.json:
-            stages = [{k: v for k, v in asdict(e).items() if k != "document"} for e in work.ended]
             print_json(
                 {
-                    "stages": stages,
+                    "stages": work.summary(),
                     "stopped": None if stopped is None else asdict(stopped),
                     "report": str(page) if page.exists() and reported else None,
                 }

@@ -11,10 +11,12 @@ import io
 import json
 import os
 import shutil
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from restock.files import read_json, write_text
 
 FOLDER, RECORD = "start", "stages.json"
 SMALL_BYTES = 1_000_000  # files up to this size are hashed; larger ones are known by size and time
+LAST_LINES = 20  # shown of a command that runs beside another and fails
 Dispatch = Callable[[list[str]], int]
 
 
@@ -53,13 +56,21 @@ class Ended:
 class Work:
     """Runs stages in a folder of its own, and remembers them.
 
-    `say` prints a line. With `plan` nothing is run: the commands are said.
+    `say` prints a line. With `plan` nothing is run: the commands are said. With `explain` each
+    stage says why it is there.
     """
 
     def __init__(
-        self, out: Path, dispatch: Dispatch, say: Callable[[str], None], *, plan: bool = False
+        self,
+        out: Path,
+        dispatch: Dispatch,
+        say: Callable[[str], None],
+        *,
+        plan: bool = False,
+        explain: bool = False,
     ) -> None:
-        self.out, self.dispatch, self.say, self.plan = out, dispatch, say, plan
+        self.out, self.dispatch, self.say = out, dispatch, say
+        self.plan, self.explain = plan, explain
         self.ended: list[Ended] = []
         self._stamps: list[str] = []
         self._known: dict[str, Any] = {}
@@ -68,7 +79,7 @@ class Work:
             self._known = read_json(record)
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise RestockError(
-                "already exists, and was not made by `restock start`",
+                "already exists, and was not made by `restock start` or `restock demo`",
                 where=str(out),
                 remedy="choose another --out",
             )
@@ -83,6 +94,8 @@ class Work:
             KeyboardInterrupt: it was interrupted; the same stage then goes on, or begins again.
         """
         self.say(f"\n[bold]{len(self.ended) + 1}  {stage.title}[/bold]")
+        if self.explain:
+            self.say(f"[dim]{stage.why}[/dim]")
         if self.plan:
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
             return self._note(Ended(stage.name, stage.line(), "planned"))
@@ -91,6 +104,11 @@ class Work:
             self._stamps.append(stamp)
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]  [dim]done before[/dim]")
             return self._note(kept)
+        if stage.decided is not None:
+            if (command := stage.decided()) is None:
+                self._stamps.append(stamp)
+                return self._note(Ended(stage.name, "", "kept", outcome=["nothing to do"]))
+            stage = replace(stage, command=command)
         began = self._known.get(stage.name, {})
         goes_on = bool(stage.resume) and began.get("stamp") == stamp and _resumable(stage)
         if not goes_on:
@@ -109,8 +127,10 @@ class Work:
         said: Any = _Both(sys.stderr, complaints) if stage.shows_progress else complaints
         started = time.monotonic()
         sys.stdout.flush()
-        with redirect_stdout(printed), redirect_stderr(said):
+        with _beside(stage) as other, redirect_stdout(printed), redirect_stderr(said):
             code = self.dispatch([*stage.command, "--json"])
+            if code in stage.expected:
+                code = other() or code
         if code == ExitCode.INTERRUPTED:
             if not stage.shows_progress:
                 sys.stderr.write(complaints.getvalue())
@@ -132,9 +152,13 @@ class Work:
         )
         if document:
             write_text(self._document(stage), text)
-        self._known[stage.name] = {k: v for k, v in asdict(ended).items() if k != "document"}
+        self._known[stage.name] = _without_document(ended)
         self._keep()
         return ended
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Return each stage as `--json` prints it, without the document of its verb."""
+        return [_without_document(ended) for ended in self.ended]
 
     def _note(self, ended: Ended, *, reported: bool = False) -> Ended:
         """Report the result of a stage, and its complaints unless they were `reported` before."""
@@ -189,6 +213,42 @@ class Work:
 
     def _keep(self) -> None:
         write_text(self.out / FOLDER / RECORD, json.dumps(self._known, indent=1) + "\n")
+
+
+def _without_document(ended: Ended) -> dict[str, Any]:
+    return {key: value for key, value in asdict(ended).items() if key != "document"}
+
+
+@contextmanager
+def _beside(stage: Stage) -> Iterator[Callable[[], int]]:
+    """Run a stage's other command in a process of its own; yield what waits for its exit code.
+
+    Its output is shown if it fails. It does not outlive the block.
+    """
+    if not stage.beside:
+        yield lambda: int(ExitCode.OK)
+        return
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # beside another, each has a core
+    with tempfile.TemporaryFile("w+") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "restock", *stage.beside],
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            env=environment,
+        )
+
+        def wait() -> int:
+            if code := process.wait():
+                said.seek(0)
+                sys.stderr.write("".join(said.readlines()[-LAST_LINES:]))
+            return code
+
+        try:
+            yield wait
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
 
 
 class _Both:
