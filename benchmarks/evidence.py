@@ -40,9 +40,8 @@ from restock.files import write_text
 from restock.report import write_study_page
 from restock.stats import paired_t
 from restock.train.study.contrasts import RunCurve
-from restock.train.study.findings import findings
 from restock.train.study.study import DONE, Study, StudyPlan, load_study
-from restock.train.study.study_run import run_study
+from restock.train.study.study_run import findings, run_study
 
 HERE = Path(__file__).parent / "evidence"
 QUESTIONS = ("twin-nominal", "lead", "ring", "practice", "archive")

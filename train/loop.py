@@ -26,8 +26,8 @@ from restock.train.evaluation.evaluate import (
     Score,
     score,
 )
-from restock.train.evaluation.off_policy.dataset import load_ope_dataset
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of, notes_of
+from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe

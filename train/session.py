@@ -24,8 +24,7 @@ from restock.state import Stateful
 from restock.toml import by_path
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.evaluate import Score, fixed_episodes
-from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
+from restock.train.evaluation.evaluate import EvaluationBuffer, Score, fixed_episodes
 from restock.train.evaluation.policies import kept_one, load_kept, save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches

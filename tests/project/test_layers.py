@@ -53,7 +53,7 @@ MAY_IMPORT = {
         "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task"
     ),
     "train": (
-        "dqn evaluation evaluation/off_policy feed run twin/missions twin/env twin/floors"
+        "dqn evaluation feed run twin/missions twin/env twin/floors"
         " twin/physics replay/mixture replay/panel replay/ring"
         " replay/store ingest/profile ingest/task"
     ),
@@ -64,14 +64,13 @@ MAY_IMPORT = {
         " replay/ring replay/plan replay/sampling ingest/task ingest/profile ingest/store"
         " replay/fleet twin/physics"
     ),
-    "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
-        "dqn evaluation/off_policy feed run twin/drivers twin/missions twin/env twin/floors"
-        " twin/physics replay/panel replay/ring replay/store ingest/live"
+        "dqn feed run twin/drivers twin/missions twin/env twin/floors"
+        " twin/physics replay/panel replay/ring replay/store ingest/live ingest/store"
         " ingest/profile ingest/task"
     ),
     "train/judge": (
-        "train dqn evaluation evaluation/off_policy feed run twin/calibration twin/drivers"
+        "train dqn evaluation feed run twin/calibration twin/drivers"
         " twin/missions twin/env twin/physics replay/fleet replay/panel replay/store"
         " ingest/profile ingest/store ingest/task"
     ),
@@ -127,7 +126,7 @@ MAY_IMPORT = {
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
         " replay/mixture replay/panel replay/store replay/trace train/judge train/dqn"
-        " train/evaluation train/evaluation/off_policy train/run train/twin/calibration"
+        " train/evaluation train/run train/twin/calibration"
         " train/twin/floors train/twin/missions"
     ),
     "cli/twin": (

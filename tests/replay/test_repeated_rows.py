@@ -16,7 +16,7 @@ from support.stores import TASK, recording_transitions, write_store
 from restock.cli import main
 from restock.errors import MixtureError
 from restock.replay.store.store import Store
-from restock.train.evaluation.off_policy.dataset import load_ope_dataset
+from restock.train.evaluation.ope_dataset import load_ope_dataset
 
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
 NEATO = SHARED / "fleet-neato"

@@ -227,7 +227,7 @@ def cut_short() -> None:
     from restock import cli
     from restock.cli.start import demo
     from restock.train import prepare
-    from restock.train.evaluation import eval_run, evaluation_plan, ope
+    from restock.train.evaluation import eval_run, ope
     from restock.train.study import study_run
     from restock.train.twin.calibration import fit, gap
     from restock.train.twin.env import vector_env
@@ -304,7 +304,7 @@ def cut_short() -> None:
     model = ope.OpeConfig().model
     object.__setattr__(model, "iterations", 2)
     object.__setattr__(model, "cloning_updates", 20)
-    eval_run.plan_evaluation = evaluation_plan.plan_evaluation = one_episode
+    eval_run.plan_evaluation = eval_run.plan_evaluation = one_episode
     RecordingPlan.__post_init__ = few_missions
     fit.fit = short_fit
     gap.measure_gap = short_gap

@@ -15,8 +15,8 @@ from support.stores import recording_transitions, write_store
 from restock.cli import main
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.fitted_q import cloned_probabilities
-from restock.train.evaluation import cloned
-from restock.train.evaluation.cloned import load_cloned
+from restock.train.evaluation import policies
+from restock.train.evaluation.policies import load_cloned
 from restock.train.run.kept_evaluations import read_clones
 from restock.train.run.run import Run
 
@@ -27,7 +27,7 @@ ACTIONS = len(TASK.actions)
 @pytest.fixture(autouse=True)
 def few_updates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clone by few updates, as what is learnt here is easy."""
-    monkeypatch.setattr(cloned, "UPDATES", (50, 100))
+    monkeypatch.setattr(policies, "UPDATES", (50, 100))
 
 
 def driven_by_a_rule(recording: int, who: str) -> pa.Table:
@@ -94,7 +94,7 @@ def test_a_clone_is_kept_and_not_trained_again(
     assert first.quality.rows < len(panel)
     load_cloned(run, "cloned:planner")
     assert [one.policy for one in read_clones(run.path)] == ["cloned:teleop", "cloned:planner"]
-    monkeypatch.setattr(cloned, "clone_of", None)  # calling it would fail
+    monkeypatch.setattr(policies, "clone_of", None)  # calling it would fail
     again = load_cloned(run, "cloned:teleop")
     assert again.quality == first.quality
     weights, before = again.network.state_dict(), first.network.state_dict()

@@ -18,8 +18,8 @@ from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.study.contrasts import RunCurve, area, contrast
-from restock.train.study.findings import contrasts, findings
 from restock.train.study.study import StudyPlan, load_study
+from restock.train.study.study_run import contrasts, findings
 
 PRIMARY = 'primary = { arm = "quotas", baseline = "uniform", measure = "auc_wheel_slip" }\n'
 STUDY = f"""

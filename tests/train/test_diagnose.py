@@ -18,8 +18,7 @@ from restock.train.dqn.config import TeacherConfig, TrainConfig, apply_overrides
 from restock.train.dqn.target import Hard, Polyak, TargetRule
 from restock.train.judge.before_training import RowDiagnosis
 from restock.train.judge.causes import Finding
-from restock.train.judge.confirm import confirm, swapped
-from restock.train.judge.diagnose import diagnose
+from restock.train.judge.diagnose import confirm, diagnose, swapped
 from restock.train.judge.windows import action_symptoms
 from restock.train.prepare import Prepared
 from restock.train.run.run import Run
@@ -540,7 +539,7 @@ def test_of_two_faults_the_experiment_answers_for_the_target(
 
         def close(self) -> None: ...
 
-    monkeypatch.setattr("restock.train.judge.confirm.prepare_new", Trained)
-    monkeypatch.setattr("restock.train.judge.confirm.train", lambda session: None)
+    monkeypatch.setattr("restock.train.judge.diagnose.prepare_new", Trained)
+    monkeypatch.setattr("restock.train.judge.diagnose.train", lambda session: None)
     answer = confirm(run, found, tmp_path / "c")
     assert (answer["cause"], answer["confirmed"]) == (cause, confirmed)

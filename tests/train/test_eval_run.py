@@ -12,7 +12,7 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.files import write_table
-from restock.train.evaluation.evaluation_plan import plan_evaluation
+from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.run.kept_evaluations import (
     WAYS,
     add_evaluation,

@@ -8,7 +8,7 @@ import pytest
 from support.stores import TASK
 
 from restock.replay.store.store import Store
-from restock.train.evaluation.off_policy.estimators import EssGate
+from restock.train.evaluation.ope import EssGate
 from restock.train.judge.evidence_needed import Evidence, policy_evidence
 
 PERIOD_S = TASK.control_period_s

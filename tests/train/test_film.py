@@ -15,8 +15,12 @@ from support.kept_run import kept_run
 from restock.cli import main
 from restock.report.run.films import films_section
 from restock.train.evaluation import film
-from restock.train.evaluation.eval_run import drive_evaluation
-from restock.train.evaluation.evaluation_plan import EvaluationPlan, make_policy, plan_evaluation
+from restock.train.evaluation.eval_run import (
+    EvaluationPlan,
+    drive_evaluation,
+    make_policy,
+    plan_evaluation,
+)
 from restock.train.evaluation.film import RESCUE, WORST, differing_fields, drive_again, scenes
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.twin.env.interface import Policy

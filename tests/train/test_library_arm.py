@@ -16,7 +16,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.evaluation.policies import load_agent
 from restock.train.libraries.library_arm import (
-    DONE,
+    TRAINED,
     LibraryArm,
     dqn_arguments,
     resolve,
@@ -69,7 +69,7 @@ def test_an_arm_whose_network_is_not_finite_ends_with_an_error(
     own = {"sb3-ppo": {"n_steps": 40, "batch_size": 20, "n_epochs": 2}}.get(library, {})
     with pytest.raises(NotFinite, match="not finite"):
         trained(tmp_path / "run", library, learning_rate=float("inf"), **own)
-    assert not (tmp_path / "run" / DONE).exists()
+    assert not (tmp_path / "run" / TRAINED).exists()
     assert not Run.open(tmp_path / "run").best.exists()
 
 

@@ -21,7 +21,7 @@ from restock.cli.start.decisions import no_ways
 from restock.cli.start.stages import Settings
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
-from restock.train.evaluation.evaluation_plan import plan_evaluation
+from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.twin.floors.floor_file import write_floor

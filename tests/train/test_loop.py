@@ -20,8 +20,7 @@ from restock.cli.learning.describe_run import no_update
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
-from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
+from restock.train.evaluation.evaluate import EpisodeResult, EvaluationBuffer, fixed_episodes
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.feed.logs import Coded, Logs, LogTerms
 from restock.train.loop import TrainingInterrupted, nothing_to_do, train

@@ -25,8 +25,8 @@ from restock.replay.store.store import Store
 from restock.train.dqn.algorithm import DQN
 from restock.train.dqn.config import LossConfig, NetworkConfig
 from restock.train.dqn.fitted_q import soft_greedy
-from restock.train.evaluation.off_policy.dataset import OpeSteps, load_ope_dataset, read_steps
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy
+from restock.train.evaluation.ope_dataset import OpeSteps, load_ope_dataset, read_steps
 
 TASK = load_profile("warehouse_amr").task
 MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.3\n")

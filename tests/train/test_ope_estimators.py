@@ -14,7 +14,7 @@ from restock.train.dqn.fitted_q import (
     fitted_q,
     values,
 )
-from restock.train.evaluation.off_policy.estimators import (
+from restock.train.evaluation.ope import (
     EssGate,
     OpeEpisodes,
     effective_episodes,

@@ -12,6 +12,7 @@ import pytest
 from restock.cli import main
 from restock.errors import RunError
 from restock.files import write_table
+from restock.train.evaluation import eval_run
 from restock.train.evaluation.regression import (
     read_baseline,
     read_run_evaluation,
@@ -140,9 +141,7 @@ def test_few_episodes_say_nothing_of_better_or_worse(
     assert "at least 5" in str(few["all"]["reason"])
     assert not regressed(rows)
 
-    from restock.train.evaluation import evaluation_plan
-
-    monkeypatch.setattr(evaluation_plan, "plan_evaluation", lambda *_, **__: None)  # nothing drives
+    monkeypatch.setattr(eval_run, "plan_evaluation", lambda *_, **__: None)  # nothing drives
     assert main(["eval", str(bad), "--no-drive", "--baseline", str(good), "--check"]) == 0
     said = capsys.readouterr()
     assert "inconclusive" in said.out
@@ -204,9 +203,8 @@ def test_the_verb_is_fit_for_a_pipeline(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    from restock.train.evaluation import evaluation_plan
 
-    monkeypatch.setattr(evaluation_plan, "plan_evaluation", lambda *_, **__: None)  # nothing drives
+    monkeypatch.setattr(eval_run, "plan_evaluation", lambda *_, **__: None)  # nothing drives
     worse = evaluated(tmp_path / "b", {**GOOD, "wheel_slip": 0.2})
     argv = ["eval", str(baseline), "--no-drive", "--save-as-baseline", "main"]
     assert main(argv) == 0

@@ -16,8 +16,8 @@ from restock.errors import ConfigError, RunError
 from restock.train.judge.comparability import Check, Difference, Treatment
 from restock.train.judge.compare import Comparison
 from restock.train.study import study_run
-from restock.train.study.findings import findings
 from restock.train.study.study import StudyPlan, load_study
+from restock.train.study.study_run import findings
 
 SMALL = """
 treatment = "algorithm"

@@ -29,13 +29,12 @@ from restock.replay.trace.seen_at_ticks import seen_between
 from restock.replay.trace.trace import Trace, TracePlaces, trace_row
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.eval_run import drive_evaluation
-from restock.train.evaluation.evaluation_plan import plan_evaluation
+from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
 from restock.train.run import checkpoint
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.run.run import Run
 from restock.train.session import Progress
-from restock.train.view.critic import critic_along
+from restock.train.view.mcap_view import critic_along
 from restock.train.view.write_view import ViewOptions, layout_of, write_view
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"

@@ -1,42 +1,388 @@
-"""Evaluating a run: its policy beside scripted ones, on the same episodes.
+"""Evaluating a run: its policy beside references, on the same episodes; every name is checked.
 
 Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
 split by how much of the aisle is blocked. Seeds differ from those that training drew its
 episodes from and from those that chose the checkpoint.
+
+The references are scripted drivers that do not explore. The planner drives as a robot without
+learning would. The operator sees pallets, people and wet floor as they are, so it is an upper bound
+for a driver that knows everything.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import pyarrow as pa
 
-from restock.errors import RunError
+from restock.errors import ConfigError, RunError
+from restock.ingest.task.limiter import Limiter, Limits
 from restock.interrupts import interrupts_raised
+from restock.toml import read_toml, typed
+from restock.train.dqn.config import LAST_SEED, TrainConfig, parse_config
 from restock.train.dqn.network import torch_threads
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
-from restock.train.evaluation.evaluation_plan import (
-    CLEAN,
-    POLICIES,
-    EvaluationPlan,
-    make_policy,
-    plan_evaluation,
+from restock.train.evaluation.logged_ways import EVERY, HELD_OUT, LoggedMissions, logged_missions
+from restock.train.evaluation.policies import (
+    CLONED,
+    GreedyPolicy,
+    cloned_panel,
+    is_cloned,
+    load_agent,
+    load_cloned,
+    load_policy,
 )
-from restock.train.evaluation.references import FIRST_SEED
 from restock.train.run.kept_evaluations import (
     LIMITED,
+    WAYS,
     CloneQuality,
     add_evaluation,
     read_clones,
     shown_evaluation,
 )
+from restock.train.run.kept_policy import PolicyOrigin
 from restock.train.run.measures import summary_rows
-from restock.train.run.run_profile import profile_of_run
+from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.run.run_tables import EVAL_EPISODES
+from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
+from restock.train.twin.env.interface import Policy
+from restock.train.twin.floors.floors import layouts_of_split, open_floors
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.physics.perturbation import (
+    PERTURBATIONS,
+    Perturbation,
+    Schedule,
+    find_perturbation,
+    is_schedule,
+)
 from restock.words import quoted
+
+REFERENCES = ("planner", "operator", "random")
+FIRST_SEED = 10_000
+
+
+def wrong_seed(seed: int, count: int = 1) -> str | None:
+    """Return what is wrong with a seed, or with the first of `count` in a row; None: nothing."""
+    if 0 <= seed <= LAST_SEED + 1 - count:
+        return None
+    last = f" ({count:,} seeds from there on)" if count > 1 else ""
+    return f"must be from 0 to {LAST_SEED + 1 - count}{last}, got {seed}"
+
+
+def reference(name: str, seed: int = 0) -> Policy:
+    """Make a reference driver by its name.
+
+    Raises:
+        ConfigError: there is none of the name.
+    """
+    from restock.train.twin.drivers.operator_policy import Operator
+    from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
+
+    if name == "planner":
+        return PlannerFollower(epsilon=0.0, seed=seed)
+    if name == "operator":
+        return Operator(epsilon=0.0, seed=seed)
+    if name == "random":
+        return RandomPolicy(seed=seed)
+    raise ConfigError(
+        f"there is no policy named {name!r}",
+        where="drivers",
+        remedy=f"choose from {', '.join(REFERENCES)}",
+    )
+
+
+CLEAN = "none"
+DRAWN = "drawn"  # missions by the seeds, on the floor
+POLICIES = ("agent", "planner", "random")
+_PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """What to evaluate; every name was checked."""
+
+    run: Run
+    config: TrainConfig
+    policies: tuple[str, ...]
+    perturbations: dict[str, Perturbation | None]  # by the requested name or file
+    episodes: Mapping[str, int]  # by kind
+    first_seed: int = FIRST_SEED
+    num_envs: int = 32
+    nthread: int = 0  # all cores
+    layouts: str = "default"
+    limits: Limits | None = None  # every policy once more, with this limiter in front
+    left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
+    missions: LoggedMissions | None = None  # None: drawn on the floor, by their seeds
+    loaded: dict[str, Policy] = field(default_factory=dict)  # those of runs and files, by name
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The requested kinds of episodes that every floor has room for."""
+        fit = [kind for kind in KINDS if kind in self.episodes and kind not in self.left_out]
+        if self.missions is not None:
+            fit = [kind for kind in fit if kind in self.missions.specs]
+        return tuple(fit)
+
+    @property
+    def specs(self) -> list[EpisodeSpec]:
+        """The episodes of each perturbation, kind beside kind; of logged ways each at most once."""
+        of = {
+            kind: range(self.first_seed, self.first_seed + n) for kind, n in self.episodes.items()
+        }
+        drawn = {kind: [EpisodeSpec(kind, seed) for seed in of[kind]] for kind in self.kinds}
+        if self.missions is not None:
+            drawn = {k: list(self.missions.specs[k][: self.episodes[k]]) for k in self.kinds}
+        most = max(map(len, drawn.values()))
+        return [drawn[k][at] for at in range(most) for k in self.kinds if at < len(drawn[k])]
+
+    @property
+    def floors(self) -> str:
+        """The floors by name, for the record: logged ways there are other missions."""
+        return self.layouts if self.missions is None else self.layouts + WAYS
+
+    @property
+    def warnings(self) -> list[str]:
+        """Episodes among those that chose the policy that is kept: they flatter it."""
+        chosen = self.config.evaluation
+        last = self.first_seed + max(self.episodes.values())
+        if self.missions is not None:
+            flattered = "its policy was chosen on such routes: its success is overestimated"
+            return [self.missions.text, *([flattered] if chosen.missions != DRAWN else [])]
+        if "agent" not in self.policies or not (
+            chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
+        ):
+            return []
+        return [
+            f"seeds {self.first_seed} to {last - 1} are among those by which the run's policy was "
+            f"chosen ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is "
+            "overestimated"
+        ]
+
+    @property
+    def origins(self) -> dict[str, PolicyOrigin]:
+        """The training step of the run's own policy, and that of each other run's."""
+        own = {n: p.origin for n, p in self.loaded.items() if isinstance(p, GreedyPolicy)}
+        return {name: origin for name, origin in own.items() if origin is not None}
+
+    @property
+    def total(self) -> int:
+        """Episodes to drive."""
+        episodes = len(self.specs)
+        drivers = len(self.policies) * (1 if self.limits is None else 2)
+        return drivers * len(self.perturbations) * episodes
+
+
+def plan_evaluation(
+    path: Path,
+    *,
+    policies: Sequence[str] = POLICIES,
+    perturbations: Sequence[str] = (CLEAN,),
+    episodes: int | str | Mapping[str, int] = 20,
+    first_seed: int = FIRST_SEED,
+    layouts: str | None = None,
+    limiter: str | None = None,
+    missions: str = DRAWN,
+) -> EvaluationPlan:
+    """Check a request. `layouts` None: the run's, with training floors' test split.
+
+    `missions` is "drawn", or "logged" (or "logged:all"): the ways of logged episodes that the run's
+    panel holds out (or of all of them). `limiter` is "profile", by the `[limiter]` of the run's
+    profile, or a TOML file with one.
+
+    Raises:
+        RunError: no such run, or it has no policy yet.
+        ConfigError: a policy or perturbation that does not exist, floors without room for any
+            kind of episode, no episodes, or a seed that generators do not take.
+    """
+    run = Run.open(path)
+    config = parse_config(run.document["config"], where=str(path / "config.json"))
+    refuse_unknown("policies", policies, where="--policies")
+    refuse_unknown("perturbations", perturbations, where="--perturbations")
+    of_kind = episodes_of_kind(episodes)
+    if wrong := wrong_seed(first_seed, max(of_kind.values())):
+        raise ConfigError(wrong, where="--seed")
+    layouts = layouts or layouts_of_split(config.env.layouts, "test")
+    floors = open_floors(layouts)
+    plan = EvaluationPlan(
+        run,
+        config,
+        tuple(dict.fromkeys(policies)),
+        {name: _perturb(name) for name in perturbations},
+        of_kind,
+        first_seed,
+        layouts=layouts,
+        limits=None if limiter is None else _limits(run, limiter),
+        left_out=unfit_kinds(floors) if missions == DRAWN else {},
+        missions=_missions(run, missions, floors, tuple(of_kind)),
+    )
+    if not plan.kinds:
+        refuse_unfit(floors, list(of_kind))
+    for name in plan.policies:
+        if is_cloned(name):
+            cloned_panel(run, name)
+        elif name == "agent" or _is_path("policies", name):
+            plan.loaded[name] = make_policy(name, plan)  # refused before anything is driven
+    return plan
+
+
+def refuse_unknown(
+    what: Literal["policies", "perturbations"], names: Sequence[str], *, where: str
+) -> None:
+    """Raise ConfigError if `restock eval` does not know a name, or there are no names."""
+    if what == "policies":
+        choices, paths = ["agent", *REFERENCES, CLONED], _PATHS
+    else:
+        choices = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
+        paths = ", FILE.toml"
+    unknown = [name for name in names if name not in choices and not _is_path(what, name)]
+    if unknown or not names:
+        raise ConfigError(
+            f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
+            where=where,
+            remedy=f"choose from {', '.join(choices)}{paths}",
+        )
+    if what == "perturbations":
+        for name in names:
+            _perturb(name)
+
+
+def episodes_of_kind(requested: int | str | Mapping[str, int]) -> dict[str, int]:
+    """Episodes by kind: a number for all, or for each as the text `kind=N,kind=N`.
+
+    Raises:
+        ConfigError: no such kind, or not a number of at least 1.
+    """
+    where = "--episodes"
+    if isinstance(requested, str):
+        parts = [part.partition("=") for part in requested.split(",") if part.strip()]
+        named = any(sign for _, sign, _ in parts)
+        try:
+            found = {kind.strip(): int(count) for kind, _, count in parts} if named else None
+            requested = int(requested) if found is None else found
+        except ValueError:
+            raise ConfigError(
+                f"{requested!r} is neither a number nor kind=number,…",
+                where=where,
+                remedy="write 20, or nominal=1000,wheel_slip=300",
+            ) from None
+        if found is not None and len(found) < len(parts):
+            kinds = [kind.strip() for kind, _, _ in parts]
+            twice = next(kind for kind in kinds if kinds.count(kind) > 1)
+            raise ConfigError(f"names {twice!r} twice", where=where, remedy="name each kind once")
+    if isinstance(requested, int):
+        requested = dict.fromkeys(KINDS, requested)
+    if unknown := [kind for kind in requested if kind not in KINDS]:
+        remedy = f"choose from {', '.join(KINDS)}"
+        raise ConfigError(f"there is no kind {unknown[0]!r}", where=where, remedy=remedy)
+    least = min(requested.values(), default=0)
+    if least < 1:
+        raise ConfigError(f"must be at least 1, got {least}", where=where)
+    return dict(requested)
+
+
+def _is_path(what: str, name: str) -> bool:
+    if what == "policies":
+        kind, _, path = name.partition(":")
+        return kind in ("onnx", "run", CLONED) and bool(path)
+    return name.endswith(".toml")
+
+
+def make_policy(name: str, plan: EvaluationPlan) -> Policy:
+    """Make the run's policy, a scripted one, or one that is named."""
+    if name in plan.loaded:
+        return plan.loaded[name]
+    if name == "agent":
+        return load_agent(plan.run)
+    if is_cloned(name):
+        return load_cloned(plan.run, name, seed=plan.first_seed)
+    named = load_policy(name, profile_of_run(plan.run).task)
+    return reference(name, plan.first_seed) if named is None else named
+
+
+def _missions(
+    run: Run, named: str, floors: Sequence[Warehouse], kinds: Sequence[str]
+) -> LoggedMissions | None:
+    """Return the missions of the logs, if they are requested.
+
+    Raises:
+        ConfigError: no such missions, no logs, or none of them can be driven.
+    """
+    if named == DRAWN:
+        return None
+    where = f"--missions {named}"
+    if named not in (HELD_OUT, EVERY):
+        remedy = f"choose from {DRAWN}, {HELD_OUT}, {EVERY}"
+        raise ConfigError("there are no such missions", where=where, remedy=remedy)
+    if (panel := run_panel(run.document)) is None:
+        raise ConfigError("the run did not learn from logs", where=where, remedy="leave it out")
+    if panel.task.goal == "none":
+        raise ConfigError("the task has no goal", where=where, remedy="leave it out")
+    return logged_missions(panel, floors, kinds, every=named == EVERY)
+
+
+def _limits(run: Run, named: str) -> Limits:
+    """Return the limits of a run's robot, by its profile or by a TOML file.
+
+    Raises:
+        ConfigError: no such file, or its `[limiter]` cannot be used.
+    """
+    profile = profile_of_run(run)
+    given = profile.limiter
+    if named != "profile":
+        document = read_toml(Path(named), remedy='give "profile", or a TOML file with a [limiter]')
+        if "limiter" not in document:
+            raise ConfigError("has no [limiter]", where=named)
+        given = typed(document["limiter"], Limiter, where=named, prefix="limiter")
+    return Limits.of(profile.task, profile.robot, given)
+
+
+def _perturb(name: str) -> Perturbation | None:
+    """Return the perturbation of the episodes; None: as they are.
+
+    Raises:
+        ConfigError: no such name or file, a schedule, or another timestep than evaluation's.
+    """
+    if name == CLEAN:
+        return None
+    perturbation = find_perturbation(name, where="--perturbations")
+    if isinstance(perturbation, Schedule):
+        raise is_schedule(name)
+    if perturbation.timestep_s != Perturbation().timestep_s:
+        raise ConfigError(
+            f"is for a timestep of {perturbation.timestep_s:g} s, but the evaluation runs at "
+            f"{Perturbation().timestep_s:g} s",
+            where=name,
+            remedy="effective parameters depend on the timestep: fit them at this one",
+        )
+    return perturbation
+
+
+def settings(plan: EvaluationPlan) -> dict[str, Any]:
+    """Return the settings of an evaluation for the JSON output."""
+    return {
+        "run": str(plan.run.path),
+        "policies": list(plan.policies),
+        "trained": {name: origin.document for name, origin in plan.origins.items()},
+        "perturbations": {
+            name: msgspec.to_builtins(perturbation or Perturbation())
+            for name, perturbation in plan.perturbations.items()
+        },
+        "episodes_per_kind": dict(plan.episodes),
+        "first_seed": plan.first_seed,
+        "layouts": plan.layouts,
+        "missions": DRAWN if plan.missions is None else plan.missions.text,
+        "limiter": None if plan.limits is None else msgspec.to_builtins(plan.limits),
+        "kinds": list(plan.kinds),
+        "left_out": plan.left_out,
+    }
+
 
 Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
 
@@ -177,3 +523,6 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
         for result in episodes
     ]
     return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
+
+
+__all__ = ["FIRST_SEED", "REFERENCES", "reference", "wrong_seed"]

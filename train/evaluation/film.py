@@ -22,8 +22,8 @@ from PIL import Image, ImageDraw, ImageFont
 from restock.arrays import F32, Ints
 from restock.errors import RestockError, RunError
 from restock.files import write_bytes, write_text
+from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy
 from restock.train.evaluation.evaluate import EpisodeResult, Stepper, run_episodes
-from restock.train.evaluation.evaluation_plan import CLEAN, EvaluationPlan, make_policy
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Step

@@ -27,7 +27,7 @@ from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
 from restock.train.dqn.config import TrainConfig
-from restock.train.evaluation.off_policy.dataset import held_out_of, panel_store
+from restock.train.evaluation.ope_dataset import held_out_of, panel_store
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame

@@ -13,7 +13,7 @@ import numpy as np
 
 from restock.ingest.task.conditions import NOMINAL
 from restock.replay.store.store import Store
-from restock.train.evaluation.off_policy.estimators import EssGate
+from restock.train.evaluation.ope import EssGate
 from restock.train.twin.calibration.logged_steps import logged_steps
 from restock.train.twin.calibration.path_gap import overlapping_segments
 from restock.train.twin.calibration.twin_gap import GapConfig

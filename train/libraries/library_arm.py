@@ -44,7 +44,7 @@ from restock.train.twin.floors.floors import layouts_of_split
 
 Library = Literal["sb3-dqn", "sb3-ppo"]
 DISTRIBUTION = "stable-baselines3"
-DONE = "library.json"  # in the run's directory: it was trained to its end
+TRAINED = "library.json"  # in the run's directory: it was trained to its end
 _EVALUATION_ENVS = 32
 
 
@@ -201,7 +201,7 @@ def train_library(arm: LibraryArm) -> None:
     drive = sb3_drive.ppo if on_policy else sb3_drive.dqn
     env_steps, updates = drive(config, arguments, run, evaluations)
     ended = {"env_steps": env_steps, "updates": updates, "wall_s": time.monotonic() - began}
-    write_text(run.path / DONE, json.dumps(ended, indent=1) + "\n")
+    write_text(run.path / TRAINED, json.dumps(ended, indent=1) + "\n")
 
 
 def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
@@ -228,7 +228,7 @@ def main(words: list[str]) -> int:
     return 0
 
 
-__all__ = ["DONE", "Library", "LibraryArm", "check_installed", "train_library"]
+__all__ = ["TRAINED", "Library", "LibraryArm", "check_installed", "train_library"]
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

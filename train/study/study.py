@@ -22,7 +22,7 @@ from restock.train.dqn.config import (
     parse_config,
     refuse_untaught,
 )
-from restock.train.evaluation.references import wrong_seed
+from restock.train.evaluation.eval_run import wrong_seed
 from restock.train.judge.comparability import Treatment
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import CELLS, RARE, unknown_measure
@@ -232,7 +232,7 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
 
 def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
     """Raise ConfigError where a run could not be evaluated, which would be found once trained."""
-    from restock.train.evaluation.evaluation_plan import refuse_unknown
+    from restock.train.evaluation.eval_run import refuse_unknown
 
     names = evaluation.perturbations
     refuse_unknown("perturbations", names, where=f"{where}: evaluation.perturbations")

@@ -16,18 +16,18 @@ from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
 from restock.replay.trace.moment import NS, Moment
 from restock.replay.trace.seen_at_ticks import Seen
-from restock.train.evaluation.evaluate import Stepper
-from restock.train.evaluation.evaluation_plan import (
+from restock.train.evaluation.eval_run import (
     CLEAN,
     EvaluationPlan,
     make_policy,
     plan_evaluation,
 )
+from restock.train.evaluation.evaluate import Stepper
 from restock.train.evaluation.film import differing_fields, drive_row, scene_state
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Step
-from restock.train.view.critic import Critic
+from restock.train.view.mcap_view import Critic
 from restock.words import quoted
 
 if TYPE_CHECKING:

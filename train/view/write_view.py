@@ -12,8 +12,7 @@ from restock.errors import ConfigError, StoreError
 from restock.files import temporary_name, write_text
 from restock.replay.trace.moment import Moment, find_moment
 from restock.replay.trace.trace import Trace
-from restock.train.view.critic import Critic, critic_along
-from restock.train.view.mcap_view import write_mcap
+from restock.train.view.mcap_view import Critic, critic_along, write_mcap
 
 if TYPE_CHECKING:  # it needs the twin and its physics
     from restock.train.view.evaluated import Beside

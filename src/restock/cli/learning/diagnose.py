@@ -60,8 +60,7 @@ class DiagnoseCommand:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.judge.confirm import check_place, confirm
-        from restock.train.judge.diagnose import diagnose, rows_of, with_rows
+        from restock.train.judge.diagnose import check_place, confirm, diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
         if self.before_training is not None:
@@ -110,7 +109,7 @@ class DiagnoseCommand:
         from restock.cli.output import print_json
         from restock.errors import ConfigError, ExitCode
         from restock.ingest.profile.profile import load_profile
-        from restock.train.evaluation.references import wrong_seed
+        from restock.train.evaluation.eval_run import wrong_seed
         from restock.train.judge.before_training import diagnose_before_training
         from restock.train.twin.physics.perturbation import load_perturbation
 

@@ -102,8 +102,13 @@ class EvalCommand:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, progress, say
         from restock.errors import ExitCode
-        from restock.train.evaluation.eval_run import clones_driven, drive_evaluation, read_recorded
-        from restock.train.evaluation.evaluation_plan import plan_evaluation, settings
+        from restock.train.evaluation.eval_run import (
+            clones_driven,
+            drive_evaluation,
+            plan_evaluation,
+            read_recorded,
+            settings,
+        )
         from restock.train.evaluation.regression import (
             check_margin,
             read_baseline,

@@ -66,9 +66,8 @@ class StudyCommand:
         from restock.errors import ConfigError
         from restock.files import expect_place, write_text
         from restock.report import write_study_page
-        from restock.train.study.findings import findings
         from restock.train.study.study import StudyPlan, load_study
-        from restock.train.study.study_run import run_study
+        from restock.train.study.study_run import findings, run_study
 
         if self.workers < 1:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")

@@ -240,7 +240,7 @@ def evidence_lines(to: Settings) -> list[str]:
     """Say what must be logged before the twin and a policy can be judged by the logs."""
     from restock.replay.mixture.mixture import load_mixture
     from restock.replay.store.store import Store
-    from restock.train.evaluation.off_policy.estimators import EssGate
+    from restock.train.evaluation.ope import EssGate
     from restock.train.judge.evidence_needed import policy_evidence, twin_evidence
     from restock.train.twin.calibration.twin_gap import GapConfig, TrustLimits
 

@@ -224,7 +224,7 @@ def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
 
 def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
     """Read the rows of these ids, by recording, episode and step."""
-    query = files(__package__).joinpath("episodes.sql").read_text(encoding="utf-8")
+    query = files(__package__).joinpath("ope_episodes.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         table = connection.sql(query).to_arrow_table()
     names = np.asarray(table["episode_id"].to_pylist(), str)
