@@ -9,7 +9,7 @@ import pytest
 from support.paths import ROOT
 
 from restock import cli
-from restock.cli.start import stages, story
+from restock.cli.start import demo, stages
 from restock.cli.start.stages import Settings
 from restock.replay.panel.panel import Panel
 from restock.train.run.fed_shares import fed_shares
@@ -36,7 +36,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
 
 def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported: Settings) -> None:
     """The plan of the panel was printed, as if it had been drawn."""
-    head, *lines, legend, note = story.shelves(reported.run)
+    head, *lines, legend, note = demo.shelves(reported.run)
     strata = {stratum.name: stratum for stratum in Panel.open(reported.panel).strata}
     fed = {row["stratum"]: row for row in fed_shares(Run.open(reported.run))}
     drawn_rows = Run.open(reported.run).table("strata").to_pylist()
@@ -56,7 +56,7 @@ def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported: Settings)
 
 
 def test_a_rare_event_is_followed_from_its_message_to_an_update(reported: Settings) -> None:
-    lines = story.rare_event(reported)
+    lines = demo.rare_event(reported)
     links = [line.split()[0] for line in lines if not line.startswith(" ")]
     assert links == ["recording", *["message"] * 2, "row", "stratum", "update", "All"]
     assert str(LOGS) in lines[0]
@@ -92,11 +92,11 @@ def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
     after += [driven("agent", "wheel_slip", n < 3, n) for n in range(4)]
     easy = [driven("planner", "nominal", True, n) for n in range(2)]
     write(to.run, [*after, *easy, *(driven("planner", "wheel_slip", n < 2, n) for n in range(4))])
-    easy_row, slip, rare = story.before_and_after(to)
+    easy_row, slip, rare = demo.before_and_after(to)
     assert (easy_row["mission"], slip["mission"], rare["mission"]) == (
         "nominal",
         "wheel_slip",
-        story.RARE,
+        demo.RARE,
     )
     assert slip["logs alone"].startswith("1 of 4 [")
     assert slip["agent"].startswith("3 of 4 [")
@@ -106,7 +106,7 @@ def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
     assert "fed uniformly" not in slip
     uniform = stages.fed_uniformly(to)
     write(to.run, [*after, *easy, *(driven(uniform, "wheel_slip", n < 2, n) for n in range(4))])
-    beside = story.before_and_after(to)[1]
+    beside = demo.before_and_after(to)[1]
     assert beside["fed uniformly"].startswith("2 of 4 [")
     assert list(beside)[1:] == ["logs alone", "fed uniformly", "agent", "planner"]
 
@@ -115,4 +115,4 @@ def test_without_a_goal_no_success_is_told(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path)
     policies = stages.from_logs_alone(to), "agent", "planner"
     write(to.run, [driven(policy, "nominal", None, 0) for policy in policies])
-    assert story.before_and_after(to) == []
+    assert demo.before_and_after(to) == []

@@ -16,8 +16,7 @@ from restock import cli
 from restock.cli.start import outcomes
 from restock.cli.start.decisions import robot_line
 from restock.cli.start.stages import Stage
-from restock.cli.start.start import StartCommand
-from restock.cli.start.way import Way
+from restock.cli.start.start import StartCommand, Way
 from restock.cli.start.work import Ended, Work
 from restock.errors import RestockError
 from restock.replay.store.store import Store

@@ -13,8 +13,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock import cli
 from restock.cli.start.decisions import fit_is_worse, no_room, node_refuses
-from restock.cli.start.start import StartCommand
-from restock.cli.start.way import Way
+from restock.cli.start.start import StartCommand, Way
 from restock.cli.start.work import Ended, Work
 from restock.errors import ConfigError
 from restock.ingest.live.observer import LiveObserver

@@ -158,7 +158,7 @@ def _dispatch(args: list[str]) -> int:
         sys.stdout.write(f"restock {__version__}\nnative code {native.state()}\n")
         return int(ExitCode.OK)
     if args[0] == COMPLETION:
-        from restock.cli.completion import write_completion
+        from restock.cli.command_line import write_completion
 
         return write_completion(args)
     name, prog, rest = _named(args)

@@ -13,15 +13,16 @@ import sys
 import textwrap
 import types
 import typing
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from restock.errors import ConfigError
+from restock.cli import COMPLETION, JOBS, VERBS, command_of
+from restock.errors import ConfigError, ExitCode
 
 _PREPARED: list[type[Any]] = []
 _EXPLAINED: list[type[Any]] = []
@@ -208,3 +209,51 @@ def fitted(text: str, columns: int) -> str:
         else:
             lines.append(line)
     return "\n".join([*lines, ""])
+
+
+SHELLS = ("bash", "zsh", "tcsh", "fish")
+
+
+def write_completion(args: list[str]) -> int:
+    """Write the script that completes `restock` in a shell.
+
+    Raises:
+        ConfigError: a shell and a file are not given.
+    """
+    if len(args) != 3 or args[1] not in SHELLS:
+        raise ConfigError(
+            "takes the name of a shell, and a file to write to, or - for stdout",
+            where=COMPLETION,
+            remedy=f"choose one of {', '.join(SHELLS)}",
+        )
+    try:
+        tyro.cli(
+            _every_command(),
+            prog="restock",
+            args=args,
+            use_underscores=False,
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
+        )
+    except SystemExit as stop:
+        return int(stop.code or ExitCode.OK)
+    return int(ExitCode.OK)
+
+
+def _every_command() -> Any:
+    """Return a union of all verbs; a verb that has nothing but jobs is a union of these."""
+    kinds = {}
+    for verb in VERBS:
+        if verb in ("store", "twin"):
+            jobs = {job: prepared(command_of(f"{verb} {job}")) for job in JOBS[verb]}
+            kinds[verb] = dataclasses.make_dataclass(verb, [("job", _union(jobs))])
+        else:
+            kinds[verb] = prepared(command_of(verb))
+    return _union(kinds)
+
+
+def _union(kinds: Mapping[str, type[Any]]) -> Any:
+    named = [
+        Annotated[kind, tyro.conf.subcommand(name, prefix_name=False, description=None)]
+        for name, kind in kinds.items()
+    ]
+    return Union[tuple(named)]  # noqa: UP007

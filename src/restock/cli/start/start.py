@@ -4,14 +4,309 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from restock.cli.start import stages
+from restock.cli.start.decisions import (
+    OF_ONE_ROBOT,
+    edited,
+    evidence_lines,
+    fit_is_worse,
+    floor_settings,
+    fullest,
+    has_goal,
+    horizon,
+    logs_alone_settings,
+    missions_unseen,
+    mistrust,
+    no_room,
+    no_ways,
+    node_refuses,
+    of_other_kinds,
+    possible_kinds,
+    practice_settings,
+    proposed_from,
+    robot_line,
+    several_kinds,
+    updates_settings,
+    wrong_outline,
+)
+from restock.cli.start.outcomes import Document
+from restock.cli.start.stages import Settings, Stop
+from restock.cli.start.work import Ended, Work, escape
 from restock.errors import ConfigError, ExitCode, RecordingError
-from restock.words import quoted
+from restock.words import counted, quoted
+
+HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
+ODOMETRY = "--odometry-as-command"
+MAX_FLOORS = 6
+SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
+
+
+class Stopped(Exception):
+    """The way ends here: a person must decide."""
+
+    def __init__(self, why: str, *remedies: str) -> None:
+        super().__init__(why)
+        self.stop = Stop(why, remedies)
+
+
+class Way:
+    """The stages from recordings to a report, run one after the other.
+
+    `to` is what the stages share; it changes as stages end. `first` is one of the recordings, which
+    a plan names without reading it.
+    """
+
+    def __init__(self, requested: StartCommand, work: Work, first: str | None = None) -> None:
+        self.requested, self.work = requested, work
+        self.first = requested.paths[0] if first is None else first
+        self.again = f"then run the same command again: finished stages are kept in {requested.out}"
+        self.to = Settings(
+            logs=requested.paths,
+            out=requested.out,
+            profile=requested.profile or requested.out / "profile.toml",
+            seconds=30.0 * requested.minutes,
+            episodes=max(round(4 * requested.minutes), 1),
+            device=requested.device,
+            mixture=requested.mixture,
+            typestore=requested.typestore,
+            definitions=requested.definitions,
+            salvage=requested.salvage,
+            tags=requested.tag,
+            map=requested.map,
+        )
+
+    def go(self) -> Stop | None:
+        """Run all stages; return why and what to do if a person must decide."""
+        try:
+            readable = self._recordings()
+            self._profile(readable)
+            coverage, panel = self._panel()
+            twin = self._twin()
+            self._policy(twin, coverage, panel)
+            self._judge(twin, panel)
+        except Stopped as stopped:
+            return stopped.stop
+        return None
+
+    def _warn(self, text: str) -> None:
+        self.work.say(f"   [yellow]{escape(text)}[/]")
+
+    def _recordings(self) -> list[Document]:
+        """Return the recordings that can be read, as `restock info` describes them."""
+        found = self.work.do(stages.info(self.to))
+        readable = list(found.document.get("recordings", ()))
+        if not (found.good or readable):
+            known = "give a file, a bag's folder, or a folder of bags"
+            if any("cannot be read" in why for why in found.errors):
+                known = "see the message for each above, or give other recordings"
+            damaged = any("--salvage" in why for why in found.errors)
+            raise Stopped("no recording can be read", SALVAGING if damaged else known)
+        if not found.good:
+            intact = f"the {len(readable)} that can be read"
+            self.work.say(f"   continuing with {intact}; or {SALVAGING}")
+        return readable
+
+    def _profile(self, readable: list[Document]) -> None:
+        """Take the user's profile or propose one, and check it against a recording."""
+        requested, to = self.requested, self.to
+        recording = fullest({"recordings": readable}) or self.first
+        own = requested.profile is not None
+        proposed = not own and not edited(to.profile, requested.out)
+        if proposed:
+            self._propose(requested.paths if len(readable) != 1 else (recording,))
+        elif given := [name for name in OF_ONE_ROBOT if getattr(requested, name) is not None]:
+            options, why = " and ".join(f"--{n}" for n in given), "given" if own else "edited"
+            self._warn(
+                f"{to.profile} was {why}: {options} can only change a proposal, and has no effect"
+            )
+        others = [] if own or self.work.plan else of_other_kinds(requested.out)
+        mine = [row for row in readable if row["path"] not in others]
+        if len(mine) < len(readable):
+            self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
+            recording = fullest({"recordings": mine}) or recording
+        if not (own or self.work.plan):
+            recording = proposed_from(requested.out) or recording
+        checked = self.work.do(stages.check(to, recording))
+        if not checked.good:
+            known = "; if it is of another robot, give only the recordings of this one"
+            raise Stopped(
+                f"the profile does not fit {recording}",
+                f"edit {to.profile}{known if len(readable) > 1 else ''}",
+                self.again,
+            )
+        outline = wrong_outline(checked.document, to.profile, proposed=proposed)
+        if outline is not None and not requested.accept:
+            raise Stopped(outline.why, *outline.remedies)
+        if not self.work.plan:
+            self.work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
+
+    def _propose(self, sources: tuple[str, ...]) -> None:
+        requested, to = self.requested, self.to
+        flags = [] if requested.footprint is None else ["--footprint", requested.footprint]
+        flags += [] if requested.urdf is None else ["--urdf", str(requested.urdf)]
+        flags += [] if requested.robot is None else ["--robot", requested.robot]
+        flags += [ODOMETRY] * requested.odometry_as_command
+        flags.append("--hindsight-goals")  # without a goal there is no success to train for
+        proposed = self.work.do(stages.propose(to, sources, flags, requested.urdf))
+        if not proposed.good:
+            raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
+        document = proposed.document
+        if not document.get("wheeled", True):
+            Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
+            raise Stopped("; ".join(document["problems"]), "give recordings of a robot on wheels")
+        if problems := document.get("problems"):
+            reported = f"edit {to.profile}: its first lines list what is missing"
+            if document.get("missing"):
+                reported = (
+                    "give recordings that contain it; or, if a topic in these recordings does, "
+                    f"edit {to.profile}, whose first lines list the topics"
+                )
+            if any(ODOMETRY in problem for problem in problems):
+                reported = f"add {ODOMETRY} to this command, or {reported}"
+            raise Stopped("; ".join(problems), reported, self.again)
+        if requested.accept:
+            return
+        if kinds := document.get("kinds"):
+            stop = several_kinds(kinds, requested)
+            raise Stopped(stop.why, *stop.remedies)
+        if driving := document.get("commands", []):
+            raise Stopped(
+                f"several topics may be the command that drives the robot: {', '.join(driving)}; "
+                "the profile uses the first",
+                f"edit `topic` of [inputs.command] in {to.profile}, and run the same command again",
+                "or add --accept to it, if the first one is right",
+            )
+
+    def _panel(self) -> tuple[Document, Document]:
+        """Rows, what they cover, and what is drawn of them: coverage and panel."""
+        to, do = self.to, self.work.do
+        if not do(stages.ingest(to)).good:
+            raise Stopped("nothing could be ingested", f"edit {to.profile}", self.again)
+        covered = do(stages.coverage(to))
+        if not self.work.plan:
+            for line in evidence_lines(to):
+                self._warn(line)
+        do(stages.audit(to))
+        mixed = do(stages.mix(to))
+        if not mixed.good:
+            raise Stopped(
+                "the mixture does not fit these logs",
+                "write one that fits (docs/mixture.md), and add --mixture FILE to the command",
+                self.again,
+            )
+        return covered.document, mixed.document
+
+    def _twin(self) -> Ended | None:
+        """Make the floor, and decide whether to train in the twin; None: on the logs alone."""
+        requested, to = self.requested, self.to
+        if requested.twin == "no":
+            return None
+        floor = self.work.do(stages.floor(to))
+        if not floor.good and to.map is not None:
+            sized = "measure the robot, and add --footprint LxW to this command"
+            raise Stopped(
+                f"{to.map} cannot be the floor of these recordings",
+                *([sized] if any("--footprint" in why for why in floor.errors) else ()),
+                "give the map.yaml in which the robot was localised, or leave out --map: the "
+                "floor is then made from the recordings",
+                self.again,
+            )
+        to = self.to = replace(to, further_floors=self._further_floors(floor))
+        settings = practice_settings(to.profile)
+        if floor.good:
+            kinds = possible_kinds(to, floor.document)
+            settings += floor_settings(to, kinds)
+            if (unseen := missions_unseen(to, floor.document)) is not None:
+                self._warn(unseen)
+                to = replace(to, kinds=tuple(kinds))
+        gap, fitted = self._fit()
+        if fitted:
+            settings.append(f"env.perturbation={to.fitted}")
+        why, remedy = no_room(floor), ""
+        if why is None and requested.twin != "yes" and not self.work.plan:
+            why, remedy = mistrust(floor, gap), " (--twin yes overrides)"
+        if why is not None:
+            self._warn(f"no training in the twin{remedy}: {why}")
+            return None
+        self.to = replace(to, train=tuple(settings))
+        return floor
+
+    def _further_floors(self, floor: Ended) -> tuple[Path, ...]:
+        """Make floors for recordings in other frames, and keep those with room for the same."""
+        kinds, used = set(floor.document.get("episodes", [])), []
+        left = list(floor.document.get("elsewhere", [])) if kinds else []
+        for number in range(2, MAX_FLOORS + 1):
+            if not left:
+                break
+            made = self.to.out / f"floor-{number}.toml"
+            further = self.work.do(stages.further_floor(self.to, left[0], made))
+            if not further.good:
+                left = left[1:]
+                continue
+            left = [name for name in left[1:] if name in further.document.get("elsewhere", [])]
+            if lacking := kinds - set(further.document["episodes"]):
+                self._warn(
+                    f"{made.name} is not used: it has no room for {', '.join(sorted(lacking))}"
+                )
+            else:
+                used.append(made)
+        if left:
+            others = counted(len(left), "recording")
+            self._warn(f"{others} in other frames: their routes are on none of the floors")
+        return tuple(used)
+
+    def _fit(self) -> tuple[Ended, bool]:
+        """Return the gap of the twin that is used, and whether that is the fitted one."""
+        horizon_s = horizon(self.to.profile)
+        fitted = self.work.do(stages.fit(self.to, horizon_s))
+        gap = self.work.do(stages.gap(self.to, horizon_s, fitted=fitted.good))
+        if not (fitted.good and gap.good) or (why := fit_is_worse(gap.document)) is None:
+            return gap, fitted.good
+        self._warn(f"the fit is not used: {why}")
+        return self.work.do(stages.gap(self.to, horizon_s, fitted=False)), False
+
+    def _policy(self, floor: Ended | None, coverage: Document, panel: Document) -> None:
+        requested, twin = self.requested, floor is not None
+        settings = [*self.to.train] if twin else logs_alone_settings(coverage)
+        settings += updates_settings(panel, requested.minutes, twin=twin, seconds=self.to.seconds)
+        self.to = replace(self.to, train=tuple(settings))
+        trained = self.work.do(stages.train(self.to, twin=twin))
+        if not trained.good:
+            raise Stopped("training did not finish", *trained.errors[:2], self.again)
+
+    def _judge(self, floor: Ended | None, panel: Document) -> None:
+        """Evaluate in the twin and on held-out logs, and write one page."""
+        to, do, judged = self.to, self.work.do, []
+        if floor is not None:
+            goal = has_goal(to.profile)
+            if goal and floor.good:
+                why = None if self.work.plan else no_ways(to)
+                if why is None:
+                    judged.append(do(stages.evaluate_on_ways(to)))
+                else:
+                    self._warn(f"no evaluation on the routes of the logs: {why}")
+            judged.append(do(stages.evaluate(to, goal=goal)))
+        if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
+            judged.append(do(stages.judge(to)))
+        else:
+            self.work.say(
+                "\n[yellow]These logs are too short to hold any of them out, so the policy cannot "
+                f"be evaluated{'' if floor is None else ' on logs'}. Ingest more recordings.[/]"
+            )
+        if not do(stages.report(to)).good:
+            raise Stopped("there is no report", self.again)
+        if failed := [ended for ended in judged if not ended.good]:
+            why_failed = [one for ended in failed for one in ended.errors[:1]]
+            names = " and ".join(f"`{ended.command}`" for ended in failed)
+            raise Stopped(
+                f"the report lacks the stages that failed: {names}", *why_failed, self.again
+            )
 
 
 @dataclass
@@ -81,9 +376,6 @@ class StartCommand:
         """Run all stages; return 3 if a person must decide or a needed stage failed."""
         from restock.cli import main
         from restock.cli.output import print_json, stderr, stdout
-        from restock.cli.start.decisions import node_refuses
-        from restock.cli.start.way import Way
-        from restock.cli.start.work import Work, escape
 
         if not self.paths:
             raise RecordingError("no recording given", remedy="restock start BAG --out DIR")
@@ -196,4 +488,4 @@ class StartCommand:
             read_grid(self.map)
 
 
-__all__ = ["StartCommand"]
+__all__ = ["StartCommand", "Way"]
