@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from train_peers import ACTIONS, DISCOUNT, OBSERVATION, ROWS, Arrays
 
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.kernel import UpdatePath
 from restock.train.dqn.learner import Learner

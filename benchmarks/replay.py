@@ -42,9 +42,9 @@ from replay_contenders import (
 )
 
 from restock.native import is_used
-from restock.replay.mixture.packed_row import row_width
-from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.chunked import ChunkedSampler
+from restock.replay.sampling.packed_rows import row_width
+from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.sampler import QuotaSampler, uniform_sampler
 
 MANY_WIDTH = 16  # floats in a row, of ten million

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from restock.replay.panel.logged_sampler import sampler_for as sampler_for
     from restock.replay.panel.panel import Panel as Panel
     from restock.replay.sampling.chunked import ChunkedSampler as ChunkedSampler
-    from restock.replay.sampling.draws import StratumDraws as StratumDraws
-    from restock.replay.sampling.draws import StratumRows as StratumRows
     from restock.replay.sampling.rules import RULES as RULES
     from restock.replay.sampling.rules import Rule as Rule
+    from restock.replay.sampling.rules import StratumDraws as StratumDraws
+    from restock.replay.sampling.rules import StratumRows as StratumRows
     from restock.replay.sampling.sampler import QuotaSampler as QuotaSampler
     from restock.replay.sampling.sampler import Sampler as Sampler
     from restock.replay.store.audit import load_audits as load_audits

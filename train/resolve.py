@@ -17,10 +17,10 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.task.task import Mirror, Task
-from restock.replay.mixture.packed_row import row_width
 from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.panel import Panel
-from restock.replay.ring.ring import META
+from restock.replay.sampling.packed_rows import row_width
+from restock.replay.sampling.ring import META
 from restock.replay.store.capacity import capacity_of_rows
 from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught

@@ -19,7 +19,7 @@ import torch
 from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Mirror, Task
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
 from restock.toml import by_path
 from restock.train.dqn.config import TrainConfig

@@ -17,7 +17,7 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.replay.fleet.gaps import Gap
 from restock.replay.fleet.yields import Unit, Yields
-from restock.replay.plan.forecast import (
+from restock.replay.plan.source_plan import (
     Forecast,
     forecast,
     missions_to_see_one,

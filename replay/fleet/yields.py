@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from restock.arrays import F64, Bools, Ints
-from restock.replay.plan.forecast import episode_hours
+from restock.replay.plan.source_plan import episode_hours
 
 MIN_STEPS = 3  # a label of a step or two may be a mistake
 CELL = ("condition", "zone", "action", "robot")

@@ -23,8 +23,15 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture, Shortfall, SourceShares, StratumRule
-from restock.replay.mixture.schedules import knots, mean_over, value_at
+from restock.replay.mixture.mixture import (
+    Mixture,
+    Shortfall,
+    SourceShares,
+    StratumRule,
+    knots,
+    mean_over,
+    value_at,
+)
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.state import Stateful
 

@@ -27,13 +27,20 @@ from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.task import Task
 from restock.interrupts import interrupts_raised
 from restock.replay.mixture.mixture import Mixture, load_mixture
-from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel.pack import Packer
-from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel
+from restock.replay.panel.panel import (
+    EVALUATION_SPLIT,
+    HEADER,
+    META,
+    ROWS,
+    FileRecord,
+    Header,
+    Panel,
+    seal,
+)
 from restock.replay.panel.scratch import SourceSteps
-from restock.replay.panel.seal import FileRecord, seal
-from restock.replay.plan.plan import PanelPlan, plan_panel
-from restock.replay.plan.stores import AllStores, PinnedStore, all_stores
+from restock.replay.plan.plan import AllStores, PanelPlan, PinnedStore, all_stores, plan_panel
+from restock.replay.sampling.packed_rows import PACKING_VERSION
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
 
 # What a panel is made of: what a table must have, whatever the mixture asks for.

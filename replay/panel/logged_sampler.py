@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.represented import stands_for_others
 from restock.replay.mixture.share_controller import (
     PlannedDraws,
     SampledStratum,
     ShareController,
 )
+from restock.replay.mixture.shares import stands_for_others
 from restock.replay.plan.plan import outcome_column
 from restock.replay.plan.strata import rules_of
 from restock.replay.plan.weights import WeightsInForce

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from restock.arrays import Bools, Ints, splitmix64
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
-from restock.replay.mixture.packed_row import GOLDEN
-from restock.replay.plan.candidates import bools, codes
+from restock.replay.plan.candidates import Places, bools, codes
 from restock.replay.plan.strata import NO_STRATUM, ResolvedStratum
-from restock.replay.plan.transition_ids import Places
+from restock.replay.sampling.packed_rows import GOLDEN
 from restock.replay.store.definitions import install_repeated_rows
 from restock.words import counted
 

@@ -1,14 +1,17 @@
 """From a mixture and a store to the rows of a panel: which, in which stratum, with which weight.
 
 DuckDB says what each row is; everything that must come out the same on every machine and version
-(the draws, the evaluation split) is done here on transition ids, with hashes of our own.
+(the draws, the evaluation split) is done here on transition ids, with hashes of our own. The rows
+of a mixture's other stores stand beside those of the first, in one view (`all_stores`).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import duckdb
@@ -21,16 +24,18 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
-from restock.replay.mixture.mixture import Mixture, nanoseconds
-from restock.replay.mixture.represented import look_for_archives, represented_shares
-from restock.replay.mixture.schedules import mean_over
+from restock.replay.mixture.mixture import Mixture, OtherStore, mean_over, nanoseconds
+from restock.replay.mixture.shares import look_for_archives, represented_shares
 from restock.replay.plan.candidates import (
     META_COLUMNS,
+    STORE_COLUMN,
+    Places,
     bools,
     codes,
     episodes_met,
     one_task,
     read_candidates,
+    stretches,
     uncertain_labels,
     unknown_conditions,
     without_measured_actions,
@@ -44,9 +49,13 @@ from restock.replay.plan.exclusions import (
     repeats_of,
     split_for_evaluation,
 )
-from restock.replay.plan.forecast import episode_hours
-from restock.replay.plan.source_plan import SourcePlan, SourceRows, plan_source
-from restock.replay.plan.stores import PinnedStore
+from restock.replay.plan.source_plan import (
+    SourcePlan,
+    SourceRows,
+    episode_hours,
+    plan_source,
+    taken_by_others,
+)
 from restock.replay.plan.strata import (
     NO_STRATUM,
     ResolvedStratum,
@@ -57,9 +66,118 @@ from restock.replay.plan.strata import (
     least_steps,
     resolve_strata,
 )
-from restock.replay.plan.transition_ids import Places, stretches
-from restock.replay.plan.unfilled import taken_by_others
 from restock.replay.plan.weights import RatioFit
+from restock.replay.store.definitions import definitions
+from restock.replay.store.parquet_views import parquet_view
+from restock.replay.store.store import Store
+
+
+class PinnedStore(msgspec.Struct, frozen=True):
+    """Another store of a panel, at the version that was taken."""
+
+    name: str
+    path: str  # as it was found
+    version: int
+    repeated_rows: int  # of recordings that a store before it has too: taken from that one
+
+
+@dataclass(frozen=True)
+class AllStores:
+    """One connection over all the stores of a mixture; its view `transitions` holds their rows."""
+
+    connection: duckdb.DuckDBPyConnection
+    others: tuple[PinnedStore, ...]
+
+
+@contextmanager
+def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> Iterator[AllStores]:
+    """Yield the first store with the mixture's others beside it, each at its pinned version.
+
+    A relative path is looked up in `folder` (that of the mixture's file), else where one stands.
+    The first store's own views stay as they are.
+
+    Raises:
+        StoreError: one of them cannot be opened, has no such version, or no rows.
+        MixtureError: the stores before one of them have all of its rows too.
+    """
+    if not mixture.sources.stores:
+        yield AllStores(first.connection, ())
+        return
+    with ExitStack() as opened:
+        others = [
+            (wanted, opened.enter_context(_open(wanted, folder)))
+            for wanted in mixture.sources.stores
+        ]
+        connection = opened.enter_context(duckdb.connect())
+        repeated_rows = _attach(connection, first, others)
+        pinned = tuple(
+            PinnedStore(wanted.name, str(store.path), store.version, repeated)
+            for (wanted, store), repeated in zip(others, repeated_rows, strict=True)
+        )
+        yield AllStores(connection, pinned)
+
+
+def _open(wanted: OtherStore, folder: Path | None) -> Store:
+    path: str | Path = wanted.path
+    if "://" not in wanted.path:
+        path = Path(wanted.path).expanduser()
+        if not path.is_absolute() and folder is not None:
+            path = folder / path
+    try:
+        store = Store(path, version=wanted.version)
+        store.verify()
+        return store
+    except StoreError as error:
+        raise StoreError(
+            f"the mixture's store {wanted.name!r}: {error.what}",
+            where=error.where,
+            remedy=error.remedy,
+        ) from error
+
+
+def _attach(
+    connection: duckdb.DuckDBPyConnection, first: Store, others: Sequence[tuple[OtherStore, Store]]
+) -> list[int]:
+    """Make the view; returns how many rows of each other store are in one before it."""
+    tables: dict[str, list[str]] = {"stored_transitions": [], "stored_recordings": []}
+    repeated = []
+    for number, store in enumerate([first, *(store for _, store in others)]):
+        schema = f'"store_{number}"'
+        connection.execute(f"CREATE SCHEMA {schema}")
+        for table in tables:
+            if not store.files[table]:
+                raise StoreError("it holds no transitions", where=str(store.path))
+            connection.execute(parquet_view(table, store.files[table], schema=f"store_{number}"))
+        connection.execute(
+            f"CREATE TABLE {schema}.mine AS SELECT DISTINCT recording_id"
+            f" FROM {schema}.stored_transitions"
+        )
+        before = " UNION ALL ".join(f'FROM "store_{i}".mine' for i in range(number))
+        known = f"recording_id IN ({before})" if before else "false"
+        if number:
+            count = f"SELECT countif({known}), count(*) FROM {schema}.stored_transitions"
+            [(repeats, rows)] = connection.sql(count).fetchall()
+            if repeats == rows:
+                raise _all_repeated(others[number - 1][0].name, rows, number)
+            repeated.append(int(repeats))
+        for table in tables:
+            tables[table].append(
+                f"SELECT *, {number} AS {STORE_COLUMN} FROM {schema}.{table} WHERE NOT ({known})"
+            )
+    for table, parts in tables.items():
+        connection.execute(f"CREATE VIEW {table} AS " + " UNION ALL BY NAME ".join(parts))
+    connection.execute(definitions(names=["rows.sql"]))
+    return repeated
+
+
+def _all_repeated(name: str, rows: int, number: int) -> MixtureError:
+    where = "the main store" if number == 1 else "the stores before it"
+    return MixtureError(
+        f"all {rows:,} rows of {name!r} are also in {where}, and are drawn from there",
+        remedy="leave this store out of the mixture: a stratum with a larger `share` draws them"
+        " more often, and its `where` may name their recordings (recording_id IN (…))",
+    )
+
 
 LOGS = "logs"  # the name of the first store's part
 

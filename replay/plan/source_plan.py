@@ -1,9 +1,21 @@
-"""One source of a panel worked out: shares, importance weights, and what is missing on a shelf."""
+"""One source of a panel worked out: shares, importance weights, and what is missing on a shelf.
+
+Strata with a wanted share and nearly no rows are named, with the reason and what to change. Most
+often that is nominal: with `unit = "episode"` it has the episodes that met nothing, and a condition
+that nearly every episode meets leaves none.
+
+How many more missions (or hours) it takes is forecast at the rates seen so far. Two things are
+unknown: the rate, of which there is a sample of episodes (a Bayesian bootstrap, Rubin 1981), and
+which of the coming missions will be rich ones (draws of episodes from it). Both are in the
+interval. Where many missions are needed, the second is the normal one of renewal theory. A kind of
+mission that never yielded a row has no rate: only a bound.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import duckdb
@@ -13,8 +25,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture, StratumRule
-from restock.replay.mixture.schedules import knots
+from restock.ingest.task.conditions import NOMINAL
+from restock.replay.mixture.mixture import Mixture, StratumRule, knots
 from restock.replay.mixture.shares import (
     SharePlan,
     has_minimum,
@@ -22,10 +34,9 @@ from restock.replay.mixture.shares import (
     plan_shares,
     wanted_shares,
 )
+from restock.replay.plan.candidates import bools, codes
 from restock.replay.plan.exclusions import scramble
-from restock.replay.plan.forecast import Forecast, forecast
 from restock.replay.plan.strata import ResolvedStratum, Stratum
-from restock.replay.plan.unfilled import too_few
 from restock.replay.plan.weights import (
     RatioFit,
     RatioRows,
@@ -35,6 +46,232 @@ from restock.replay.plan.weights import (
     importance_weights,
     stands_for,
 )
+from restock.words import counted
+
+_NEARLY_NONE = 0.1  # of what a stratum could have: it has less than that …
+_TAKEN = 0.5  # … because a condition holds in at least this much
+
+
+def too_few(rule: StratumRule, rows: int, episodes: int) -> str:
+    """Return why a stratum gets nothing, and what to change; "" if it has what it needs."""
+    if not rows:
+        other = "change its `where`" if rule.where is not None else "leave it out of the strata"
+        return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
+    needs = {"min_rows": (rule.min_rows, rows), "min_episodes": (rule.min_episodes, episodes)}
+    short = [f"{name} = {least:,}" for name, (least, has) in needs.items() if has < least]
+    if not short:
+        return ""
+    has = f"{counted(rows, 'row')} in {counted(episodes, 'episode')}"
+    return f"has {has}, too few for its {' and '.join(short)}: lower that, or record more"
+
+
+def taken_by_others(
+    table: pa.Table,
+    strata: Sequence[ResolvedStratum],
+    member: Bools,
+    stratum: NDArray[np.int16],
+    admitted: Bools,
+) -> dict[str, str]:
+    """Return, of each stratum to which one other condition leaves nearly nothing, which one it is.
+
+    Args:
+        table: what `read_candidates` returns.
+        member: (N, S) which strata a row may be in.
+        stratum: (N,) the one that it is in.
+        admitted: (N,) rows that the mixture admits.
+    """
+    episode = codes(table, "episode_id")
+    found = {}
+    for index, named in enumerate(strata):
+        rule = named.rule
+        rest = named.name == NOMINAL and rule.where is None
+        could = admitted if rest else admitted & member[:, index]
+        total = _count(could, rule, episode)
+        kept = _count(could & (stratum == index), rule, episode)
+        others = [j for j, other in enumerate(strata) if j != index and other.name != NOMINAL]
+        if rule.share in ("natural", 0) or kept >= _NEARLY_NONE * total or not others:
+            continue
+        held = {j: _count(could & member[:, j], rule, episode) for j in others}
+        taker = max(others, key=held.__getitem__)
+        if held[taker] < _TAKEN * total:
+            continue
+        other = strata[taker]
+        remedy = (
+            _less_often(other, _usual_steps(table, taker, admitted))
+            if rest
+            else f"give {named.name} priority = {other.priority - 1}, which is before {other.name}"
+        )
+        unit = "episode" if rule.unit == "episode" else "row"
+        found[named.name] = (
+            f"has {kept:,} of {counted(total, unit)}, since {other.name} is met in"
+            f" {held[taker]:,} of them: {remedy}"
+        )
+    return found
+
+
+def _count(rows: Bools, rule: StratumRule, episode: Codes) -> int:
+    """Return the size of some rows (N,) in the unit of a stratum."""
+    return int((np.bincount(episode[rows]) > 0).sum() if rule.unit == "episode" else rows.sum())
+
+
+def _usual_steps(table: pa.Table, index: int, admitted: Bools) -> int:
+    """Return the median number of steps of a condition, over the episodes that have it."""
+    steps = np.bincount(codes(table, "episode_id")[bools(table, f"stratum_{index}") & admitted])
+    return int(np.median(steps[steps > 0]))
+
+
+def _less_often(taker: ResolvedStratum, steps: int) -> str:
+    """Return what leaves nominal more than a condition that holds nearly everywhere does."""
+    name = taker.name
+    in_mixture = (
+        f'under [[strata]] give {name} unit = "step", or min_steps = {steps + 1} (half of its'
+        f" episodes have {counted(steps, 'such step')} or fewer); "
+        if taker.rule.unit == "episode"
+        else ""
+    )
+    at_source = (
+        "make its `where` stricter"
+        if taker.rule.where is not None
+        else "raise its threshold in the profile and run `restock store label`"
+    )
+    return (
+        f"{in_mixture}{at_source}; or list the other conditions under [[strata]] in place of"
+        " [each_condition]"
+    )
+
+
+REPLICATES = 200
+_SIMULATED = 2000  # expected missions up to which they are drawn one by one
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Of one kind of mission for one gap; amounts are missions or hours."""
+
+    episodes: int  # that the rate is of
+    seen: int  # of them had any
+    rate: float  # rows (or episodes) for each
+    rate_low: float  # 95 % interval
+    rate_high: float
+    draws: F64  # (R,) amounts that were needed in replicates; empty where nothing was ever seen
+
+    @property
+    def known(self) -> bool:
+        return self.seen > 0
+
+    def quantile(self, share: float) -> float:
+        """Return the amount that is enough in this share of the replicates; inf without draws."""
+        return float(np.quantile(self.draws, share)) if len(self.draws) else math.inf
+
+
+def episode_hours(first_ns: Ints, last_ns: Ints, rows: Ints) -> F64:
+    """Hours that episodes (E,) took: the last step takes as long as the others."""
+    steps = np.maximum(rows - 1, 1)
+    return np.asarray((last_ns - first_ns) / 3.6e12 * rows / steps, np.float64)
+
+
+def forecast(
+    found: F64,
+    amount: F64,
+    missing: float,
+    *,
+    rng: np.random.Generator,
+    replicates: int = REPLICATES,
+) -> Forecast:
+    """Forecast from the yields of E episodes (E,), each of so many missions or hours (E,).
+
+    Episodes of no length (of one step, say) count as none, and so do those without a yield (NaN).
+    """
+    used = (amount > 0) & ~np.isnan(found)
+    found, amount = found[used], amount[used]
+    episodes, seen = len(found), int((found > 0).sum())
+    nan = float("nan")
+    if not seen:
+        return Forecast(episodes, 0, 0.0 if episodes else nan, nan, nan, np.zeros(0))
+    rate = float(found.sum() / amount.sum())
+    amount = np.append(amount, amount.mean())
+    rates, draws = np.zeros(replicates), np.zeros(replicates)
+    found = np.append(found, 0.0)
+    for index, weights in enumerate(_replicates(episodes, rng, replicates)):
+        each = float(weights @ found) / max(float(weights @ amount), 1e-300)
+        rates[index], draws[index] = each, _needed(found, amount, weights, each, missing, rng)
+    low, high = np.quantile(rates, [0.025, 0.975])
+    return Forecast(episodes, seen, rate, float(low), float(high), draws)
+
+
+def _needed(
+    found: F64, amount: F64, weights: F64, rate: float, missing: float, rng: np.random.Generator
+) -> float:
+    """Return the amount after which `missing` is reached, in one replicate."""
+    if missing <= 0:
+        return 0.0
+    mean = float(weights @ found)
+    episodes = missing / max(mean, 1e-300)
+    if episodes > _SIMULATED:
+        spread = math.sqrt(max(float(weights @ found**2) - mean**2, 0.0))
+        return max(missing + spread * math.sqrt(episodes) * float(rng.normal()), 0.0) / rate
+    total = spent = 0.0
+    while True:
+        drawn = _drawn(weights, math.ceil(episodes * 1.5) + 8, rng)
+        reached = total + np.cumsum(found[drawn])
+        if reached[-1] >= missing:
+            last = int(np.searchsorted(reached, missing))
+            return spent + float(amount[drawn[: last + 1]].sum())
+        total, spent = float(reached[-1]), spent + float(amount[drawn].sum())
+
+
+def missions_to_see_one(without: int) -> int:
+    """Missions that would show what `without` missions did not, with 95 %, at best.
+
+    At best: at the highest rate that such a silence leaves likely, the exact (Clopper-Pearson)
+    bound at which `without` missions show none with 5 %. As many again then show one with 95 %.
+    """
+    return max(without, 1)
+
+
+def probability_to_close(
+    parts: list[tuple[F64, int]],
+    missing: float,
+    *,
+    rng: np.random.Generator,
+    replicates: int = REPLICATES,
+) -> float:
+    """Return the probability that planned missions yield what is missing.
+
+    `parts` are pairs of yields (E,) and a number of missions.
+    """
+    total = np.zeros(replicates)
+    for sample, missions in parts:
+        found = sample[~np.isnan(sample)]
+        if not len(found) or not missions or not found.any():
+            continue
+        found = np.append(found, 0.0)
+        for index, weights in enumerate(_replicates(len(found) - 1, rng, replicates)):
+            if missions > _SIMULATED:
+                mean = float(weights @ found)
+                spread = math.sqrt(max(float(weights @ found**2) - mean**2, 0.0))
+                chance = spread * math.sqrt(missions) * float(rng.normal())
+                total[index] += missions * mean + chance
+            else:
+                total[index] += found[_drawn(weights, missions, rng)].sum()
+    return float((total >= missing).mean())
+
+
+def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator[F64]:
+    """Yield the weights of E episodes and one more, (E + 1,), in each replicate.
+
+    One more, of half a weight, yields nothing: what every one of a few episodes did is not certain.
+    """
+    prior = np.append(np.ones(episodes), 0.5)
+    return (rng.dirichlet(prior) for _ in range(count))
+
+
+def _drawn(weights: F64, size: int, rng: np.random.Generator) -> Ints:
+    """Return so many drawn episodes, each with its weight (E,)."""
+    steps = np.cumsum(weights)
+    drawn = np.searchsorted(steps, rng.random(size) * steps[-1], side="right")
+    return np.asarray(np.minimum(drawn, len(weights) - 1), np.int64)
+
 
 # A share of the gradient this much below the natural one is no rounding.
 TOLERANCE = 0.01

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.sampling.draws import StratumDraws
-from restock.replay.sampling.row_file import RowFile
+from restock.replay.sampling.packed_rows import RowFile
+from restock.replay.sampling.rules import StratumDraws
 from restock.replay.sampling.sampler import BlockSampler, Quotas
 
 CHUNK_ROWS = 16_384

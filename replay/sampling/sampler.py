@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.sampling.draws import StratumDraws, StratumRows
-from restock.replay.sampling.per import Prioritised
-from restock.replay.sampling.rules import RULES, follow_td
+from restock.replay.sampling.rules import RULES, Prioritised, StratumDraws, StratumRows, follow_td
 from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time

@@ -36,15 +36,13 @@ MAY_IMPORT = {
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "camera containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
-    "replay": "fleet panel store ingest/store",
+    "replay": "fleet panel store ingest/store ingest",
     "replay/store": "ingest/camera ingest/store ingest/task",
     "replay/sampling": "",
     "replay/mixture": "sampling",
-    "replay/ring": "mixture sampling",
-    "replay/plan": "mixture store ingest/task",
+    "replay/plan": "mixture store ingest/task sampling",
     "replay/panel": "mixture plan sampling store ingest/store ingest/task",
     "replay/fleet": "mixture panel plan store ingest/task",
-    "replay/review": "store ingest ingest/store",
     "replay/trace": (
         "replay panel store ingest/containers ingest/decoding ingest/profile ingest/steps"
         " ingest/store ingest/task"
@@ -53,21 +51,21 @@ MAY_IMPORT = {
         "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task"
     ),
     "train": (
-        "dqn evaluation feed run twin/missions twin/env twin/floors"
-        " twin/physics replay/mixture replay/panel replay/ring"
-        " replay/store ingest/profile ingest/task"
+        "dqn evaluation feed run twin/missions twin/env twin/floors twin/physics"
+        " replay/mixture replay/panel replay/store ingest/profile ingest/task"
+        " replay/sampling"
     ),
     "train/dqn": "twin/missions twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel"
-        " replay/ring replay/plan replay/sampling ingest/task ingest/profile ingest/store"
+        " replay/plan replay/sampling ingest/task ingest/profile ingest/store"
         " replay/fleet twin/physics"
     ),
     "train/evaluation": (
-        "dqn feed run twin/drivers twin/missions twin/env twin/floors"
-        " twin/physics replay/panel replay/ring replay/store ingest/live ingest/store"
-        " ingest/profile ingest/task"
+        "dqn feed run twin/drivers twin/missions twin/env twin/floors twin/physics"
+        " replay/panel replay/store ingest/live ingest/store ingest/profile ingest/task"
+        " replay/sampling"
     ),
     "train/judge": (
         "train dqn evaluation feed run twin/calibration twin/drivers"
@@ -75,8 +73,8 @@ MAY_IMPORT = {
         " ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (
-        "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
-        " replay/ring replay/sampling replay/store ingest/profile ingest/task"
+        "train dqn evaluation feed run twin/floors twin/physics replay/panel"
+        " replay/sampling replay/store ingest/profile ingest/task"
     ),
     "train/study": "judge dqn evaluation libraries run replay/panel twin/missions",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
@@ -135,7 +133,7 @@ MAY_IMPORT = {
         " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
         " train/twin/physics train/twin/recording train/twin/survey"
     ),
-    "cli/upkeep": "cli ingest ingest/profile ingest/store ingest/task replay/review replay/store",
+    "cli/upkeep": "cli ingest ingest/profile ingest/store ingest/task replay replay/store",
 }
 
 

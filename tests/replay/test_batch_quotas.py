@@ -15,7 +15,7 @@ from restock.replay.mixture.share_controller import (
     ShareController,
 )
 from restock.replay.plan.strata import rules_of
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 
 QUOTAS = (
     "max_replays_per_row = 400\n"

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from restock.errors import MixtureError, PanelError
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.row_file import RowFile
+from restock.replay.sampling.packed_rows import RowFile
 
 WIDTH = 5
 

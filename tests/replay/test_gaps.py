@@ -22,7 +22,7 @@ from restock.replay.fleet.shopping_list import shopping_list
 from restock.replay.fleet.yields import Yields
 from restock.replay.mixture.mixture import load_mixture, parse_mixture
 from restock.replay.places import add_computed_tables
-from restock.replay.plan.forecast import forecast, missions_to_see_one, probability_to_close
+from restock.replay.plan.source_plan import forecast, missions_to_see_one, probability_to_close
 from restock.replay.store.capacity import recommend_capacity
 from restock.replay.store.store import Store
 from restock.words import figure

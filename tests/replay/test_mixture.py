@@ -20,10 +20,13 @@ from restock.errors import ConfigError, MixtureError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import (
     CorrectionRule,
+    Cosine,
     EachCondition,
     EvaluationSplit,
+    Linear,
     Mixture,
     OtherStore,
+    Piecewise,
     PlannedUse,
     Prioritised,
     Safety,
@@ -33,7 +36,6 @@ from restock.replay.mixture.mixture import (
     parse_mixture,
     shipped_mixtures,
 )
-from restock.replay.mixture.schedules import Cosine, Linear, Piecewise
 from restock.replay.mixture.shares import plan_shares, scaled_within, wanted_shares
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.plan.plan import PanelPlan, plan_panel

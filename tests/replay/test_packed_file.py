@@ -13,18 +13,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import PanelError
-from restock.replay.panel import packed_file
-from restock.replay.panel.packed_file import PackedFile, Values
-from restock.replay.panel.seal import FileRecord, Leaves, checksum, sample_checksum
+from restock.replay.panel import pack
+from restock.replay.panel.pack import PackedFile, Values
+from restock.replay.panel.panel import FileRecord, Leaves, checksum, sample_checksum
 
 WIDTH = 5
 HALVES = (slice(0, 2), slice(2, WIDTH))
 
 
 def small_blocks(patch: pytest.MonkeyPatch, held_blocks: int) -> None:
-    patch.setattr(packed_file, "BLOCK_ROWS", 8)
-    patch.setattr(packed_file, "HELD_BYTES", held_blocks * 8 * WIDTH * 4)
-    patch.setattr(packed_file, "WAITING_BYTES", 0)
+    patch.setattr(pack, "BLOCK_ROWS", 8)
+    patch.setattr(pack, "HELD_BYTES", held_blocks * 8 * WIDTH * 4)
+    patch.setattr(pack, "WAITING_BYTES", 0)
 
 
 @settings(max_examples=40)

@@ -24,13 +24,13 @@ from restock.errors import MixtureError, PanelError, RestockError, StoreError
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, load_mixture, parse_mixture
-from restock.replay.mixture.n_step import n_step_horizon, n_step_return
-from restock.replay.mixture.packed_row import PACKING_VERSION, row_width
-from restock.replay.panel import build, pack, packed_file, scratch
+from restock.replay.panel import build, pack, scratch
 from restock.replay.panel import panel as panel_module
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import ROWS, Panel
-from restock.replay.plan import candidates, transition_ids
+from restock.replay.panel.scratch import n_step_horizon, n_step_return
+from restock.replay.plan import candidates
+from restock.replay.sampling.packed_rows import PACKING_VERSION, row_width
 from restock.replay.store.store import Store
 
 
@@ -152,13 +152,13 @@ def test_small_stretches_and_batches_pack_the_same_bytes(
     at_once = build_panel(table, mixture, tmp_path / "a", task=TASK)
     for module, name, value in (
         (scratch, "STRETCH", 64),
-        (transition_ids, "STRETCH", 64),
+        (candidates, "STRETCH", 64),
         (candidates, "BATCH_ROWS", 2048),
         (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
         (pack, "ROW_GROUP_ROWS", 1000),
-        (packed_file, "BLOCK_ROWS", 64),
-        (packed_file, "WAITING_BYTES", 0),
-        (packed_file, "HELD_BYTES", 3 * 64 * row_width(TASK.observation_size) * 4),
+        (pack, "BLOCK_ROWS", 64),
+        (pack, "WAITING_BYTES", 0),
+        (pack, "HELD_BYTES", 3 * 64 * row_width(TASK.observation_size) * 4),
     ):
         monkeypatch.setattr(module, name, value)
     by_parts = build_panel(table, mixture, tmp_path / "b", task=TASK)
@@ -507,7 +507,7 @@ import scipy.optimize, scipy.special  # imported by the ratio's fit: libraries a
 from pathlib import Path
 from restock.replay.panel.build import build_panel
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.plan import candidates, transition_ids
+from restock.replay.plan import candidates
 from restock.replay.store.store import Store
 
 text = "n_step = 3\\nreturn_to_go = true\\nevaluation_split = {by = 'none'}\\n[each_condition]"

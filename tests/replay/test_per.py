@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from restock import native
 from restock.errors import MixtureError
-from restock.replay.sampling.draws import StratumRows
-from restock.replay.sampling.per import CHUNK, Per, Prioritised, find_places
+from restock.replay.sampling.rules import CHUNK, Per, Prioritised, StratumRows, find_places
 from restock.replay.sampling.sampler import QuotaSampler
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows

@@ -17,7 +17,7 @@ from restock import cli
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
-from restock.replay.mixture.represented import look_for_archives, odds_ratio
+from restock.replay.mixture.shares import look_for_archives, odds_ratio
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.logged_sampler import sampler_for
 from restock.replay.panel.panel import Panel

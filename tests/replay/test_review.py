@@ -20,8 +20,13 @@ from restock.errors import LabelError
 from restock.ingest.relabel import correct_store
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.label_scores import true_names
-from restock.replay.review.doubtful import DoubtfulEvent, doubtful_events, review_csv, review_rows
-from restock.replay.review.verdicts import read_verdicts
+from restock.replay.review import (
+    DoubtfulEvent,
+    doubtful_events,
+    read_verdicts,
+    review_csv,
+    review_rows,
+)
 from restock.replay.store.store import Store
 
 HEADER = "episode_id,condition,first_step,last_step,value\n"

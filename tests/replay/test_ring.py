@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.states import leaves, through_json
 
 from restock.errors import MixtureError
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 
 SIZE = 3
 CONDITIONS = ("wheel_slip", "blocked_aisle", "nominal")

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from restock.replay.plan import rows_in_order
-from restock.replay.plan.rows_in_order import KEYS, RowsInOrder
+from restock.replay.plan import candidates
+from restock.replay.plan.candidates import KEYS, RowsInOrder
 
 TEXT = ("recording_id", "episode_id", "zone")
 BY = [("recording_id", "ascending"), *((key, "ascending") for key in KEYS)]
@@ -97,7 +97,7 @@ def test_any_batches_in_any_order_give_the_same_table(
         random.shuffle(batches)  # type: ignore[attr-defined]
     with pytest.MonkeyPatch.context() as patch:
         if few:  # short stretches: rows are sorted
-            patch.setattr(rows_in_order, "MAX_STRETCHES", 0)
+            patch.setattr(candidates, "MAX_STRETCHES", 0)
         check(in_order(batches, table.schema), table)
 
 

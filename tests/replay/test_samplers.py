@@ -16,7 +16,7 @@ from support.states import through_json
 
 from restock.errors import MixtureError
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.per import Prioritised
+from restock.replay.sampling.rules import Prioritised
 from restock.replay.sampling.sampler import Quotas, QuotaSampler, uniform_sampler
 from restock.train.run import checkpoint
 

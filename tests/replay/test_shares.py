@@ -10,8 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import StratumRule
-from restock.replay.mixture.schedules import Cosine, Linear, Piecewise, mean_over, value_at
+from restock.replay.mixture.mixture import (
+    Cosine,
+    Linear,
+    Piecewise,
+    StratumRule,
+    mean_over,
+    value_at,
+)
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.replay.plan.strata import ResolvedStratum, assign
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
-from restock.replay.mixture.packed_row import row_width
+from restock.replay.sampling.packed_rows import row_width
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.feed.logs import Coded, Logs
 from restock.train.feed.teacher import open_teacher

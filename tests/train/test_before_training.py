@@ -24,8 +24,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
-from restock.replay.panel.panel import HEADER, META, Panel
-from restock.replay.panel.seal import FileRecord, seal
+from restock.replay.panel.panel import HEADER, META, FileRecord, Panel, seal
 from restock.stats import ConfidenceInterval
 from restock.train.judge import before_training
 from restock.train.judge.answers import ACTION_TURN, GAIN, RELATIONS, Answer

@@ -24,7 +24,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.collector import Collector, ring_conditions
 from restock.train.feed.flush_fresh import flush
 from restock.train.feed.fresh_log import FreshEpisode, FreshLog, episode_files, write_episodes

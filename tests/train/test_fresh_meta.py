@@ -12,7 +12,7 @@ import restock  # noqa: F401 - registers the environment
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import label, primary
 from restock.ingest.task.signals import STORED_SIGNALS
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.physics.episode import EpisodeSpec

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock import native
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.sampled_rows import FRESH, LOGGED, BatchValues, SampledRows, keep_rows
 
 compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")

@@ -20,7 +20,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.logged_sampler import LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import rules_of
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.sampler import QuotaSampler
 from restock.train.feed.batches import Batches
 from restock.train.feed.logs import Logs

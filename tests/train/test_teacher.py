@@ -23,8 +23,8 @@ from restock.cli.learning.describe_run import describe_run
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Mirror
-from restock.replay.mixture.schedules import Linear
-from restock.replay.ring.ring import FreshRing
+from restock.replay.mixture.mixture import Linear
+from restock.replay.sampling.ring import FreshRing
 from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import Facts
 from restock.state import restored, saved

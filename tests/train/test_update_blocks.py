@@ -16,7 +16,7 @@ from support.toy_twin import TASK
 
 from restock.cli.failures import as_restock_error
 from restock.errors import MixtureError
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.logs import Logs
 from restock.train.feed.update_blocks import LONGEST, DeviceTable, UpdateBlocks
 from restock.train.loop import train

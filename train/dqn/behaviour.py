@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from restock.replay.mixture.schedules import value_at
+from restock.replay.mixture.mixture import value_at
 from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import TeacherConfig, TrainConfig

@@ -19,7 +19,7 @@ from msgspec import Meta
 from restock.errors import ConfigError
 from restock.renamed import TRAINING_KEYS
 from restock.replay.fleet.missions_file import MissionOrder
-from restock.replay.mixture.schedules import Portion
+from restock.replay.mixture.mixture import Portion
 from restock.toml import Checked, changed, read_toml, toml_value, typed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import LinearEpsilon

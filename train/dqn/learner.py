@@ -35,7 +35,7 @@ class Terms:
 class Learner(Stateful):
     """The online network, its target, its optimizer and how many updates they have seen.
 
-    Batches are packed rows (B, 2D + 3) float32 as `restock.replay.mixture.packed_row` says:
+    Batches are packed rows (B, 2D + 3) float32 as `restock.replay.sampling.packed_rows` says:
     `[observation | next_observation | action | reward | discount]`.
     """
 

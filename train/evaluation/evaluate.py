@@ -26,7 +26,7 @@ from restock.ingest.task.conditions import Condition
 from restock.ingest.task.limiter import NONE, STOP
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.target import value_lag
 from restock.train.feed.collector import Collector

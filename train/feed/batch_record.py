@@ -18,7 +18,7 @@ from torch import Tensor
 from restock import native
 from restock.arrays import F32, Ints
 from restock.replay.mixture.share_controller import ShareController
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.algorithm import Loss
 from restock.train.feed import interval_tables

@@ -24,8 +24,8 @@ from restock.replay.panel.logged_sampler import (
     BatchDraw,
     LoggedSampler,
 )
-from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.gather import gather_rows
+from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.sampler import Quotas
 from restock.state import Stateful
 from restock.train.feed.logs import Logs

@@ -33,7 +33,7 @@ from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import NOMINAL_PRIORITY, ResolvedStratum, assign, rules_of
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful, saved
 from restock.train.dqn.behaviour import UNKNOWN
 from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries

@@ -24,9 +24,9 @@ import torch
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.task import Mirror
-from restock.replay.mixture.packed_row import SCALARS, row_columns
 from restock.replay.panel.panel import Panel
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.packed_rows import SCALARS, row_columns
+from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
 from restock.train.dqn.config import TeacherConfig

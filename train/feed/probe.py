@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.arrays import F64, splitmix64
-from restock.replay.mixture.packed_row import GOLDEN
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.packed_rows import GOLDEN
+from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.target import value_lag
 from restock.train.feed.logs import Logs

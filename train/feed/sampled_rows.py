@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from restock import native
 from restock.arrays import F32, Ints
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
 from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.feed.logs import Coded, Logs

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from restock.errors import MixtureError
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.behaviour import Labelled
 from restock.train.dqn.captured_update import CapturedUpdates, Launched, UpdateBlock

@@ -19,8 +19,7 @@ from restock.arrays import Bools, Ints
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.task.schema import signal_arrays
 from restock.ingest.task.signals import STORED_SIGNALS
-from restock.replay.ring.ring import META
-from restock.replay.ring.slots import NONE, StratumSlots
+from restock.replay.sampling.ring import META, NONE, StratumSlots
 
 EPISODES_PER_QUERY = 8  # at most: as many as there are environments
 _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")

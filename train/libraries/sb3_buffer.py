@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from restock.arrays import F32
 from restock.errors import MixtureError
 from restock.replay.panel.panel import Panel
-from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.rules import RULES
 from restock.replay.store.store import Store
 from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed

@@ -23,9 +23,9 @@ from tianshou.data import Batch, ReplayBuffer, ReplayBufferManager
 
 from restock.arrays import F32, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.panel.logged_sampler import BatchDraw
 from restock.replay.panel.panel import Panel
+from restock.replay.sampling.packed_rows import row_columns, row_width
 from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed, environment_profile
 
 TIANSHOU = "tianshou"

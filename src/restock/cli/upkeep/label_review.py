@@ -21,7 +21,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
     """List the most doubtful events, and write them to a file for verdicts."""
     from restock.cli import output
     from restock.files import expect_file_place, write_text
-    from restock.replay.review.doubtful import doubtful_events, review_csv, review_rows
+    from restock.replay.review import doubtful_events, review_csv, review_rows
     from restock.replay.store.store import Store
 
     if most < 1:
@@ -87,7 +87,7 @@ def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: b
     """Take a file's verdicts into the store, or all corrections out of it."""
     from restock.cli import output
     from restock.ingest.relabel import correct_store, remove_corrections
-    from restock.replay.review.verdicts import read_verdicts
+    from restock.replay.review import read_verdicts
     from restock.replay.store.store import Store
 
     taken = left_open = 0

@@ -1,5 +1,6 @@
-"""Verdicts on labels, from a CSV file: a review that was filled in, or lines written by hand.
+"""Labels in doubt, listed for review, and the verdicts that people give on them, read back.
 
+A review file is CSV, an event a line, with a verdict to fill in; lines can be written by hand too.
 Each line speaks of one condition on some steps of one episode. Everything is checked against the
 rows of the store before anything is taken.
 """
@@ -10,19 +11,109 @@ import csv
 import datetime as dt
 import io
 import re
+import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
+from datetime import datetime
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from restock.arrays import Ints
-from restock.errors import LabelError
+from restock.errors import LabelError, StoreError
 from restock.files import first_line
 from restock.ingest.relabel import RecordingCorrections
 from restock.ingest.store.corrections import Correction
-from restock.replay.review.doubtful import VERDICT
+from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
+
+LIKELY = 0.2  # from this probability on, steps without a label may be a missed event
+EDGE_STEPS = 2  # what is so near to an event is its edge
+VERDICT = "verdict"
+
+
+@dataclass(frozen=True)
+class DoubtfulEvent:
+    """One event of a label, or steps that may be a missed one. Times are log time, UTC."""
+
+    event: str  # EPISODE/FIRST-LAST/CONDITION
+    condition: str
+    labelled: bool  # False: it may be missed
+    probability: float | None  # mean over its steps; None: the condition has no rule for it
+    margin: float  # log odds that the label is right, or what stands for them: doubtful near 0
+    why: str  # what the margin is made of: probability, length, gap in an event
+    recording: str
+    source_file: str
+    start_time: datetime
+    end_time: datetime
+    start_s: float  # seconds after the recording's first step
+    end_s: float
+    episode_id: str
+    first_step: int
+    last_step: int
+    transition_id: int  # of its first step
+
+
+_COLUMNS = [field.name for field in fields(DoubtfulEvent) if field.name != "transition_id"]
+_COLUMNS += ["open", VERDICT]  # of a review file
+
+
+def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
+    """Return the events whose label is most doubtful, first the one that is most so.
+
+    Of a condition with a probability: those whose mean log odds speak least for the label, and
+    stretches without the label that are likely enough to be a missed event. Of others: the
+    shortest, and gaps of a step or two in one. What a correction speaks of already is left out.
+
+    Raises:
+        StoreError: the store holds no labels to review.
+    """
+    text = (files("restock.replay") / "doubtful.sql").read_text(encoding="utf-8")
+    given = {"likely": LIKELY, "edge": EDGE_STEPS, "most": most}
+    install_named(store.connection, text)
+    relation = store.connection.sql(text, params=given)
+    events = [DoubtfulEvent(*row) for row in relation.fetchall()]
+    if not events and not store.connection.sql("FROM recordings LIMIT 1").fetchall():
+        raise StoreError("it holds no recording", where=str(store.path), remedy="ingest some")
+    return events
+
+
+def opened_by(event: DoubtfulEvent, store: str) -> str:
+    """Return the command that shows an event's first step.
+
+    It also shows the messages behind that step if the recording is there.
+    """
+    words = ["restock", "trace", store, str(event.transition_id)]
+    if Path(event.source_file).exists():
+        words += ["--recording", event.source_file]
+    return shlex.join(words)
+
+
+def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]:
+    """Return the lines of a review file, with a verdict to fill in."""
+    rows = []
+    for event in events:
+        row = asdict(event)
+        del row["transition_id"]
+        row["labelled"] = "yes" if event.labelled else "no"
+        for name, digits in (("probability", 3), ("margin", 2), ("start_s", 3), ("end_s", 3)):
+            row[name] = None if row[name] is None else round(row[name], digits)
+        for name in ("start_time", "end_time"):
+            row[name] = row[name].isoformat(sep=" ", timespec="milliseconds")
+        rows.append({**row, "open": opened_by(event, store), VERDICT: ""})
+    return rows
+
+
+def review_csv(rows: list[dict[str, Any]]) -> str:
+    """Return a review file."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
 
 _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
 _STEP = re.compile(r"[0-9]{1,9}")

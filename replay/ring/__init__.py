@@ -1,1 +1,0 @@
-"""The newest experience, in a ring with reserves."""
