@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from restock.replay.sampling.gather import gather_rows
 from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
+from restock.train.feed.batches import gather_rows
 
 Draw = Callable[[], None]
 ALPHA, BETA = 0.6, 0.4

@@ -115,6 +115,7 @@ class ShareController(Stateful):
         fresh: Bools | None = None,
     ) -> None:
         self.mixture, self.strata, self.planned = mixture, list(strata), planned
+        self.max_replays = mixture.most_draws  # draws of one row at most; None: any number
         self.fresh, self.online = fresh, False
         size = len(strata) // len(mixture.sources.parts)
         self._of: Ints = np.arange(len(strata)) % size  # the stratum of each source's stratum
@@ -193,11 +194,6 @@ class ShareController(Stateful):
         portions = [s.rule.share for s in self.strata if not isinstance(s.rule.share, str)]
         parts = list(self.mixture.sources.parts.values())
         return any(map(knots, portions + (parts if len(parts) > 1 else [])))
-
-    @property
-    def max_replays(self) -> int | None:
-        """The most draws of a row."""
-        return self.mixture.most_draws
 
     def at(self, env_steps: float, stock: F64 | None = None) -> bool:
         """Before an online batch is drawn: move to its moment. True if the shares changed.

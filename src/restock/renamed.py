@@ -37,7 +37,12 @@ MIXTURE_KEYS = {
     "held_out": _now("`evaluation_split`"),
     "prioritised.lap_alpha": _GONE,
 }
-MIXTURES = {"missions": _now("'coverage'")}
+MIXTURES = {
+    "missions": _now("'coverage'"),
+    "exposure": 'it was removed: write `[each_condition]` with `kind = "exposure"` and'
+    ' `unit = "episode"` into a file',
+    "steps": 'it was removed: write `[each_condition]` with `share = "equal"` into a file',
+}
 AUDITS = {  # and their thresholds
     "flattering_evaluation": _now("'evaluation_bias'"),
     "flattering_panel": _now("'panel_bias'"),

@@ -18,6 +18,7 @@ from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
 LOGS = ROOT / "sample_logs" / "amr_tuesday"
+STEPS = ROOT / "benchmarks" / "evidence" / "step-quotas.toml"
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     to = Settings((str(LOGS),), tmp_path_factory.mktemp("demo"))
     for command in (
         ["ingest", str(LOGS), "--store", str(to.store)],
-        ["mix", str(to.store), "--mixture", "steps", "--out", str(to.panel)],
+        ["mix", str(to.store), "--mixture", str(STEPS), "--out", str(to.panel)],
         ["train", "--panel", str(to.panel), "--out", str(to.run)]
         + [f"--set={setting}" for setting in ("env.twin=false", "teacher.source=none")]
         + ["--set=schedule.offline_updates=6", "--set=record.audit_share=1"],

@@ -330,7 +330,7 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("option", "value", "why"),
     [
-        ("--mixture", "coverag", "one of coverage, exposure"),
+        ("--mixture", "coverag", "one of coverage, uniform"),
         ("--profile", "no_such.toml", "no such profile"),
         ("--typestore", "humbel", "no type store named 'humbel'"),
         ("--footprint", "wide", "--footprint"),

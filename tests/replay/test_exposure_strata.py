@@ -13,7 +13,7 @@ from support.stores import CONDITIONS, recording_transitions, write_store
 from restock.cli import main
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
-from restock.replay.mixture.mixture import load_mixture, parse_mixture
+from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
@@ -112,7 +112,7 @@ def test_an_exposure_beside_a_condition_by_name_takes_its_rows_by_priority(tmp_p
 def test_a_panel_of_exposures_is_packed_and_knows_its_conditions(tmp_path):
     store = store_of(planted(lambda number: NEAR[number]), tmp_path / "store")
     with Store(store) as opened:
-        panel = build_panel(opened, load_mixture("exposure"), tmp_path / "panel")
+        panel = build_panel(opened, parse_mixture(BY_EXPOSURE), tmp_path / "panel")
     assert {"closing_traffic", "nominal"} <= {line.name for line in panel.header.strata}
     assert panel.header.conditions == [  # of which each row has one: exposures are none
         *("recovery", "near_collision", "wheel_slip", "blocked_aisle", "nominal")
@@ -127,7 +127,7 @@ def test_a_table_in_memory_names_its_exposures(tmp_path):
 def test_a_store_without_exposures_has_none_to_ask_for(tmp_path):
     store = store_of(planted(lambda number: False), tmp_path / "store")
     with Store(store) as opened, pytest.raises(ConfigError, match="the store has none") as caught:
-        plan_panel(opened.connection, load_mixture("exposure"), CONDITIONS)
+        plan_panel(opened.connection, parse_mixture(BY_EXPOSURE), CONDITIONS)
     assert "ingest" in str(caught.value.remedy)
 
 
@@ -159,7 +159,7 @@ def test_the_audit_names_the_condition_that_is_chosen_on_its_outcome_and_the_exp
     ]
     capsys.readouterr()
     assert main(["audit", str(store), "--strict"]) == 1
-    assert "shipped mixture `exposure`" in capsys.readouterr().out
+    assert 'kind = "exposure"' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: Choose on the situation: use a stratum for the exposure in the row in place of this condition's (the shipped mixture `exposure` does so for all), so that episodes that handled it well are replayed, too.
+-- advice: Choose on the situation: use a stratum for the exposure in the row in place of this condition's (`[each_condition]` with `kind = "exposure"` does so for all), so that episodes that handled it well are replayed, too.
 -- doc: Conditions whose episodes succeed much less often than all episodes in the same situation (the exposure that most of them met): a stratum of them is chosen on its outcome.
 SELECT
     condition,

@@ -42,7 +42,7 @@ class MixCommand:
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
-    """A TOML file, or one of coverage, exposure, steps and uniform. See docs/mixture.md."""
+    """A TOML file, or one of coverage and uniform. See docs/mixture.md."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """The new panel's directory. It must not exist yet."""
     dry_run: bool = False

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from restock import native
-from restock.replay.sampling import gather
-from restock.replay.sampling.gather import gather_rows
+from restock.train.feed import batches
+from restock.train.feed.batches import gather_rows
 
 TABLES = npst.arrays(
     np.float32,
@@ -27,11 +27,16 @@ TABLES = npst.arrays(
 def way(request: pytest.FixtureRequest) -> Iterator[str]:
     if request.param == "1" and not native.IS_THERE:
         pytest.skip(f"native code is {native.state()}")
-    gather._prefetching_works.cache_clear()
+    forget()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(native.SWITCH, request.param)
         yield request.param
-    gather._prefetching_works.cache_clear()
+    forget()
+
+
+def forget() -> None:
+    batches._prefetching_works.cache_clear()
+    batches._is_compiled.cache_clear()
 
 
 def same(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:
@@ -118,5 +123,5 @@ def test_without_the_kernel(kernel: Any, monkeypatch: pytest.MonkeyPatch) -> Non
     else:
         monkeypatch.setattr(torch, "_embedding_bag_forward_only", kernel)
     rows, index = torch.randn(50, 7), torch.tensor([49, 0, 3, 3])
-    assert not gather._prefetching_works()
+    assert not batches._prefetching_works()
     assert same(gather_rows(rows, index), rows, index)
