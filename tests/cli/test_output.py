@@ -15,7 +15,7 @@ from support.paths import ROOT
 
 from restock import cli
 from restock.cli import output
-from restock.cli.learning.eval_tables import show_measures
+from restock.cli.learning.eval import show_measures
 from restock.ingest.task.schema import RECORDING_COLUMNS
 from restock.replay.trace import origin
 

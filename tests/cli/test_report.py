@@ -24,23 +24,20 @@ from support.panels import panel_of
 from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
-from restock.cli.learning.eval_tables import show_measures
+from restock.cli.learning.eval import show_measures
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
 from restock.replay.store.store import Store
 from restock.report import build_report
-from restock.report.look.charts import POLICY_COLOURS, POLICY_SPARES, lines, scale
+from restock.report.look.charts import POLICY_COLOURS, POLICY_SPARES, colours, lines, scale
 from restock.report.look.queries import ask, statements
 from restock.report.look.theme import DARK
-from restock.report.run import shares
+from restock.report.run import fed
 from restock.report.run.facts import evaluation_bias, gather, mean_success
 from restock.report.run.headline import headline
-from restock.report.run.page import page
-from restock.report.run.sections import success
-from restock.report.run.ways import ways_section
-from restock.report.study.charts import colours
+from restock.report.run.page import page, success, ways_section
 from restock.stats import ConfidenceInterval
 from restock.train.run.measures import summary_rows
 from restock.train.run.run import Run
@@ -931,14 +928,14 @@ def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_shares_stand_side_by_side_and_what_is_short_or_lost_by_weights_is_said(run: Path) -> None:
     facts = gather(run)
-    kinds = {row["kind"] for row in shares.bars(facts)}
+    kinds = {row["kind"] for row in fed.share_bars(facts)}
     assert kinds == {"natural", "wanted", "drawn"}
-    short, lost = shares.remarks(facts)
+    short, lost = fed.remarks(facts)
     assert "was short by 40.0% of the rows fed, of 50.0% wanted: too few rows of" in short
     assert "nominal (86.27% of the rows, 90.00% of the draws, 50.00% of the gradient)" in lost
     facts.sampled = [row | {"effective_share": row["drawn_share"]} for row in facts.sampled]
-    assert shares.remarks(facts) == [short]
-    figure = shares.figure(facts)
+    assert fed.remarks(facts) == [short]
+    figure = fed.shares_figure(facts)
     assert figure is not None
     assert "wanted" in figure.widest
-    assert [row["drawn"] for row in shares.fed_table(facts).rows] == ["90%", "10%"]
+    assert [row["drawn"] for row in fed.fed_table(facts).rows] == ["90%", "10%"]

@@ -22,7 +22,7 @@ from restock.report.fleet.coverage import coverage_facts, coverage_page
 from restock.report.fleet.shopping import shopping_section
 from restock.report.look import charts
 from restock.report.look.live import Charts
-from restock.report.study.comparison import gate_section
+from restock.report.run.comparison import gate_section
 
 HOSTILE = "</script><script>alert(1)</script><!--"
 

@@ -97,14 +97,13 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
-    "report": "look run fleet study replay/fleet replay/store train/twin/calibration",
+    "report": "look run fleet replay/fleet replay/store train/twin/calibration",
     "report/look": "train/twin/missions",
     "report/run": (
         "look replay/panel replay/plan replay/sampling replay/store train/evaluation train/run"
         " train/twin/calibration train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/store",
-    "report/study": "look",
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/containers/formats ingest/profile ingest/propose"

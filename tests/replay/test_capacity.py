@@ -11,7 +11,7 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.cli.learning.describe_run import describe_run
+from restock.cli.learning.train import describe_run
 from restock.errors import ArgumentError, ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture

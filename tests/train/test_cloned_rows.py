@@ -12,7 +12,7 @@ import pytest
 from support.paths import ROOT
 from support.toy_run import config, logs, session
 
-from restock.cli.learning.describe_run import describe_run
+from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile

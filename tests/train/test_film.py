@@ -13,7 +13,7 @@ from PIL import Image
 from support.kept_run import kept_run
 
 from restock.cli import main
-from restock.report.run.films import films_section
+from restock.report.run.floor import films_section
 from restock.train.evaluation import film
 from restock.train.evaluation.eval_run import (
     EvaluationPlan,

@@ -17,7 +17,7 @@ from support.toy_twin import CONDITIONS as TOY_CONDITIONS
 from support.toy_twin import TASK as TOY_TASK
 
 from restock.cli.data.mix import TRAINING
-from restock.cli.learning.describe_run import describe_forecast
+from restock.cli.learning.train import describe_forecast
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import held
 from restock.replay.mixture.mixture import parse_mixture

@@ -16,7 +16,7 @@ from support.long import one_in
 from support.toy_run import SMALL, assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
-from restock.cli.learning.describe_run import no_update
+from restock.cli.learning.train import no_update
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train.dqn.learner import Learner

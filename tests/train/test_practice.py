@@ -17,7 +17,7 @@ from support.toy_run import assert_same_run, config, session
 from support.toy_twin import ToyTwin
 
 from restock.cli import main
-from restock.cli.learning.describe_run import unmoved
+from restock.cli.learning.train import unmoved
 from restock.errors import ConfigError, RunError
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.dqn.config import PracticeConfig, load_config, parse_config

@@ -19,7 +19,7 @@ from support.toy_run import assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, TASK
 from torch import Tensor, tensor
 
-from restock.cli.learning.describe_run import describe_run
+from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Mirror

@@ -22,7 +22,7 @@ from support.stores import recording_transitions
 
 import restock
 from restock.cli import main
-from restock.cli.learning.describe_run import describe_run
+from restock.cli.learning.train import describe_run
 from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture

@@ -22,7 +22,7 @@ from scipy.sparse import csgraph
 
 import restock  # noqa: F401 - registers the environment
 from restock.cli import main
-from restock.cli.learning.describe_run import describe_run
+from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.train.prepare import prepare_new

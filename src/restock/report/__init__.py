@@ -18,11 +18,10 @@ from restock.report.fleet.drift import drift_page
 from restock.report.look.write import as_markdown as markdown
 from restock.report.look.write import write_page
 from restock.report.run.card import as_markdown, replay_card
+from restock.report.run.comparison import comparison_page, study_page
 from restock.report.run.facts import gather
 from restock.report.run.page import page
 from restock.report.run.twin_gap import gap_page
-from restock.report.study.comparison import comparison_page
-from restock.report.study.study import study_page
 from restock.train.twin.calibration.twin_gap import read_gap
 
 

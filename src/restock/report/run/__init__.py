@@ -1,1 +1,1 @@
-"""The report and the replay card of a run: what it was fed, what it learnt, where it fails."""
+"""Pages about runs: the report and replay card of one, a comparison of two, a study of many."""

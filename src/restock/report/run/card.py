@@ -15,7 +15,7 @@ import msgspec
 from restock.replay.sampling.rules import RULES
 from restock.report.look.blocks import Rows, count, estimate, number
 from restock.report.run.facts import Facts, evaluation_bias
-from restock.report.run.practice import by_arm
+from restock.report.run.fed import by_arm
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"

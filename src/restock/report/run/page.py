@@ -1,35 +1,36 @@
-"""The page: facts to headline, cards and sections. The template only lays them out."""
+"""The page of a run: facts to headline, cards and sections. The template only lays them out."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from restock.report.run import logs_alone
-from restock.report.run.actions import actions_section
-from restock.report.run.capacity import capacity_section
-from restock.report.run.facts import Facts
-from restock.report.run.films import films_section
-from restock.report.run.headline import headline, lead
-from restock.report.run.labels import labels_section
-from restock.report.run.practice import practice_section
-from restock.report.run.sections import (
-    critic,
-    floor_section,
-    learning,
-    provenance,
-    sampled,
-    success,
+from restock.report.look import charts
+from restock.report.look.blocks import (
+    Figure,
+    Rows,
+    Section,
+    Table,
+    count,
+    percent,
+    pretty,
+    span,
+    words,
 )
+from restock.report.run.facts import NO_GOAL, Facts
+from restock.report.run.fed import actions_section, capacity_section, practice_section, sampled
+from restock.report.run.floor import films_section, floor_section
+from restock.report.run.headline import headline, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
-from restock.report.run.ways import ways_section
-from restock.words import counted
+from restock.stats import interval_text, wilson
+from restock.words import counted, policy_words
 
 
 def page(facts: Facts) -> dict[str, Any]:
     """Return everything that the page's template needs."""
     sections = [
-        success(facts) if facts.twin else logs_alone.judged_section(facts),
+        success(facts) if facts.twin else headline.judged_section(facts),
         ways_section(facts),
         films_section(facts),
         sampled(facts),
@@ -99,3 +100,349 @@ def _sampling(facts: Facts) -> str:
     rows = sum(row["drawn_rows"] for row in facts.sampled)
     logged = sum(row["drawn_rows"] for row in facts.sampled if row["source"] == "logs")
     return f"{logged / rows:.0%}" if rows else "?"
+
+
+def success(facts: Facts) -> Section | None:
+    if not facts.cells:
+        return None
+    cells = sorted(facts.cells, key=_cell_order)
+    names = policy_words(row["policy"] for row in cells)
+    shown = [
+        {
+            **row,
+            "policy": names[row["policy"]],
+            "cell": words(row["cell"]),
+            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
+        }
+        for row in cells
+    ]
+    places = {place: number for number, place in enumerate(dict.fromkeys(map(_place, shown)))}
+    rows = [
+        {
+            "perturbation": row["perturbation"],
+            "kind of episode": row["cell"],
+            "policy": row["policy"],
+            "success": "no goal"
+            if row["success"] is None
+            else f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]",
+            "episodes": row["episodes"],
+            "discounted return": _told(row, "discounted_return", ".2f"),
+            "bumps per km": _told(row, "bumps_per_km", ".1f"),
+            "least distance to people": _told(row, "closest_person_least_m", ".2f", " m"),
+            "time to goal": _told(row, "time_s", ".1f", " s"),
+            "time lost to the planner": ""
+            if row["policy"] == "planner"
+            else _told(row, "time_lost_s", "+.1f", " s"),
+        }
+        for row in sorted(shown, key=lambda row: (places[_place(row)], row["policy"] != "agent"))
+        if row["policy"] != "random"
+    ]
+    tables = [
+        _success_table(name, [row for row in rows if row["perturbation"] == name])
+        for name in dict.fromkeys(row["perturbation"] for row in rows)
+    ]
+    return Section(
+        "success",
+        "Does it reach the goal?",
+        intro=NO_GOAL
+        if facts.no_goal
+        else "Success per kind of episode, on the same seeded episodes for every policy, without "
+        "a perturbation (clean) and under each one. Lines are 95 % Wilson intervals. "
+        f"{facts.evaluation}" + "".join(f" {one.text}." for one in facts.clones),
+        callout="" if facts.no_goal else ". ".join(losses(facts)),
+        figures=[] if facts.no_goal else [Figure(charts.success(shown))],
+        tables=tables,
+    )
+
+
+def _success_table(perturbation: str, rows: Rows) -> Table:
+    """Show the success under one perturbation, folded unless that is the clean one."""
+    reported = {name for row in rows for name, value in row.items() if value != ""} - {
+        "perturbation"
+    }
+    shown, before = [], None
+    for row in rows:
+        kind = row["kind of episode"]
+        line = {name: value for name, value in row.items() if name in reported}
+        shown.append(line | {"kind of episode": "" if kind == before else kind})
+        before = kind
+    clean = perturbation == "clean"
+    return replace(
+        _table(
+            shown,
+            {"policy", "kind of episode"},
+            title="Success, return and safety side by side"
+            + ("" if clean else f": {perturbation}"),
+            caption="Intervals are 95 % over episodes. People include forklifts; the distance is "
+            "the true one from the edge of the body. Time lost is over the missions in which "
+            "both arrived."
+            if clean
+            else "",
+        ),
+        folded=not clean,
+    )
+
+
+def _table(rows: Rows, texts: set[str], *, title: str = "", caption: str = "") -> Table:
+    """Make a table whose columns are numbers, except `texts`."""
+    numbers = set(rows[0]) - texts if rows else set()
+    return Table(rows, numbers, title=title, caption=caption)
+
+
+def _cell_order(row: dict[str, Any]) -> tuple[str, int, str]:
+    known = list(charts.CONDITION_COLOURS)
+    condition = row["cell"].split(" (")[0]
+    place = known.index(condition) if condition in known else len(known)
+    return (row["perturbation"] if row["perturbation"] != "none" else "", place, row["cell"])
+
+
+def _place(row: dict[str, Any]) -> tuple[str, str]:
+    return row["perturbation"], row["cell"]
+
+
+def _told(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
+    """Format a value with its unit and interval; nothing if it is unknown."""
+    if row[name] is None:
+        return ""
+    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+    ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
+    return f"{row[name]:{form}}{unit}{ends}"
+
+
+def learning(facts: Facts) -> Section:
+    figures = []
+    policy = facts.policy
+    latest = policy if policy is not None and policy.chosen == "latest" else None
+    if any(row["success"] is not None for row in facts.learning):
+        figures.append(
+            Figure(
+                charts.lines(
+                    charts.in_words(facts.learning),
+                    x="env_steps",
+                    y="success",
+                    series="condition",
+                    y_title="success",
+                    percent=True,
+                    domain=(0, 1),
+                    points=True,
+                    marker=None if policy is None or latest else float(policy.env_steps),
+                ),
+                "Greedy success on fixed episodes",
+                "The kept checkpoint is the best of these evaluations, not the last."
+                if latest is None
+                else f"None of these is of the {latest.text}.",
+            )
+        )
+    figures.append(
+        Figure(
+            charts.lines(
+                facts.loss,
+                x="gradient_steps",
+                y="loss",
+                series="phase",
+                y_title="Huber loss",
+                colours={"offline": "#334155", "warmup": "#94a3b8", "online": "#14b8a6"},
+            ),
+            "Loss",
+            "A low loss alone says little: with a frozen target it is lowest.",
+        )
+    )
+    tables = [off_policy_table(facts.off_policy)] if facts.off_policy and facts.twin else []
+    return Section("learning", "How did it learn?", figures=figures, two=True, tables=tables)
+
+
+def critic(facts: Facts) -> Section | None:
+    figures = []
+    if facts.td:
+        figures.append(
+            Figure(
+                charts.lines(
+                    charts.in_words(facts.td),
+                    x="gradient_steps",
+                    y="td_abs_mean",
+                    series="condition",
+                    y_title="mean |TD error| on a fixed probe",
+                ),
+                "TD error by condition",
+                "On the same rows at every point. If a condition stays high while the others "
+                "fall, the buffer does not teach it.",
+            )
+        )
+    lag = [
+        {**row, "what": "relative value lag"}
+        for row in facts.lag
+        if row["target_q_lag"] is not None
+    ]
+    if lag:
+        figures.append(
+            Figure(
+                charts.lines(
+                    lag,
+                    x="gradient_steps",
+                    y="target_q_lag",
+                    series="what",
+                    y_title="mean |Q − Q target| / mean |Q|",
+                    colours={"relative value lag": "#0f766e"},
+                ),
+                "Lag of the target network",
+                f"Target rule: {facts.target_rule}. Near zero, the target keeps up; above about a "
+                "quarter, it slows down learning.",
+            )
+        )
+    return (
+        Section("critic", "Is the critic healthy?", figures=figures, two=True) if figures else None
+    )
+
+
+def provenance(facts: Facts) -> Section:
+    tables = []
+    unlabelled = [
+        {"condition": words(name), "not labelled in the twin, which has no": ", ".join(signals)}
+        for name, signals in facts.config.get("not_evaluated", {}).items()
+    ]
+    if facts.panel is not None:
+        header = facts.panel.header
+        left_out = [f"{count:,} {reason}" for reason, count in header.left_out.items() if count]
+        pins = {
+            "panel": header.id,
+            "store": f"{header.store}, version {header.store_version}",
+            "task": header.task_hash,
+            "labels": header.labels_version,
+            "left out of the panel": ", ".join(left_out) or "nothing",
+            "held out to evaluate on": header.split_note
+            or words(header.split_by or header.mixture.evaluation_split.by),
+        }
+        tables.append(Table([{"pinned": name, "value": value} for name, value in pins.items()]))
+    if facts.recordings:
+        rows = [
+            {
+                "recording": row["source_file"],
+                "format": row["format"],
+                "length": span(row["duration_s"]),
+                "episodes": row["episodes"],
+                "transitions": count(row["transitions"]),
+                "profile": f"{row['profile']} {row['profile_hash']}",
+                "id": row["recording_id"],
+            }
+            for row in facts.recordings
+        ]
+        tables.append(Table(rows, {"length", "episodes", "transitions"}, title="Recordings"))
+    tables.append(Table(unlabelled, title="Conditions of the logs that the twin cannot show"))
+    versions = facts.config.get("versions", {})
+    software = [{"software": name, "version": str(value)} for name, value in versions.items()]
+    tables.append(Table(software, title="Software"))
+    return Section(
+        "provenance",
+        "Where does the data come from?",
+        intro=" ".join(facts.missing),
+        tables=tables,
+        details=pretty(facts.config),
+        details_title="The full configuration of the run",
+    )
+
+
+def labels_section(facts: Facts) -> Section | None:
+    """Return the section on labels; None if no recording of the store knows the truth."""
+    if not facts.labels:
+        return None
+    rows = [_score(row) for row in facts.labels]
+    reliability = _reliability(facts.reliability)
+    tables = [Table(rows, set(rows[0]) - {"condition"})]
+    if reliability:
+        title = "Steps with probability p: the share that is true should be p"
+        tables.append(Table(reliability, set(reliability[0]) - {"condition"}, title=title))
+    return Section(
+        "labels",
+        "How good are the labels?",
+        intro="Compared with the true conditions of the simulator, over all recordings of the "
+        "store. An event is a run of steps of an episode; it counts as found within .4 s. "
+        "Ranges are 95 % (Wilson). Uncertain: the share of all steps that are uncertain by "
+        "the condition's probability.",
+        tables=tables,
+    )
+
+
+def _score(row: dict[str, Any]) -> dict[str, str]:
+    return {
+        "condition": words(row["condition"]),
+        "true steps": count(row["support"]),
+        "precision": _two_decimals(row["precision"]),
+        "recall": _two_decimals(row["recall"]),
+        "true events": count(row["event_support"]) if row["event_support"] is not None else "",
+        "event precision": _with_range(row["event_precision"], row["event_labelled"]),
+        "event recall": _with_range(row["event_recall"], row["event_support"]),
+        "uncertain": percent(row["uncertain_share"] or 0.0),
+    }
+
+
+def _two_decimals(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _with_range(value: float | None, events: int | None) -> str:
+    if value is None or not events:
+        return ""
+    low, high = wilson(round(value * events), events)
+    return f"{value:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _reliability(bins: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """Show the true share of each condition by tenths of probability."""
+    rows: dict[str, dict[str, str]] = {}
+    for one in bins:
+        blank = {f"{tenth / 10:g}+": "" for tenth in range(10)}
+        row = rows.setdefault(one["condition"], {"condition": words(one["condition"]), **blank})
+        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
+    return list(rows.values())
+
+
+OWN = "agent"
+
+
+def ways_section(facts: Facts) -> Section | None:
+    """Show logged routes; None if none was driven, or nothing else was."""
+    if not facts.ways:
+        return None
+    rows = sorted(
+        facts.ways,
+        key=lambda row: (
+            *(row["perturbation"] != "none", row["cell"] != "nominal", row["cell"]),
+            *(row["policy"] != OWN, row["policy"]),
+        ),
+    )
+    names = policy_words(row["policy"] for row in rows)
+    shown: list[dict[str, Any]] = [
+        {
+            "kind of episode": words(row["cell"])
+            + ("" if row["perturbation"] == "none" else f", {row['perturbation']}"),
+            "policy": names[row["policy"]],
+            "success": interval_text(
+                row["success"], row["success_low"], row["success_high"], ".0%"
+            ),
+            "ways": row["episodes"],
+            "bumps an episode": f"{row['bumps_per_episode']:.2f}",
+            "time to goal": "" if row["time_s"] is None else f"{row['time_s']:.1f} s",
+            "time lost to the planner": ""
+            if row["time_lost_s"] is None or row["policy"] == "planner"
+            else f"{row['time_lost_s']:+.1f} s",
+        }
+        for row in rows
+    ]
+    return Section(
+        "ways",
+        "And on routes that robots really drove?",
+        intro="Start and goal of logged episodes, each route once, on the floor of the logs"
+        f" (`restock eval --missions logged`). {facts.evaluation_on_ways}",
+        tables=[
+            Table(
+                shown,
+                set(shown[0]) - {"kind of episode", "policy"},
+                title="Success on logged routes",
+                caption="Intervals are 95 % Wilson intervals over routes; with few routes they "
+                "are wide.",
+            )
+        ],
+    )
+
+
+__all__ = ["ways_section"]

@@ -1,4 +1,4 @@
-"""The section on films: what the robot did in its worst failures and in its rescues."""
+"""Sections on the floor: where the logs have been, where the policy failed, and films of it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,78 @@ import base64
 import math
 from typing import Any
 
+from markupsafe import Markup
+
 from restock.errors import RestockError
 from restock.files import read_json
-from restock.report.look.blocks import Drawing, Figure, Section, words
+from restock.report.look import charts, floor_map
+from restock.report.look.blocks import (
+    Drawing,
+    Figure,
+    Section,
+    words,
+)
 from restock.report.look.charts import FONT
 from restock.report.look.floor_map import SCALE, Box, FloorMap
-from restock.report.run.facts import Facts
+from restock.report.run.facts import CELL_M, Facts
 from restock.train.run.measures import cell_name
 from restock.train.twin.floors.floors import open_floors
 from restock.words import counted, policy_words
+
+
+def floor_section(facts: Facts) -> Section | None:
+    """Show on the map where the logs have been, and where the agent failed."""
+    layout = facts.floor
+    if layout is None:
+        return None
+    racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in layout.racks]
+    plan = floor_map.FloorMap(layout.width_m, layout.depth_m, racks)
+    failures = [
+        row
+        for row in facts.failures
+        if row["perturbation"] == "none" and row["layout"] == layout.name
+    ]
+    conditions = {row["condition"] for row in [*facts.rare, *failures]}
+    names = charts.ordered(
+        [{"condition": name} for name in conditions], "condition", charts.CONDITION_COLOURS
+    )
+    colours = charts.palette(names)
+    steps = sum(row["rows"] for row in facts.visited)
+    return Section(
+        "map",
+        "Where did it happen?",
+        figures=[
+            Figure(
+                floor_map.visited(plan, facts.visited, CELL_M),
+                "Where the logs have been",
+                f"{steps:,} logged steps in cells of {CELL_M} m, darker where there are more"
+                f" (logarithmic); the bar is {floor_map.BAR_M} m. Drawn on the run's floor, "
+                f"{layout.name}"
+                + (f", the first of {facts.floors} with logs." if facts.floors > 1 else ".")
+                + (
+                    f" Not drawn: what was logged in other frames, "
+                    f"{counted(facts.elsewhere, 'recording')}."
+                    if facts.elsewhere
+                    else ""
+                )
+                + (
+                    f" Its missions start at {len(layout.starts_m)} places where the robot was in "
+                    f"the logs, and go to {len(layout.goals)}."
+                    if layout.starts_m
+                    else ""
+                ),
+            ),
+            Figure(
+                floor_map.events(plan, facts.rare, failures, colours),
+                "Rare conditions in the logs (dots), the agent's failures (crosses)",
+                Markup(floor_map.legend(names, colours))
+                + Markup("<br>")
+                + f"{len(failures)} failed clean episodes there.",
+            ),
+        ],
+        two=True,
+    )
+
 
 FOLDER, DOCUMENT = "eval/films", "films.json"
 BODY_M = (0.62, 0.44)  # length and width of the robot as drawn
@@ -29,7 +92,7 @@ def films_section(facts: Facts) -> Section | None:
         return None
     try:
         films = read_json(folder / DOCUMENT)["films"]
-        figures = [_figure(facts, film) for film in films]
+        figures = [_film(facts, film) for film in films]
     except (RestockError, KeyError, TypeError, ValueError, OSError) as error:
         facts.missing.append(f"Films are not shown, since they could not be read: {error}")
         return None
@@ -48,7 +111,7 @@ def films_section(facts: Facts) -> Section | None:
     )
 
 
-def _figure(facts: Facts, film: dict[str, Any]) -> Figure:
+def _film(facts: Facts, film: dict[str, Any]) -> Figure:
     floor = next(f for f in open_floors(film["layouts"]) if f.name == film["layout"])
     racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in floor.racks]
     plan = FloorMap(floor.width_m, floor.depth_m, racks)

@@ -1,0 +1,516 @@
+"""Sections on the feed: rows and weights, missions practised, actions, and the buffer's size."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import altair as alt
+
+from restock.errors import RestockError
+from restock.replay.plan.exclusions import DAY_NS
+from restock.replay.plan.source_plan import TOLERANCE
+from restock.replay.store.capacity import capacity_of_rows
+from restock.report.look import charts
+from restock.report.look.blocks import (
+    Drawing,
+    Figure,
+    Rows,
+    Section,
+    Table,
+    count,
+    number,
+    percent,
+    span,
+    words,
+)
+from restock.report.run.facts import Facts, evaluation_bias
+from restock.train.run.fed_shares import SHORT
+
+_YEARS_FROM_DAYS = 512  # ages are in years from there on
+
+
+def sampled(facts: Facts) -> Section:
+    """Show what the critic was fed: the section that matters most."""
+    of_shares = shares_figure(facts)
+    figures = [] if of_shares is None else [of_shares]
+    if facts.ages:
+        figures.append(
+            Figure(
+                charts.ages(_age_rows(facts)),
+                "How old the sampled rows were",
+                f"The age of logs is in days (before training began{_newest(facts)}), that of "
+                "fresh rows in environment steps since they were collected. The two are never "
+                "pooled.",
+            )
+        )
+    if facts.policies:
+        policies = [{**row, "who": row["behaviour_policy"]} for row in facts.policies]
+        stacked = charts.stacked(
+            policies, group="source", part="who", value="share", colours=charts.POLICY_COLOURS
+        )
+        figures.append(Figure(stacked, "Behaviour policies of the sampled rows"))
+    return Section(
+        "fed",
+        "What was the critic fed?",
+        intro="The replay mix is the training distribution. A quota is a stratum's share of the "
+        "batch, whether its rows are logged or fresh. Wanted: the quota. Drawn: the share of all "
+        "rows fed. After weights: the share in the gradient.",
+        callout=evaluation_bias(facts),
+        figures=figures,
+        two=True,
+        tables=[*([fed_table(facts)] if facts.fed else []), source_table(facts)],
+    )
+
+
+def _newest(facts: Facts) -> str:
+    """Return the age of the panel's newest row: what is only as old is not stale."""
+    began_ns = facts.config.get("created_ns")
+    if facts.panel is None or began_ns is None:
+        return ""
+    days = (began_ns - facts.panel.header.newest_ns) / DAY_NS
+    age = f"{days:,.1f} days" if days < _YEARS_FROM_DAYS else f"{days / 365.25:.1f} years"
+    return f"; the panel's newest row was {age} old then"
+
+
+def _age_rows(facts: Facts) -> Rows:
+    rows: Rows = []
+    for row in facts.ages:
+        unit = "d" if row["unit"] == "days" else "steps"
+        text = f"< 1 {unit}" if row["bucket"] < 0 else _span(2 ** row["bucket"], unit)
+        rows.append(
+            {
+                "source": row["source"],
+                "bucket": text,
+                "order": row["bucket"] + (0 if unit == "d" else 100),
+                "share": row["share"],
+            }
+        )
+    return rows
+
+
+def _span(low: int, unit: str) -> str:
+    """Label ages from `low` to twice that, in years if they are that old."""
+    if unit == "d" and low >= _YEARS_FROM_DAYS:
+        return f"{low / 365.25:.1f} to {2 * low / 365.25:.1f} y"
+    return f"{_short(low)} to {_short(2 * low)} {unit}"
+
+
+def _short(value: int) -> str:
+    return f"{value / 1024:.0f}k" if value >= 1024 else str(value)
+
+
+SHARE_COLOURS = {
+    "natural": "#cbd5e1",
+    "wanted": "#94a3b8",
+    "drawn": "#0f766e",
+}
+
+
+def shares_figure(facts: Facts) -> Figure | None:
+    """Three bars a stratum; None for a run without a panel."""
+    rows = share_bars(facts)
+    if not rows:
+        return None
+    title = "All rows fed: natural, wanted and drawn shares"
+    return Figure(_share_chart(rows), title, " ".join(remarks(facts)))
+
+
+def share_bars(facts: Facts) -> Rows:
+    """Return stratum, kind and share of all rows that the critic was fed."""
+    return [
+        {"stratum": words(row["stratum"]), "kind": kind, "share": row[f"{kind}_share"]}
+        for row in facts.fed
+        for kind in SHARE_COLOURS
+    ]
+
+
+def fed_table(facts: Facts) -> Table:
+    """Show the feed in numbers, with sources, shortages and their reasons."""
+    shares = ("natural", "wanted", "drawn", "logs", "fresh", "short")
+    return Table(
+        [
+            {
+                "stratum": words(row["stratum"]),
+                **{_SHARE_TITLES.get(name, name): percent(row[f"{name}_share"]) for name in shares},
+                "rows drawn": count(row["drawn_rows"]),
+                "why short": row["reason"] or "",
+            }
+            for row in facts.fed
+        ],
+        {*(_SHARE_TITLES.get(name, name) for name in shares), "rows drawn"},
+        caption="Shares are of all rows fed, over the whole run. Natural: what the same sources "
+        "would have given if drawn from uniformly.",
+    )
+
+
+_SHARE_TITLES = {"logs": "from logs", "fresh": "fresh"}
+
+
+def remarks(facts: Facts) -> list[str]:
+    """Say which strata were short, which lose by weights, and what rows are missing."""
+    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
+    lost = []
+    for row in facts.sampled:
+        of_rows = natural.get(row["stratum"], row["available_share"])
+        weighted = row["effective_share"]
+        if row["source"] == "fresh" or of_rows is None or weighted is None:
+            continue
+        if row["drawn_share"] >= of_rows and weighted < (1 - TOLERANCE) * of_rows:
+            lost.append(
+                f"{words(row['stratum'])} ({of_rows:.2%} of the rows, {row['drawn_share']:.2%} of"
+                f" the draws, {weighted:.2%} of the gradient)"
+            )
+    short = [
+        f"{words(stratum.name)} {stratum.missing_rows:,} rows"
+        + (
+            ""
+            if stratum.missing_hours is None
+            else f" ({span(3600 * stratum.missing_hours)} of driving as logged)"
+        )
+        for stratum in facts.strata
+        if stratum.missing_rows
+    ]
+    texts = [
+        f"{words(row['stratum'])} was short by {row['short_share']:.1%} of the rows fed, of"
+        f" {row['wanted_share']:.1%} wanted: {row['reason'] or 'too few rows'}."
+        for row in facts.fed
+        if row["short_share"] >= SHORT
+    ]
+    if lost:
+        texts.append(
+            f"The share after weights is smaller than in the plain logs for {'; '.join(lost)}."
+        )
+    if short:
+        texts.append(
+            "At the draws that `restock mix` planned, the logs alone have too few rows; missing:"
+            f" {', '.join(short)}."
+        )
+    return texts
+
+
+def source_table(facts: Facts) -> Table:
+    """Show the rows of each source by stratum, also after weights."""
+    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
+    wanted = {stratum.name: stratum.wanted_share for stratum in facts.strata}
+    rows = []
+    for row in facts.sampled:
+        of_panel = row["source"] != "fresh"
+        name, available = row["stratum"], row["available_rows"]
+        share = natural.get(name, row["available_share"]) if of_panel else row["available_share"]
+        replays = f"{row['drawn_rows'] / available:.1f}" if available else ""
+        rows.append(
+            {
+                "source": row["source"],
+                "stratum": words(name),
+                "timing": row["timing"] or "",
+                "available": count(available),
+                "natural": percent(share),
+                "wanted": percent(wanted.get(name, row["quota_share"]) if of_panel else None),
+                "drawn": percent(row["drawn_share"]),
+                "after weights": percent(row["effective_share"]),
+                "rows drawn": count(row["drawn_rows"]),
+                "replays per row": replays,
+                "mean reward": number(row["reward_mean"]),
+                "terminal": percent(row["terminal_share"]),
+            }
+        )
+    numbers = set(rows[0]) - {"source", "stratum", "timing"} if rows else set()
+    return Table(
+        rows,
+        numbers,
+        caption="Shares are of the source. Replays per row: rows drawn divided by rows available "
+        "at the end; for a ring that was overwritten, this is an upper bound.",
+    )
+
+
+def _share_chart(rows: Rows) -> Drawing:
+    """Draw bars on a square-root axis, so that rare strata can be seen."""
+    strata = list(dict.fromkeys(row["stratum"] for row in rows))
+    kinds = charts.ordered(rows, "kind", SHARE_COLOURS)
+
+    def chart(width: int) -> Any:
+        quiet = alt.Axis(grid=False, ticks=False)
+        marks = [0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1]
+        return (
+            charts.plot(rows)
+            .mark_bar(cornerRadiusEnd=2)
+            .encode(
+                y=alt.Y("stratum:N", sort=strata, title=None, axis=quiet),
+                yOffset=alt.YOffset("kind:N", sort=kinds),
+                x=alt.X(
+                    "share:Q",
+                    title="share of rows (square-root axis)",
+                    scale=alt.Scale(type="sqrt"),
+                    axis=alt.Axis(format="%", values=marks),
+                ),
+                color=charts.coloured("kind", kinds, SHARE_COLOURS, width, charts.label_px(strata)),
+            )
+            .properties(height=52 * max(len(strata), 1))
+        )
+
+    return charts.draw(chart)
+
+
+def practice_section(facts: Facts) -> Section | None:
+    """Return the section on practice; None if the run has no record of it."""
+    rows = by_arm(facts)
+    if not rows:
+        return None
+    shown = [
+        {
+            "missions": words(row["arm"]),
+            "natural": percent(row["natural_share"]),
+            "wanted at first": percent(row["first_share"]),
+            "wanted at last": percent(row["last_share"]),
+            "given": percent(row["given_share"]),
+            "ended": count(row["episodes"]),
+            "success, exploring": "" if row["success"] is None else f"{row['success']:.2f}",
+        }
+        for row in rows
+    ]
+    rule = rows[0]["rule"]
+    return Section(
+        "practice",
+        "What did it practise?",
+        intro=f"Missions in the twin, by the rule “{rule}”. Shares are of missions that ended "
+        "while the agent explored; its success is lower there than in evaluations.",
+        figures=[] if rule in FIXED else [Figure(_wanted_shares(facts.practice), "Wanted shares")],
+        tables=[Table(shown, set(shown[0]) - {"missions"})],
+    )
+
+
+FIXED = ("natural", "even", "shares", "logs", "missions")
+
+
+def by_arm(facts: Facts) -> Rows:
+    """Return a row for each arm: its first and last shares, and all missions that ended."""
+    arms: dict[str, dict[str, Any]] = {}
+    for row in facts.practice:
+        arm = arms.setdefault(
+            row["arm"],
+            {
+                **{name: row[name] for name in ("rule", "arm", "condition", "natural_share")},
+                "first_share": row["wanted_share"],
+                "episodes": 0,
+                "successes": 0.0,
+            },
+        )
+        arm["last_share"] = row["wanted_share"]
+        arm["episodes"] += row["episodes"]
+        arm["successes"] += row["episodes"] * (row["success"] or 0.0)
+    total = sum(arm["episodes"] for arm in arms.values())
+    for arm in arms.values():
+        ended, successes = arm["episodes"], arm.pop("successes")
+        arm["given_share"] = ended / total if total else None
+        arm["success"] = successes / ended if ended else None
+    return list(arms.values())
+
+
+def _wanted_shares(rows: Rows) -> Drawing:
+    return charts.lines(
+        charts.in_words(rows, "arm"),
+        x="env_steps",
+        y="wanted_share",
+        series="arm",
+        y_title="share of missions",
+        percent=True,
+        steps=True,
+    )
+
+
+KINDS = ("logs", "fresh", "wanted")
+_MIN_AUDITED = 20  # rows in which the policy was asked, for a line of the table
+_LINES = 12
+MIN_TILE_PX = 34  # for a number in it
+
+
+def actions_section(facts: Facts) -> Section | None:
+    """Return the section on actions; None for a run that kept no such counts."""
+    if not facts.actions:
+        return None
+    cells = _action_cells(facts.actions)
+    return Section(
+        "actions",
+        "Which actions were in the data, and which ones does the policy prefer?",
+        intro="For each condition, the share of each action in sampled rows from logs and in "
+        "fresh rows, and the share of fresh rows in which the policy would take it (from "
+        "audited batches, in the last quarter of the updates). The logs do not show the "
+        "outcome of an action that is preferred but not in the logs; `restock diagnose` tells "
+        "whether that causes failures. Actions are named by their m/s and rad/s.",
+        figures=[Figure(_heatmap(cells), "Share of a condition's rows by action")],
+        tables=_action_table(facts.actions),
+    )
+
+
+def _row_name(row: dict[str, Any]) -> str:
+    """Return the name of a condition, or of the stratum of logs that it belongs to."""
+    stratum, condition = words(row["stratum"]), words(row["condition"])
+    return condition if stratum == condition else f"{stratum}: {condition}"
+
+
+def _action_cells(rows: Rows) -> Rows:
+    """Return a cell for each source, condition and action; `wanted` is a source here."""
+    cells: Rows = []
+    for row in rows:
+        name = _row_name(row)
+        shares = {row["source"]: row["drawn_share"]}
+        if row["source"] == "fresh":
+            shares["wanted"] = row["wanted_share"]
+        cells += [
+            {
+                **{"row": name, "action": row["name"], "order": row["action"]},
+                **{"kind": kind, "share": share, "text": _tile_text(share)},
+            }
+            for kind, share in shares.items()
+            if share is not None
+        ]
+    return cells
+
+
+def _tile_text(share: float) -> str:
+    """Format a share for a tile, where never differs from seldom."""
+    if not share:
+        return "0"
+    return f"{share:.0%}" if share >= 0.01 else "<1%"
+
+
+def _heatmap(cells: Rows) -> Drawing:
+    kinds = [kind for kind in KINDS if any(cell["kind"] == kind for cell in cells)]
+    actions = [c["action"] for c in sorted(cells, key=lambda cell: int(cell["order"]))]
+    names = list(dict.fromkeys(cell["row"] for cell in cells))
+
+    def chart(width: int) -> Any:
+        # A small tile has no number: the pointer shows it, and the table has the largest.
+        labels_px = min(charts.label_px(names), 200 if width > charts.FULL[0] else 140)
+        tile = (width - labels_px - 12) // max(len(set(actions)), 1)
+        axis = alt.Axis(
+            grid=False, ticks=False, labelOverlap=False, labelAngle=-60 if tile >= 24 else -90
+        )
+        base = charts.plot(cells).encode(
+            x=alt.X("action:N", sort=list(dict.fromkeys(actions)), title=None, axis=axis),
+            y=alt.Y(
+                "row:N",
+                title=None,
+                axis=alt.Axis(grid=False, ticks=False, labelLimit=labels_px, labelOverlap=False),
+            ),
+        )
+        tiles = base.mark_rect(stroke="#ffffff").encode(
+            color=alt.Color(
+                "share:Q",
+                scale=alt.Scale(type="sqrt", domain=[0, 1], range=["#f1f5f9", "#0b5f58"]),
+                legend=None,
+            )
+        )
+        layers = [tiles]
+        if tile >= MIN_TILE_PX:
+            number = alt.condition("datum.share > 0.35", alt.value("#fdfdfd"), alt.value("#1f2937"))
+            layers.append(base.mark_text(fontSize=12).encode(text="text:N", color=number))
+        layered = alt.layer(*layers).properties(width=tile * len(set(actions)), height=alt.Step(24))
+        header = alt.Header(orient="top", labelAnchor="start", labelPadding=4)
+        rows = alt.Row("kind:N", sort=kinds, header=header)
+        return layered.facet(row=rows).resolve_scale(y="independent")
+
+    return charts.draw(chart, charts.FULL)
+
+
+def _action_table(rows: Rows) -> list[Table]:
+    """Show which actions the policy wants most beyond the logs, by condition."""
+    logged: dict[tuple[str, int], int] = {}
+    of_condition: dict[str, int] = {}
+    for row in rows:
+        if row["source"] == "logs":
+            key = row["condition"], row["action"]
+            logged[key] = logged.get(key, 0) + row["drawn_rows"]
+            of_condition[row["condition"]] = (
+                of_condition.get(row["condition"], 0) + row["drawn_rows"]
+            )
+    gaps = []
+    for row in rows:
+        drawn = of_condition.get(row["condition"], 0)
+        if row["source"] != "fresh" or not drawn or (row["audited_rows"] or 0) < _MIN_AUDITED:
+            continue
+        share = logged.get((row["condition"], row["action"]), 0) / drawn
+        if row["wanted_share"] > 2 * share:
+            gaps.append((row["wanted_share"] - share, share, row))
+    gaps.sort(key=lambda gap: -gap[0])
+    lines = [
+        {
+            "condition": words(row["condition"]),
+            "action": row["name"],
+            "wanted": percent(row["wanted_share"]),
+            "in the logs": percent(share),
+            "in fresh rows": percent(row["drawn_share"]),
+            "rows checked": count(row["audited_rows"]),
+        }
+        for _, share, row in gaps[:_LINES]
+    ]
+    numbers = {"wanted", "in the logs", "in fresh rows", "rows checked"}
+    title = "Preferred more than twice as often as in the logs"
+    return [Table(lines, numbers, title=title)] if lines else []
+
+
+def capacity_section(facts: Facts) -> Section | None:
+    """Return the section on capacity; None if nothing says what the logs cover."""
+    chosen = facts.config.get("ring_capacity")
+    ring = facts.config.get("config", {}).get("replay", {}).get("ring_capacity")
+    capacity = chosen or _of_panel(facts)
+    if capacity is None:
+        return None
+    requested = capacity["recommended"]
+    how = (
+        "chosen by task diversity"
+        if chosen
+        else (f"by the panel's diversity, {requested:,} would be enough")
+    )
+    intro = f"The ring holds {ring or 0:,} rows; {how}: {capacity['reason']}."
+    rows = [
+        {
+            "newest rows": count(point["capacity"]),
+            "cells": count(point["cells"]),
+            "share of cells": percent(point["cells_share"]),
+            "conditions": count(point["conditions"]),
+            "episodes": count(point["episodes"]),
+            "effective episodes": f"{point['effective_episodes']:.1f}",
+        }
+        for point in capacity["curve"]
+        if point["capacity"] >= 64
+    ]
+    return Section(
+        "capacity",
+        "How large must the buffer be?",
+        intro=f"{intro} A cell is a condition x zone x action. A smaller first-in-first-out "
+        "buffer forgets whole cells, which no sampling can bring back.",
+        figures=[Figure(_cells_kept(capacity), "Cells covered by the newest logged rows")],
+        two=True,
+        tables=[Table(rows, set(rows[0]) if rows else set())],
+    )
+
+
+def _of_panel(facts: Facts) -> dict[str, Any] | None:
+    if facts.panel is None:
+        return None
+    try:
+        capacity = capacity_of_rows(facts.panel.meta)
+    except (RestockError, KeyError):  # a panel of an earlier Restock has no such columns
+        return None
+    return {**asdict(capacity), "reason": capacity.reason}
+
+
+def _cells_kept(capacity: dict[str, Any]) -> Drawing:
+    return charts.lines(
+        [{**point, "what": "logged rows"} for point in capacity["curve"]],
+        x="capacity",
+        y="cells_share",
+        series="what",
+        y_title="share of the cells ever seen",
+        colours={"logged rows": "#0f766e"},
+        percent=True,
+        domain=(0, 1),
+        marker=capacity["recommended"],
+        marked="recommended",
+        log=True,
+    )
+
+
+__all__ = ["actions_section", "by_arm", "capacity_section", "practice_section"]
