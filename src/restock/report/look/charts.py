@@ -408,16 +408,16 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
 def differences(rows: Rows) -> Drawing:
     """Draw differences in success by condition, perturbations side by side."""
     shown = _outcomes(rows)
-    return _forest(shown, "difference", "difference in success (points)", 0.0, scale=alt.Scale())
+    return _forest(shown, "difference", "difference in success (points)", 0.0, x_scale=alt.Scale())
 
 
 def improvements(rows: Rows) -> Drawing:
     """Draw the probability that the second arm's return is higher."""
     shown = _outcomes(rows)
-    return _forest(shown, "improvement", "P(higher return)", 0.5, scale=alt.Scale(domain=[0, 1]))
+    return _forest(shown, "improvement", "P(higher return)", 0.5, x_scale=alt.Scale(domain=[0, 1]))
 
 
-def _forest(rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Scale) -> Drawing:
+def _forest(rows: Rows, value: str, title: str, neutral: float, *, x_scale: alt.Scale) -> Drawing:
     """Draw a dot and its interval for each condition, beside the value of no difference."""
     conditions = _conditions(rows)
     perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
@@ -437,12 +437,12 @@ def _forest(rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Sc
             ),
         )
         dots = base.mark_circle(size=70, opacity=1).encode(
-            x=alt.X(f"{value}:Q", title=title, scale=scale)
+            x=alt.X(f"{value}:Q", title=title, scale=x_scale)
         )
         bars = (
             base.transform_filter(f"isValid(datum.{low})")
             .mark_rule(strokeWidth=3, opacity=0.5)
-            .encode(x=alt.X(f"{low}:Q", title=title, scale=scale), x2=f"{high}:Q")
+            .encode(x=alt.X(f"{low}:Q", title=title, scale=x_scale), x2=f"{high}:Q")
         )
         rule = plot([{"at": neutral}]).mark_rule(strokeDash=[4, 3], color="#475569")
         layers = alt.layer(rule.encode(x="at:Q"), bars, dots)
