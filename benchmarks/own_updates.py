@@ -11,8 +11,8 @@ from train_peers import ACTIONS, DISCOUNT, OBSERVATION, ROWS, Arrays
 
 from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.dqn.kernel import UpdatePath
 from restock.train.dqn.learner import Learner
+from restock.train.dqn.network import UpdatePath
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.logs import Coded, Logs, LogTerms

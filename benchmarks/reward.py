@@ -29,7 +29,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Rewards, reward_parts
 from restock.train.dqn.config import LossConfig
 from restock.train.evaluation.policies import load_agent
-from restock.train.run.measures import cell_name
+from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower

@@ -23,15 +23,15 @@ from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
 from restock.train import loop
 from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
-from restock.train.dqn.kernel import update_path
 from restock.train.dqn.learner import open_device
+from restock.train.dqn.network import update_path
 from restock.train.dqn.target import describe
 from restock.train.evaluation.evaluate import evaluation_time_s
 from restock.train.evaluation.logged_ways import ways_to_evaluate
+from restock.train.feed.batch_record import STOPPED
 from restock.train.feed.collector import FreshStrata, conditions_in_twin
-from restock.train.feed.imitation import refuse_nothing_to_learn
 from restock.train.feed.logs import Logs
-from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher
+from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher, refuse_nothing_to_learn
 from restock.train.feed.training_twin import check_missions, make_twin
 from restock.train.loop import Notify, TrainResult
 from restock.train.resolve import (
@@ -44,7 +44,7 @@ from restock.train.resolve import (
     without_twin,
 )
 from restock.train.run.checkpoint import check_earlier, go_back
-from restock.train.run.not_finite import STOPPED
+from restock.train.run.events import require_trackers
 from restock.train.run.run import (
     Run,
     RunLock,
@@ -60,7 +60,6 @@ from restock.train.run.run_profile import (
     profile_of_run,
     run_panel,
 )
-from restock.train.run.trackers import require_trackers
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import Twin

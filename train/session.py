@@ -29,18 +29,16 @@ from restock.train.evaluation.policies import kept_one, load_kept, save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, FreshStrata, ring_conditions
-from restock.train.feed.imitation import Imitation
 from restock.train.feed.logs import Logs, LogTerms
 from restock.train.feed.practice import Practice
 from restock.train.feed.probe import LogFidelity, Probe
-from restock.train.feed.teacher import AskedTeacher
+from restock.train.feed.teacher import AskedTeacher, Imitation
 from restock.train.feed.update_blocks import UpdateBlocks
 from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
-from restock.train.run.events import Events, TensorBoard
+from restock.train.run.events import Events, TensorBoard, tracker_sinks
 from restock.train.run.run import Run, RunLock
-from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 

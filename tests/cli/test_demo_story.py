@@ -12,8 +12,8 @@ from restock import cli
 from restock.cli.start import demo, stages
 from restock.cli.start.stages import Settings
 from restock.replay.panel.panel import Panel
-from restock.train.run.fed_shares import fed_shares
 from restock.train.run.kept_evaluations import FILE
+from restock.train.run.replay_audit import fed_shares
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 

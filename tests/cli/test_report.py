@@ -39,7 +39,7 @@ from restock.report.run.facts import evaluation_bias, gather, mean_success
 from restock.report.run.headline import headline
 from restock.report.run.page import page, success, ways_section
 from restock.stats import ConfidenceInterval
-from restock.train.run.measures import summary_rows
+from restock.train.run.kept_evaluations import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap

@@ -22,8 +22,8 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train.dqn.config import TeacherConfig
-from restock.train.feed.imitation import cloned, rows_of_policies, rows_of_successes
 from restock.train.feed.logs import Coded
+from restock.train.feed.teacher import cloned, rows_of_policies, rows_of_successes
 from restock.train.prepare import prepare_new
 
 # An episode a line: who drove its steps, and how it ended.

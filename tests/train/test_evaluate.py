@@ -16,7 +16,7 @@ from restock.train.evaluation.evaluate import (
     run_episodes,
     score,
 )
-from restock.train.run.measures import cell_name, measures, summary_rows
+from restock.train.run.kept_evaluations import cell_name, measures, summary_rows
 from restock.train.twin.physics.episode import EpisodeSpec
 
 

@@ -31,7 +31,7 @@ from restock.train.feed.logs import Logs
 from restock.train.loop import TrainingInterrupted, time_left, train
 from restock.train.prepare import refuse_short_budget
 from restock.train.resolve import planned_draws
-from restock.train.run.fed_shares import fed_shares, shortfalls
+from restock.train.run.replay_audit import fed_shares, shortfalls
 
 TABLE = pa.concat_tables([recording_transitions(index) for index in (1, 2, 3)])
 OF_STEPS = "prefer = 'priority'\n[each_condition]\nshare = 'equal'\n"

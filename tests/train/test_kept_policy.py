@@ -19,8 +19,7 @@ from restock.report.run.headline import headline
 from restock.train.evaluation.policies import load_agent
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new, prepare_resumed
-from restock.train.run.kept_policy import PolicyOrigin, kept_policy
-from restock.train.run.run import Run
+from restock.train.run.run import PolicyOrigin, Run, kept_policy
 from restock.train.session import Session
 
 

@@ -15,6 +15,7 @@ from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.evaluation.policies import load_agent
+from restock.train.feed.batch_record import NotFinite
 from restock.train.libraries.library_arm import (
     TRAINED,
     LibraryArm,
@@ -22,7 +23,6 @@ from restock.train.libraries.library_arm import (
     resolve,
     train_library,
 )
-from restock.train.run.not_finite import NotFinite
 from restock.train.run.run import Run
 from restock.train.study.study import load_study
 

@@ -14,7 +14,7 @@ from support.long import one_in
 
 from restock import cli
 from restock.replay.store.store import Store
-from restock.train.run.not_finite import STOPPED, NotFinite
+from restock.train.feed.batch_record import STOPPED, NotFinite
 
 pytestmark = pytest.mark.long
 

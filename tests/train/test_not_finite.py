@@ -19,9 +19,9 @@ from restock.cli import main
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
+from restock.train.feed.batch_record import STOPPED, NotFinite
 from restock.train.loop import check_parameters, train
 from restock.train.run import checkpoint
-from restock.train.run.not_finite import STOPPED, NotFinite
 from restock.train.run.run import Run
 
 TINY = [

@@ -40,8 +40,12 @@ from restock.train.dqn.behaviour import (
 from restock.train.dqn.config import GIVEN, TeacherConfig, parse_config
 from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.feed.imitation import Imitation, refuse_nothing_to_learn
-from restock.train.feed.teacher import TeacherFailed, open_teacher
+from restock.train.feed.teacher import (
+    Imitation,
+    TeacherFailed,
+    open_teacher,
+    refuse_nothing_to_learn,
+)
 from restock.train.judge.comparability import differences
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new, prepare_resumed

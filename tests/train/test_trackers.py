@@ -17,9 +17,8 @@ from support.toy_run import run_to_end
 from restock import cli
 from restock.imports import install_command
 from restock.train.dqn.config import TrainConfig
-from restock.train.run.events import GIVE_UP_AFTER, Events, tracked
+from restock.train.run.events import GIVE_UP_AFTER, Events, tracked, tracker_sinks
 from restock.train.run.run import Run
-from restock.train.run.trackers import tracker_sinks
 
 PANEL = {
     **{"id": "2564c94a221d4c16", "path": "/data/panel", "store": "/data/store"},

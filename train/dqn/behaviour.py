@@ -22,8 +22,7 @@ from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
-from restock.train.dqn.kernel import UpdatePath, differentiable
-from restock.train.dqn.network import QNetwork, clone
+from restock.train.dqn.network import QNetwork, UpdatePath, clone, differentiable
 
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
 _SEED = 1 << 32  # apart from that of Q, which may be as large

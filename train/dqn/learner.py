@@ -17,8 +17,7 @@ from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm
 from restock.train.dqn.behaviour import Behaviour, FilteredNetwork, Labelled, PolicyNetwork
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
-from restock.train.dqn.kernel import UpdatePath, differentiable, update_path
-from restock.train.dqn.network import clone
+from restock.train.dqn.network import UpdatePath, clone, differentiable, update_path
 from restock.train.dqn.target import Polyak, TargetUpdate
 
 

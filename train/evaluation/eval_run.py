@@ -43,10 +43,9 @@ from restock.train.run.kept_evaluations import (
     add_evaluation,
     read_clones,
     shown_evaluation,
+    summary_rows,
 )
-from restock.train.run.kept_policy import PolicyOrigin
-from restock.train.run.measures import summary_rows
-from restock.train.run.run import Run
+from restock.train.run.run import PolicyOrigin, Run
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds

@@ -50,8 +50,7 @@ from restock.train.evaluation.ope_dataset import (
     load_ope_dataset,
 )
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
-from restock.train.run.kept_policy import PolicyOrigin
-from restock.train.run.run import Run
+from restock.train.run.run import PolicyOrigin, Run
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.run.run_tables import TABLES
 

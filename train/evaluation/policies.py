@@ -32,8 +32,7 @@ from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.ope_dataset import MODEL_ROWS, held_out_rows
 from restock.train.run import checkpoint
 from restock.train.run.kept_evaluations import CloneQuality, keep_clone
-from restock.train.run.kept_policy import PolicyOrigin, env_steps_of, latest_drives
-from restock.train.run.run import Run, resuming
+from restock.train.run.run import PolicyOrigin, Run, env_steps_of, latest_drives, resuming
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.env.interface import Policy
 

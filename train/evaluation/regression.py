@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError, RunError
 from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
-from restock.train.run.kept_evaluations import shown_evaluation
-from restock.train.run.measures import cell_name
+from restock.train.run.kept_evaluations import cell_name, shown_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.words import counted, quoted

@@ -48,7 +48,7 @@ from restock.train.judge.comparability import (
     same_run,
     worst,
 )
-from restock.train.run.measures import cell_name
+from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run
 from restock.words import counted, quoted
 

@@ -37,7 +37,7 @@ from restock.train.evaluation.evaluate import (
 )
 from restock.train.evaluation.policies import GreedyPolicy, save_agent
 from restock.train.feed.training_twin import make_twin
-from restock.train.libraries.library_run import create_run
+from restock.train.libraries.mixed_feed import create_run
 from restock.train.resolve import resolve_config
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import layouts_of_split

@@ -34,8 +34,12 @@ from restock.train.libraries.library_arm import (
     check_installed,
     resolve,
 )
-from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
-from restock.train.run.measures import cell_name
+from restock.train.run.kept_evaluations import (
+    cell_name,
+    mission_of,
+    planner_times,
+    read_evaluations,
+)
 from restock.train.study.contrasts import (
     Contrast,
     RunCurve,

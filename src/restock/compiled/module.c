@@ -3,7 +3,7 @@
  *
  * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` and
  * `restock.ingest.task` with NumPy's and `restock.train.twin` with MuJoCo's rays, in fewer calls and
- * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/kernel.py`,
+ * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/network.py`,
  * `train/feed/sampled_rows.py` and `batches.py`, `replay/sampling/rules.py`,
  * `train/twin/physics/scenery.py`, `ingest/task/route.py` and `surroundings.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on

@@ -120,7 +120,7 @@ class EvalCommand:
             regression,
         )
         from restock.train.evaluation.regression import save_baseline as save
-        from restock.train.run.measures import summary_rows
+        from restock.train.run.kept_evaluations import summary_rows
 
         if self.baseline is None:
             refuse(

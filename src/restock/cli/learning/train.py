@@ -240,7 +240,7 @@ def _print(
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say
-    from restock.train.run.fed_shares import fed_shares, shortfalls
+    from restock.train.run.replay_audit import fed_shares, shortfalls
     from restock.train.run.run import Run
 
     run = Run.open(prepared.path)
@@ -335,7 +335,7 @@ def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
 
     `fed` is the panel's part of config.json.
     """
-    from restock.train.run.fed_shares import SHORT
+    from restock.train.run.replay_audit import SHORT
 
     rows, planned = fed["forecast"], fed["planned_draws"]
     total = planned["offline"] + planned["online"]
@@ -418,7 +418,7 @@ def unmoved(practised: list[dict[str, Any]], config: TrainConfig) -> str | None:
 
 
 def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
-    from restock.train.feed.imitation import cloned
+    from restock.train.feed.teacher import cloned
     from restock.train.prepare import rows_by_policy
 
     logged = {} if panel is None else rows_by_policy(panel)

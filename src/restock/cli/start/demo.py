@@ -264,7 +264,7 @@ def steps_line(to: Settings) -> str:
 
 def shelves(run: Path) -> list[str]:
     """Return a line a stratum: its share of the logs, its quota, and what the critic was fed."""
-    from restock.train.run.fed_shares import fed_shares, shortfalls
+    from restock.train.run.replay_audit import fed_shares, shortfalls
     from restock.train.run.run import Run
     from restock.train.run.run_profile import run_panel
 
@@ -349,7 +349,7 @@ def _chosen(run: Path) -> dict[str, Any] | None:
 def _told(trace: Trace, to: Settings) -> list[str]:
     """Write the chain, with a line or two for each link."""
     from restock.replay.panel.panel import Panel
-    from restock.train.run.fed_shares import fed_shares
+    from restock.train.run.replay_audit import fed_shares
     from restock.train.run.run import Run
 
     assert trace.audit is not None

@@ -16,16 +16,15 @@ from restock.replay.plan.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.look.blocks import Rows, words
 from restock.report.look.queries import ask, rows_of, statements
-from restock.train.run.fed_shares import fed_shares
 from restock.train.run.kept_evaluations import (
     CloneQuality,
+    measures,
     read_clones,
     shown_evaluation,
     trained_step,
 )
-from restock.train.run.kept_policy import PolicyOrigin, kept_policy, run_clocks
-from restock.train.run.measures import measures
-from restock.train.run.run import Run
+from restock.train.run.replay_audit import fed_shares
+from restock.train.run.run import PolicyOrigin, Run, kept_policy, run_clocks
 from restock.train.run.run_profile import run_panel
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse

@@ -25,7 +25,7 @@ from restock.report.look.blocks import (
     words,
 )
 from restock.report.run.facts import Facts, evaluation_bias
-from restock.train.run.fed_shares import SHORT
+from restock.train.run.replay_audit import SHORT
 
 _YEARS_FROM_DAYS = 512  # ages are in years from there on
 

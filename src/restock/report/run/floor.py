@@ -20,7 +20,7 @@ from restock.report.look.blocks import (
 from restock.report.look.charts import FONT
 from restock.report.look.floor_map import SCALE, Box, FloorMap
 from restock.report.run.facts import CELL_M, Facts
-from restock.train.run.measures import cell_name
+from restock.train.run.kept_evaluations import cell_name
 from restock.train.twin.floors.floors import open_floors
 from restock.words import counted, policy_words
 
