@@ -33,7 +33,7 @@ import numpy as np
 import pyarrow as pa
 from harness import finish, markdown, once, option_parser, run_restock
 
-from restock.ingest.containers.discover import recordings_in
+from restock.ingest.containers.open_recording import recordings_in
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps import steps as steps_module

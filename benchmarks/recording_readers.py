@@ -17,11 +17,10 @@ import zstandard
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from restock.ingest.containers.formats.mcap_records import crc32
+from restock.ingest.containers.mcap_records import crc32
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import FieldColumn, Ragged, equal, join, take
+from restock.ingest.decoding.columns import FieldColumn, Leaf, Ragged, equal, join, take
 from restock.ingest.decoding.definitions import message_type
-from restock.ingest.decoding.field_paths import Leaf
 from restock.ingest.decoding.row_by_row import RowDecoder
 
 NOT_INSTALLED: set[str] = set()

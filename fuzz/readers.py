@@ -40,15 +40,12 @@ with (
     import numpy as np
     from seeds import seeds, small_mcap
 
+    from restock.cli.data.info import describe_recording
     from restock.errors import RestockError
     from restock.ingest.containers.open_recording import open_recording
-    from restock.ingest.decoding.cdr import ColumnDecoder
-    from restock.ingest.decoding.columns import equal, take
-    from restock.ingest.decoding.decoders import decoder_of, type_of
-    from restock.ingest.decoding.field_paths import CannotDecode
-    from restock.ingest.decoding.messages import Channel, MessageBatch
+    from restock.ingest.decoding.columns import CannotDecode, Channel, MessageBatch, equal, take
+    from restock.ingest.decoding.decoders import ColumnDecoder, decoder_of, type_of
     from restock.ingest.decoding.row_by_row import RowDecoder
-    from restock.ingest.describe import describe_recording
 
 MAX_INPUT = 1 << 14
 SECONDS_EACH = 30

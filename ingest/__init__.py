@@ -9,8 +9,8 @@ from restock.public import lazy
 if TYPE_CHECKING:
     from restock.ingest.batch import IngestJob as IngestJob
     from restock.ingest.batch import ingest_all as ingest_all
-    from restock.ingest.containers.discover import recordings_in as recordings_in
     from restock.ingest.containers.open_recording import open_recording as open_recording
+    from restock.ingest.containers.open_recording import recordings_in as recordings_in
     from restock.ingest.live.observer import LiveObserver as LiveObserver
     from restock.ingest.pipeline import ingest as ingest
     from restock.ingest.profile.profile import Profile as Profile

@@ -36,7 +36,7 @@ from restock.imports import import_extra
 
 if TYPE_CHECKING:
     from restock.errors import RestockError
-    from restock.ingest.containers.formats.storage import Watch
+    from restock.ingest.containers.storage import Watch
     from restock.ingest.prepared import CommitGroup, IngestResult, OnRepeat, Prepared
     from restock.ingest.profile.profile import Profile
 
@@ -256,7 +256,7 @@ def warm_up() -> None:
 
 def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
     """Run a worker: one recording after the other, until none is left or the parent is gone."""
-    from restock.ingest.containers.formats.mcap_file import ChunkReader
+    from restock.ingest.containers.mcap_file import ChunkReader
 
     ChunkReader.ahead = False  # the other workers have the other cores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
@@ -392,7 +392,7 @@ def _task(
     job: IngestJob, path: Path, folder: str, environment: dict[str, str]
 ) -> Prepared | RestockError:
     """Prepare one recording on whatever machine runs the task."""
-    from restock.ingest.containers.formats.mcap_file import ChunkReader
+    from restock.ingest.containers.mcap_file import ChunkReader
 
     ChunkReader.ahead = False  # the task was given one core
     os.environ.update(environment)

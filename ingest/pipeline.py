@@ -19,9 +19,9 @@ import pyarrow as pa
 
 from restock.errors import ConfigError, RecordingError, expect, visible
 from restock.ingest.camera.frames import OFF_CLOCK, KeptFrames, frame_rows, kept_frames
-from restock.ingest.containers.formats.storage import Watch
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.storage import Watch
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml

@@ -25,8 +25,7 @@ from restock.ingest.camera.images import (
 )
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
-from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.decoding.field_paths import DTYPES, Leaf
+from restock.ingest.decoding.columns import DTYPES, FieldColumn, Leaf, Ragged, TopicColumns
 from restock.ingest.profile.tables import Camera
 from restock.ingest.task.schema import frame_schema, transition_ids
 

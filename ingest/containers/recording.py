@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.formats.compression import decompressed
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers.storage import (
     Damage,
     Extra,
     Integrity,
@@ -29,6 +28,7 @@ from restock.ingest.containers.formats.storage import (
     Packed,
     Storage,
     Watch,
+    decompressed,
     unwatched,
 )
 from restock.ingest.containers.topic_reading import (
@@ -40,10 +40,15 @@ from restock.ingest.containers.topic_reading import (
     TopicReading,
     together,
 )
-from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.decoding.columns import (
+    CannotDecode,
+    Channel,
+    Leaf,
+    MessageBatch,
+    MessageType,
+    TopicColumns,
+)
 from restock.ingest.decoding.decoders import decoder_of, type_of
-from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
-from restock.ingest.decoding.messages import Channel, MessageBatch
 from restock.ingest.decoding.row_by_row import Decoder
 
 STATIC_TRANSFORMS = "/tf_static"

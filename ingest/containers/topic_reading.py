@@ -12,16 +12,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from restock.arrays import Ints
-from restock.ingest.containers.formats.compression import decompressed
+from restock.ingest.containers.storage import decompressed
 from restock.ingest.decoding.columns import (
     FieldColumn,
     GrowingArray,
     GrowingRagged,
+    MessageBatch,
+    PendingBatch,
     TopicColumns,
     growing,
     take,
 )
-from restock.ingest.decoding.messages import MessageBatch, PendingBatch
 from restock.ingest.decoding.row_by_row import Decoded
 
 SMALL_ROWS = 1024  # batches of fewer messages are put together, up to

@@ -1,8 +1,16 @@
-"""Columns of messages: arrays and ragged arrays by field, and how they grow batch by batch."""
+"""Messages of one channel: their fields, their serialised bytes, and the columns they become.
+
+A field path names a value inside a message: `twist.twist.linear.x`, `ranges`, `header.stamp`
+(nanoseconds), `poses[].pose.position.x` (one value per element of a sequence), `name` or `name[]`.
+Names come out of files, and go to terminals, tables and reports: control characters in them are
+written out (`visible`) where they come in.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -10,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
+from restock.errors import RecordingError, visible
 
 # The number of messages to come is the file's claim: no more than this is allocated for them.
 # Memory that is allocated and not yet written to costs nothing.
@@ -202,3 +211,247 @@ class GrowingRagged:
 def growing(empty: FieldColumn) -> GrowingArray | GrowingRagged:
     """Make a growing column of the same kind as this empty one."""
     return GrowingRagged(empty) if isinstance(empty, Ragged) else GrowingArray(empty)
+
+
+DEEPEST = 24  # nested messages; real ones reach 6
+MAX_FIELDS = 20_000
+MAX_WHY = 300  # it may quote a definition
+
+DTYPES: dict[str, np.dtype[Any]] = {
+    "bool": np.dtype(np.bool_),
+    "byte": np.dtype(np.uint8),
+    "octet": np.dtype(np.uint8),
+    "char": np.dtype(np.uint8),
+    "int8": np.dtype(np.int8),
+    "uint8": np.dtype(np.uint8),
+    "int16": np.dtype(np.int16),
+    "uint16": np.dtype(np.uint16),
+    "int32": np.dtype(np.int32),
+    "uint32": np.dtype(np.uint32),
+    "int64": np.dtype(np.int64),
+    "uint64": np.dtype(np.uint64),
+    "float32": np.dtype(np.float32),
+    "float64": np.dtype(np.float64),
+}
+
+
+class CannotDecode(Exception):
+    """A type that cannot be decoded, and why: the topic is skipped, the recording is not."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(visible(why if len(why) <= MAX_WHY else f"{why[:MAX_WHY]}…"))
+
+
+@dataclass(frozen=True)
+class Many:
+    """A field that repeats: a fixed array of `length`, or a sequence where that is None."""
+
+    length: int | None
+
+
+@dataclass(frozen=True)
+class FieldType:
+    """A field: a primitive (`base`) or a message (`message`), alone or repeated."""
+
+    name: str
+    base: str | None  # key of DTYPES, or "string"
+    message: str | None  # full name
+    many: Many | None
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A field path, resolved: the fields it goes through and what is at its end."""
+
+    path: str
+    steps: tuple[FieldType, ...]
+    kind: str  # key of DTYPES, "string" or "time"
+
+    @property
+    def dims(self) -> tuple[int | None, ...]:
+        """Per repetition along the path, outermost first: its fixed length, or None."""
+        return tuple(step.many.length for step in self.steps if step.many)
+
+
+class MessageType(ABC):
+    """A message type with everything it is made of.
+
+    `source` is where its definition comes from: "embedded", a distribution's name, "inferred".
+    `times` are the messages that stand for a moment or a duration: read as nanoseconds.
+    """
+
+    name: str
+    source: str
+    times: Sequence[str] = ()
+    recursive = False  # whether a message may hold messages of its own type
+
+    @abstractmethod
+    def fields_of(self, name: str) -> Sequence[FieldType]:
+        """Return the fields of a message of this type's family.
+
+        Raises:
+            CannotDecode: it is not defined, or uses something unsupported.
+        """
+
+    def leaves(self) -> list[Leaf]:
+        """Return every field path of the type, in the order of its definition.
+
+        Inside a message that holds its own type the paths have no end: there they are left out
+        (`leaf` still finds each).
+
+        Raises:
+            CannotDecode: it nests too deeply, or has too many fields.
+        """
+        return list(self._leaves(self.name, "", (), (self.name,), [0]))
+
+    def _leaves(
+        self,
+        name: str,
+        prefix: str,
+        steps: tuple[FieldType, ...],
+        within: tuple[str, ...],
+        count: list[int],
+    ) -> Iterator[Leaf]:
+        if len(within) > DEEPEST:
+            raise CannotDecode(f"{self.name} nests deeper than {DEEPEST} messages")
+        for member in self.fields_of(name):
+            count[0] += 1
+            if count[0] > MAX_FIELDS:
+                raise CannotDecode(f"{self.name} has more than {MAX_FIELDS:,} fields")
+            path = prefix + member.name
+            through = (*steps, member)
+            if member.base:
+                yield Leaf(path, through, member.base)
+            elif member.message in self.times:
+                yield Leaf(path, through, "time")
+            elif member.message and not (self.recursive and member.message in within):
+                inner = path + ("[]." if member.many else ".")
+                inside = (*within, member.message)
+                yield from self._leaves(member.message, inner, through, inside, count)
+
+    def leaf(self, path: str) -> Leaf:
+        """Resolve one field path.
+
+        Raises:
+            RecordingError: the type has no such field; names those it has.
+        """
+        name, steps = self.name, list[FieldType]()
+        parts = path.split(".")
+        for place, part in enumerate(parts):
+            fields = {field.name: field for field in self.fields_of(name)}
+            field = fields.get(part.removesuffix("[]"))
+            last = place == len(parts) - 1
+            if field is None or (part.endswith("[]") and not field.many):
+                raise _no_field(self.name, path, f"{name} has {', '.join(fields) or 'no fields'}")
+            if field.many and not last and not part.endswith("[]"):
+                raise _no_field(self.name, path, f"{part} repeats: write {part}[]")
+            steps.append(field)
+            if last and field.base:
+                return Leaf(path, tuple(steps), field.base)
+            if last and field.message in self.times:
+                return Leaf(path, tuple(steps), "time")
+            if field.message is None:
+                raise _no_field(self.name, path, f"{part} is a {field.base}, it has no fields")
+            name = field.message
+        inside = ", ".join(field.name for field in self.fields_of(name))
+        raise _no_field(self.name, path, f"it is a message: name one of its fields ({inside})")
+
+
+def _no_field(kind: str, path: str, remedy: str) -> RecordingError:
+    return RecordingError(f"{kind} has no value at {path!r}", remedy=remedy)
+
+
+_SHORT_NAME = re.compile(r"(\w+)/(\w+)")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A stream of messages of one type in one file.
+
+    Some writers leave the `msg` out of a ROS type's name: the type has it.
+    """
+
+    id: int
+    topic: str
+    type: str  # "nav_msgs/msg/Odometry"
+    encoding: str  # of the messages: "cdr", "json", "protobuf", "ros1", …
+    definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
+    definition: bytes = b""
+    qos: str = ""  # the profiles that its publishers offered, as the file has them: YAML
+
+    def __post_init__(self) -> None:
+        for name in ("topic", "type", "encoding", "definition_format"):
+            object.__setattr__(self, name, visible(getattr(self, name)))
+        if short := _SHORT_NAME.fullmatch(self.type):
+            object.__setattr__(self, "type", "/msg/".join(short.groups()))
+
+
+@dataclass(frozen=True)
+class MessageBatch:
+    """Serialised messages of one channel: slices of one buffer, in file order."""
+
+    buffer: NDArray[np.uint8]
+    start: Ints  # (N,) first byte of each payload in `buffer`
+    stop: Ints  # (N,) one past its last
+    log_time_ns: Ints  # (N,)
+    publish_time_ns: Ints  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def select(self, rows: NDArray[np.intp]) -> MessageBatch:
+        """Select rows, in the same buffer."""
+        return MessageBatch(
+            self.buffer,
+            self.start[rows],
+            self.stop[rows],
+            self.log_time_ns[rows],
+            self.publish_time_ns[rows],
+        )
+
+    @property
+    def size_bytes(self) -> int:
+        """Return the bytes of all payloads."""
+        return int((self.stop - self.start).sum())
+
+    def payloads(self) -> list[bytes]:
+        """Return the bytes of each message."""
+        view = self.buffer.data
+        bounds = zip(self.start.tolist(), self.stop.tolist(), strict=True)
+        return [bytes(view[start:stop]) for start, stop in bounds]
+
+    @classmethod
+    def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> MessageBatch:
+        """Payloads laid one after the other."""
+        offsets = offsets_of(np.fromiter(map(len, payloads), np.int64, len(payloads)))
+        return cls(
+            np.frombuffer(b"".join(payloads), np.uint8),
+            offsets[:-1],
+            offsets[1:],
+            np.asarray(log_time_ns, np.int64),
+            np.asarray(publish_time_ns, np.int64),
+        )
+
+
+class PendingBatch:
+    """Messages of one channel that wait for more of them, to be decoded together."""
+
+    def __init__(self) -> None:
+        self._payloads = list[bytes]()
+        self._log_time_ns, self._publish_time_ns = list[Ints](), list[Ints]()
+        self.size_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._payloads)
+
+    def add(self, payloads: Sequence[bytes], log_time_ns: Ints, publish_time_ns: Ints) -> None:
+        """Add messages, in file order."""
+        self._payloads += payloads
+        self._log_time_ns.append(log_time_ns)
+        self._publish_time_ns.append(publish_time_ns)
+        self.size_bytes += sum(map(len, payloads))
+
+    def batch(self) -> MessageBatch:
+        """Return all of them as one batch."""
+        log, publish = np.concatenate(self._log_time_ns), np.concatenate(self._publish_time_ns)
+        return MessageBatch.of(self._payloads, log, publish)

@@ -1,15 +1,493 @@
-"""Choice of a channel's decoder, by the encoding of its messages."""
+"""Decoders of channels: by the encoding of their messages, ROS's straight to columns.
+
+ROS messages are CDR in both byte orders, or ROS 1's serialisation. The first four bytes of a CDR
+payload (the encapsulation header) define how the rest is laid out; alignment is relative to the
+byte after them. Of these layouts, ROS 2 writes plain CDR ("00 01", little-endian); XCDR2 and
+parameter lists are refused by name.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
-from restock.ingest.decoding.cdr import ColumnDecoder
-from restock.ingest.decoding.definitions import RosType, message_type
-from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
-from restock.ingest.decoding.json_messages import JsonParser, JsonType, Sample
-from restock.ingest.decoding.messages import Channel
-from restock.ingest.decoding.row_by_row import Decoder, ParsedDecoder
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import Ints
+from restock.ingest.decoding.cdr_frame import (
+    TOO_LONG,
+    UNTERMINATED,
+    BadRows,
+    Columns,
+    FixedField,
+    FixedFields,
+    Frame,
+    Order,
+    gather_sequences,
+    spread,
+    texts,
+    uniform,
+)
+from restock.ingest.decoding.columns import (
+    DTYPES,
+    CannotDecode,
+    Channel,
+    FieldColumn,
+    FieldType,
+    Leaf,
+    MessageBatch,
+    MessageType,
+    Ragged,
+    join,
+    offsets_of,
+    take,
+)
+from restock.ingest.decoding.definitions import TIMES, RosType, message_type
+from restock.ingest.decoding.row_by_row import (
+    Decoded,
+    Decoder,
+    JsonParser,
+    JsonType,
+    ParsedDecoder,
+    RowDecoder,
+    Sample,
+)
+
+
+class Operation(Protocol):
+    """Reads one or more fields of all messages of a frame into `out`."""
+
+    def decode(self, frame: Frame, out: Columns) -> None: ...
+
+
+@dataclass
+class CdrPlan:
+    """The operations of one message type, in the order of its serialisation."""
+
+    operations: list[Operation]
+    paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted -> kind, repetitions inside
+
+    def decode(self, frame: Frame) -> Columns:
+        """Decode the wanted fields of all messages, and move the cursor past the last field.
+
+        Raises:
+            BadRows: messages that end too early, or hold invalid text.
+        """
+        out: Columns = {}
+        for operation in self.operations:
+            operation.decode(frame, out)
+        return out
+
+    def empty(self) -> Columns:
+        """Return the columns of no messages."""
+        return {path: empty_column(kind, dims) for path, (kind, dims) in self.paths.items()}
+
+
+def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
+    """Return a column without rows, of the shape that rows would have."""
+    dtype = {"string": np.dtype(object), "time": np.dtype(np.int64)}.get(kind) or DTYPES[kind]
+    column: FieldColumn = np.zeros(0, dtype)
+    for length in reversed(dims):
+        column = wrap(column, length, 0, offsets_of(np.zeros(0, np.int64)))
+    return column
+
+
+def wrap(column: FieldColumn, length: int | None, rows: int, offsets: Ints) -> FieldColumn:
+    """Elements to rows: a fixed repetition of an array is a further axis, others are Ragged."""
+    if length is not None and not isinstance(column, Ragged):
+        return column.reshape(rows, length, *column.shape[1:])
+    return Ragged(column, offsets)
+
+
+@dataclass
+class Text:
+    """A string: its length (CDR counts a terminating zero, ROS 1 has none), then its bytes."""
+
+    path: str | None
+    ros1: bool
+
+    def decode(self, frame: Frame, out: Columns) -> None:
+        """Step over the strings, or decode them."""
+        length = frame.read_uint32(1 if self.ros1 else 4)
+        stop = frame.position + length
+        frame.check_bounds(stop)
+        start = frame.origin + frame.position
+        if not self.ros1:
+            # Some writers give an empty text no bytes at all, not even its zero.
+            ends = frame.origin + stop - 1
+            bad = (frame.buffer[np.maximum(ends, 0)] != 0) & (spread(length, len(frame)) > 0)
+            if bad.any():
+                raise BadRows(frame.rows[bad], UNTERMINATED)
+            length = max(length - 1, 0) if isinstance(length, int) else np.maximum(length - 1, 0)
+        if self.path is not None:
+            out[self.path] = texts(frame, start, length)
+        frame.position = stop
+
+
+@dataclass
+class Primitives:
+    """A sequence of primitives."""
+
+    dtype: np.dtype[Any]
+    path: str | None
+    ros1: bool
+
+    def decode(self, frame: Frame, out: Columns) -> None:
+        """Step over the sequences, or gather them."""
+        count = frame.read_uint32(1 if self.ros1 else 4)
+        size = self.dtype.itemsize
+        if size > 4 and not self.ros1:
+            # An empty sequence takes no padding.
+            aligned = (frame.position + (size - 1)) & -size
+            if isinstance(count, int):
+                frame.position = aligned if count else frame.position
+            else:
+                frame.position = np.where(count > 0, aligned, frame.position)
+        stop = frame.position + count * size
+        frame.check_bounds(stop)
+        if self.path is not None:
+            boolean = self.dtype == np.bool_
+            dtype = np.dtype(np.uint8) if boolean else self.dtype.newbyteorder(frame.order)
+            at = frame.origin + frame.position
+            sequences = gather_sequences(frame.buffer, at, count, dtype)
+            if boolean and not isinstance(sequences.values, Ragged):
+                sequences = Ragged(sequences.values != 0, sequences.offsets)
+            out[self.path] = sequences
+        frame.position = stop
+
+
+@dataclass
+class Repeat:
+    """A sequence or fixed array of messages, or of texts: the inner plan, once per element."""
+
+    inner: CdrPlan
+    length: int | None  # of a fixed array
+    ros1: bool
+
+    @cached_property
+    def _only_fixed(self) -> FixedFields | None:
+        operations = self.inner.operations
+        only = operations[0] if len(operations) == 1 else None
+        return only if isinstance(only, FixedFields) else None
+
+    def decode(self, frame: Frame, out: Columns) -> None:
+        """Decode all elements of all messages, as far as possible at once."""
+        count = self.length if self.length is not None else frame.read_uint32(1 if self.ros1 else 4)
+        if not self.inner.operations:  # ROS 1: messages without fields take no bytes
+            return
+        counts = spread(count, len(frame))
+        # An element takes at least a byte: refuse counts that cannot be, before allocating.
+        frame.check_bounds(frame.position + count)
+        offsets = offsets_of(counts)
+        if offsets[-1] == 0:
+            elements = self.inner.empty()
+        else:
+            fixed = self._fixed(frame, counts, offsets)
+            if fixed is None:
+                fixed = _Elements(self.inner, frame, counts, offsets).read()
+            elements = fixed
+        for path, column in elements.items():
+            out[path] = wrap(column, self.length, len(frame), offsets)
+
+    def _fixed(self, frame: Frame, counts: Ints, offsets: Ints) -> Columns | None:
+        """Elements of one fixed size lie at known places: one gather for all of them."""
+        fields = self._only_fixed
+        if fields is None:
+            return None
+        aligned = (frame.position + (fields.first_align - 1)) & -fields.first_align
+        phase = uniform(aligned & fields.mask)
+        stride = fields.stride(phase) if isinstance(phase, int) else None
+        if stride is None or not isinstance(phase, int):
+            return None
+        stop = np.where(counts > 0, aligned + counts * stride, frame.position)
+        frame.check_bounds(stop)
+        within = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts)
+        at = np.repeat(frame.origin + aligned, counts) + within * stride
+        elements: Columns = {}
+        fields.take(frame, at, fields.layouts[phase], elements)
+        frame.position = uniform(stop)
+        return elements
+
+
+class _Elements:
+    """Elements of varying size: where the next one starts is known when this one has been read.
+
+    The first two of every message are read one after the other. The rest are then guessed to be
+    as long as the second, and read all at once: a guess is right where every element ends just
+    where the next was thought to start. Where it was wrong, elements are read one by one.
+    """
+
+    def __init__(self, inner: CdrPlan, frame: Frame, counts: Ints, offsets: Ints) -> None:
+        self.inner, self.frame = inner, frame
+        self.counts, self.offsets = counts, offsets
+        self.position = spread(frame.position, len(frame)).copy()
+        self.places: list[Ints] = []  # of the elements that were read, in the answer
+        self.parts: list[Columns] = []
+
+    def read(self) -> Columns:
+        """Read all elements in order, and move the frame's cursor past the last."""
+        most = int(self.counts.max())
+        left = self.counts.copy()
+        step = 0
+        while (rows := np.nonzero(left > 0)[0]).size:
+            before = self.position[rows]
+            self._read_one(rows, self.counts[rows] - left[rows])
+            left[rows] -= 1
+            step += 1
+            if step == 2 and most > 4:
+                stride = np.zeros(len(left), np.int64)
+                stride[rows] = self.position[rows] - before
+                left[self._guess(np.nonzero(left > 0)[0], left, stride)] = 0
+        self.frame.position = uniform(self.position)
+        place = np.concatenate(self.places)
+        if len(self.parts) == 1 and (np.diff(place) == 1).all():
+            return self.parts[0]
+        back = np.argsort(place, kind="stable")
+        return {
+            path: take(join([part[path] for part in self.parts]), back) for path in self.parts[0]
+        }
+
+    def _read_one(self, rows: NDArray[np.intp], number: Ints) -> None:
+        frame = self.frame.select(rows, uniform(self.position[rows]))
+        self.parts.append(self.inner.decode(frame))
+        self.places.append(self.offsets[rows] + number)
+        self.position[rows] = frame.position
+
+    def _guess(self, rows: NDArray[np.intp], left: Ints, stride: Ints) -> NDArray[np.intp]:
+        """Read what is left of these messages by the guess; the rows where it was right."""
+        no_rows = np.zeros(0, np.intp)
+        if not rows.size:
+            return no_rows
+        counts = left[rows]
+        starts = offsets_of(counts)
+        within: Ints = np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
+        which = np.repeat(np.arange(len(rows)), counts)
+        position = self.position[rows][which] + within * stride[rows][which]
+        frame = self.frame.select(rows[which], position)
+        try:
+            columns = self.inner.decode(frame)
+        except BadRows:
+            return no_rows
+        stop = spread(frame.position, len(position))
+        right = np.ones(len(position), np.bool_)
+        right[:-1] = (stop[:-1] == position[1:]) | (which[:-1] != which[1:])
+        whole = np.logical_and.reduceat(right, starts[:-1])
+        elements = np.nonzero(whole[which])[0]
+        if not elements.size:
+            return no_rows
+        self.parts.append({path: take(column, elements) for path, column in columns.items()})
+        place = self.offsets[rows][which] + (self.counts[rows] - counts)[which] + within
+        self.places.append(place[elements])
+        good: NDArray[np.intp] = rows[whole]
+        self.position[good] = stop[starts[1:] - 1][whole]
+        return good
+
+
+class _Compiler:
+    """Walks a definition and collects its operations."""
+
+    def __init__(self, message: RosType, wanted: Collection[str], ros1: bool) -> None:
+        self.message, self.wanted, self.ros1 = message, wanted, ros1
+
+    def plan(self, name: str, prefix: str) -> CdrPlan:
+        """Compile the plan of a message whose fields' paths start with `prefix`."""
+        plan = CdrPlan([], {})
+        fixed: list[FixedField] = []
+        self._message(name, prefix, plan, fixed)
+        self._close(plan, fixed)
+        return plan
+
+    def _close(self, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        if fixed:
+            plan.operations.append(FixedFields(list(fixed)))
+            fixed.clear()
+
+    def _message(self, name: str, prefix: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        fields = self.message.fields_of(name)
+        if not fields and not self.ros1:  # C and C++ have no empty structure: it holds one byte
+            fixed.append(FixedField(np.dtype(np.uint8), None, 1, None))
+        for part in fields:
+            self._field(part, prefix + part.name, plan, fixed)
+
+    def _field(self, part: FieldType, path: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        wanted = self._wanted(path)
+        if part.base and part.base != "string":
+            dtype = DTYPES[part.base]
+            if part.many is None or part.many.length is not None:
+                count = part.many.length if part.many else None
+                fixed.append(FixedField(dtype, count, 1 if self.ros1 else dtype.itemsize, wanted))
+                self._note(plan, wanted, part.base, () if count is None else (count,))
+                return
+            self._close(plan, fixed)
+            plan.operations.append(Primitives(dtype, wanted, self.ros1))
+            self._note(plan, wanted, part.base, (None,))
+        elif part.many:
+            self._repeat(part, path, plan, fixed)
+        elif part.base:
+            self._close(plan, fixed)
+            plan.operations.append(Text(wanted, self.ros1))
+            self._note(plan, wanted, "string", ())
+        elif part.message in TIMES:
+            self._time(str(part.message), path, ".", plan, fixed)
+        else:
+            self._message(str(part.message), path + ".", plan, fixed)
+
+    def _repeat(self, part: FieldType, path: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        length = part.many.length if part.many else None
+        self._close(plan, fixed)
+        if part.base:
+            wanted = self._wanted(path)
+            inner = CdrPlan([Text(wanted, self.ros1)], {})
+            self._note(inner, wanted, "string", ())
+        elif part.message in TIMES:
+            inner, inner_fixed = CdrPlan([], {}), list[FixedField]()
+            self._time(str(part.message), path, "[].", inner, inner_fixed)
+            self._close(inner, inner_fixed)
+        else:
+            inner = self.plan(str(part.message), path + "[].")
+        if inner.operations or length is None:
+            plan.operations.append(Repeat(inner, length, self.ros1))
+        for inner_path, (kind, dims) in inner.paths.items():
+            plan.paths[inner_path] = (kind, (length, *dims))
+
+    def _time(self, name: str, path: str, dot: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        """Add its two fields: as nanoseconds of both, or each by its own path, or all."""
+        fields = self.message.fields_of(name)
+        bases = [field.base for field in fields]
+        if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):
+            raise CannotDecode(f"{name} is not the standard definition of a time")
+        whole = self._wanted(path)
+        for part, one in zip(("sec", "nanosec"), fields, strict=True):
+            dtype = DTYPES[str(one.base)]
+            align = 1 if self.ros1 else 4
+            part_path = self._wanted(path + dot + one.name)
+            if whole is not None:
+                fixed.append(FixedField(dtype, None, align, whole, part, part_path))
+            else:
+                fixed.append(FixedField(dtype, None, align, part_path))
+            self._note(plan, part_path, str(one.base), ())
+        self._note(plan, whole, "time", ())
+
+    def _wanted(self, path: str) -> str | None:
+        return path if path in self.wanted else None
+
+    def _note(
+        self, plan: CdrPlan, wanted: str | None, kind: str, dims: tuple[int | None, ...]
+    ) -> None:
+        if wanted is not None:
+            plan.paths[wanted] = (kind, dims)
+
+
+def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> CdrPlan:
+    """Compile the plan that reads these leaf paths of a message type (as `Leaf.path` gives them).
+
+    Raises:
+        CannotDecode: the type uses something unsupported.
+    """
+    return _Compiler(message, frozenset(wanted), ros1).plan(message.name, "")
+
+
+HEADER = 4  # bytes of the encapsulation header
+PADDING = 3  # a payload is padded to a multiple of four
+RESTARTS = 16  # with fewer rows each time, before the rest is decoded one by one
+
+_ENCAPSULATIONS = {
+    0x0002: "a parameter list (PL_CDR)",
+    0x0003: "a parameter list (PL_CDR)",
+    0x0006: "XCDR2",
+    0x0007: "XCDR2",
+    0x0008: "XCDR2 (delimited)",
+    0x0009: "XCDR2 (delimited)",
+    0x000A: "XCDR2 (parameter list)",
+    0x000B: "XCDR2 (parameter list)",
+}
+
+
+class ColumnDecoder:
+    """Decodes the wanted fields of one message type, whole batches at a time."""
+
+    def __init__(self, message: RosType, leaves: Sequence[Leaf], *, ros1: bool = False) -> None:
+        self._message, self._leaves, self._ros1 = message, tuple(leaves), ros1
+        # `name[]` is asked for and `name` compiled: brackets at the end add nothing.
+        self._paths = {leaf.path: leaf.path.removesuffix("[]") for leaf in leaves}
+        self._plan = compile_plan(message, self._paths.values(), ros1=ros1)
+
+    def empty(self) -> Columns:
+        """Columns without a row."""
+        return self._named(self._plan.empty())
+
+    def decode(self, batch: MessageBatch) -> Decoded:
+        """Decode a batch to columns, counting messages that do not decode by reason."""
+        if self._ros1:
+            every = np.arange(len(batch))
+            return self._join([self._decode_rows(batch, every, "<", 0)], Counter())
+        small = np.nonzero(batch.stop - batch.start < HEADER)[0]
+        bad = Counter({"mis-sized: shorter than its header": len(small)} if len(small) else {})
+        rows = np.nonzero(batch.stop - batch.start >= HEADER)[0]
+        start = batch.start[rows]
+        kind = batch.buffer[start].astype(np.int64) << 8 | batch.buffer[start + 1]
+        parts = []
+        for value in np.unique(kind).tolist():
+            chosen = rows[kind == value]
+            if value in (0, 1):
+                parts.append(self._decode_rows(batch, chosen, "<" if value else ">", HEADER))
+            else:
+                name = _ENCAPSULATIONS.get(value, "an unknown encapsulation")
+                reason = f"serialised as {name}, {value >> 8:02x} {value & 255:02x}: not supported"
+                bad[reason] = len(chosen)
+        return self._join(parts, bad)
+
+    def _decode_rows(
+        self, batch: MessageBatch, rows: NDArray[np.intp], order: Order, header: int
+    ) -> Decoded:
+        bad = Counter[str]()
+        for _ in range(RESTARTS):
+            if not len(rows):
+                return Decoded(rows, self.empty(), bad)
+            origin = batch.start[rows] + header
+            frame = Frame(batch.buffer, order, origin, batch.stop[rows] - origin, rows, 0)
+            try:
+                columns = self._plan.decode(frame)
+                left = frame.end - frame.position
+                if (left > (0 if self._ros1 else PADDING)).any():
+                    raise BadRows(rows[left > (0 if self._ros1 else PADDING)], TOO_LONG)
+            except BadRows as refused:
+                refused_rows = np.unique(refused.rows)
+                bad[refused.reason] += len(refused_rows)
+                rows = np.setdiff1d(rows, refused_rows)
+                continue
+            return Decoded(rows, self._named(columns), bad)
+        return self._one_by_one(batch, rows, bad)
+
+    def _one_by_one(
+        self, batch: MessageBatch, rows: NDArray[np.intp], bad: Counter[str]
+    ) -> Decoded:
+        """Decode row by row, so that each fails for itself, as what is wrong differs."""
+        part = batch.select(rows)
+        slow = RowDecoder(self._message, self._leaves, ros1=self._ros1).decode(part)
+        return Decoded(rows[slow.rows], slow.fields, bad + Counter(slow.bad))
+
+    def _join(self, parts: list[Decoded], bad: Counter[str]) -> Decoded:
+        for part in parts:
+            bad.update(part.bad)
+        if not parts:
+            return Decoded(np.zeros(0, np.intp), self.empty(), bad)
+        if len(parts) == 1:
+            return Decoded(parts[0].rows, parts[0].fields, bad)
+        rows = np.concatenate([part.rows for part in parts])
+        back = np.argsort(rows, kind="stable")
+        fields = {
+            path: take(join([part.fields[path] for part in parts]), back) for path in self._paths
+        }
+        return Decoded(rows[back], fields, bad)
+
+    def _named(self, columns: Columns) -> dict[str, FieldColumn]:
+        return {path: columns[compiled] for path, compiled in self._paths.items()}
+
 
 READABLE = ("cdr", "ros1", "json", "protobuf")
 SAMPLE_BYTES = 4 << 20  # of first messages, from which fields are inferred

@@ -26,8 +26,14 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from restock.errors import RecordingError
-from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Many, MessageType
-from restock.ingest.decoding.messages import Channel
+from restock.ingest.decoding.columns import (
+    DTYPES,
+    CannotDecode,
+    Channel,
+    FieldType,
+    Many,
+    MessageType,
+)
 
 # The line before each message inside another one names it, after a line of "=".
 _RULE = re.compile(r"^=+[ \t]*\n\s*(?:MSG|IDL):[ \t]*([\w/]+)[ \t]*(?:\n|\Z)", re.MULTILINE)

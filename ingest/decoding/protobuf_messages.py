@@ -20,7 +20,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.message_factory import GetMessageClass  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from restock.ingest.decoding.field_paths import (
+from restock.ingest.decoding.columns import (
     DTYPES,
     CannotDecode,
     FieldType,

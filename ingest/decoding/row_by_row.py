@@ -2,15 +2,24 @@
 
 ROS messages go this way through `rosbags` where the columnar decoder gives up, and as its
 reference in the tests; JSON and protobuf always do.
+
+JSON has its fields by JSON Schema; where the schema does not describe a place (or is missing), the
+channel's first messages do. JSON does not tell 0 from 0.0: seen numbers are float64, except
+integers that only int64 can hold. A message that lacks a wanted field, or has another kind of value
+there, is counted as undecodable; a null is NaN where a number should be.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces.typing import Typesdict
@@ -18,10 +27,22 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 
-from restock.ingest.decoding.columns import FieldColumn, Ragged, join, offsets_of
+from restock.ingest.decoding.columns import (
+    DEEPEST,
+    DTYPES,
+    MAX_FIELDS,
+    CannotDecode,
+    FieldColumn,
+    FieldType,
+    Leaf,
+    Many,
+    MessageBatch,
+    MessageType,
+    Ragged,
+    join,
+    offsets_of,
+)
 from restock.ingest.decoding.definitions import RosType
-from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Leaf
-from restock.ingest.decoding.messages import MessageBatch
 
 BYTES_AT_ONCE = 1 << 20  # of payloads that are parsed, and so objects, at the same time
 
@@ -221,3 +242,261 @@ def _family(message: RosType) -> Typesdict:
             family[name] = message.raw[name]
             wanted += [field.message for field in fields if field.message]
     return family
+
+
+LARGEST = 64 << 20  # bytes of a message; as objects it takes some thirty times that
+MAX_SCHEMA = 4 << 20
+EXACT = 1 << 53  # up to here float64 holds every integer
+
+# Members by which an object is a time or a duration: seconds, nanoseconds.
+TIMES = (("sec", "nsec"), ("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"))
+_KINDS = {"boolean": "bool", "integer": "int64", "number": "float64", "string": "string"}
+
+Sample = Callable[[], Iterable[bytes]]
+
+
+@dataclass
+class Node:
+    """Knowledge about the values at one place of the messages."""
+
+    seen: Counter[str] = field(default_factory=Counter)  # JSON Schema's kinds; null is left out
+    members: dict[str, Node] = field(default_factory=dict)  # of objects
+    items: Node | None = None  # of arrays
+    declared: bool = False  # by the schema: what is seen changes nothing
+    widest: int = 0  # of the integers seen
+
+    @property
+    def kind(self) -> str | None:
+        """Return the kind of most values here, so that one odd message does not decide."""
+        seen = self.seen
+        if seen["number"] and seen["integer"]:
+            seen = seen + Counter(number=seen["integer"]) - Counter(integer=seen["integer"])
+        return max(seen, key=lambda kind: seen[kind]) if seen else None
+
+
+@dataclass(eq=False)
+class JsonType(MessageType):
+    """The type of one channel's JSON messages.
+
+    Raises:
+        CannotDecode: its schema is not valid.
+    """
+
+    name: str
+    source: str  # "embedded", or "inferred" where there is no schema
+    schema: bytes
+    sample: Sample  # the channel's first messages
+    _root: Node = field(init=False)
+    _fields: dict[str, list[FieldType]] | None = None
+    times = tuple(f"{{{first}, {second}}}" for first, second in TIMES)
+
+    def __post_init__(self) -> None:
+        self._root = _Schema(self.schema).root() if self.schema else Node()
+
+    def fields_of(self, name: str) -> Sequence[FieldType]:
+        if self._fields is None:
+            root = self._root
+            if not _complete(root):
+                for payload in self.sample():
+                    try:
+                        _observe(root, parse(payload), 0)
+                    except Unparsable:
+                        continue  # counted when it is read
+            self._fields = {}
+            _Fields(self._fields).add(self.name, root)
+        return self._fields.get(name, [])
+
+
+def parse(payload: bytes) -> dict[str, Any]:
+    """Parse one message.
+
+    Raises:
+        Unparsable: not JSON, nested too deeply, too large, or not an object.
+    """
+    if len(payload) > LARGEST:
+        raise Unparsable(f"JSON of more than {LARGEST:,} bytes")
+    try:
+        try:
+            value = msgspec.json.decode(payload)
+        except msgspec.DecodeError:
+            # Not in the standard, and yet written by Python and read by it.
+            if b"NaN" not in payload and b"Infinity" not in payload:
+                raise
+            value = json.loads(payload)
+    except RecursionError:
+        raise Unparsable("JSON that nests too deeply") from None
+    except ValueError:
+        raise Unparsable("not JSON") from None
+    if not isinstance(value, dict):
+        raise Unparsable("JSON that is not an object")
+    return value
+
+
+class _Schema:
+    """A JSON Schema's document, as far as it describes which values are where."""
+
+    def __init__(self, text: bytes) -> None:
+        if len(text) > MAX_SCHEMA:
+            raise CannotDecode(f"its definition of {len(text):,} bytes is too long")
+        try:
+            self._document = msgspec.json.decode(text)
+        except (ValueError, RecursionError) as error:
+            raise CannotDecode(f"its definition cannot be parsed: {error}") from error
+        self._count = 0
+
+    def root(self) -> Node:
+        return self._node(self._document, 0, frozenset({"#"}))
+
+    def _node(self, schema: Any, depth: int, within: frozenset[str]) -> Node:
+        self._count += 1
+        if self._count > MAX_FIELDS:
+            raise CannotDecode(f"its definition has more than {MAX_FIELDS:,} fields")
+        if isinstance(schema, dict) and isinstance(target := schema.get("$ref"), str):
+            if target in within:  # its paths have no end: they are left out
+                return Node(declared=True)
+            return self._node(self._at(target), depth, within | {target})
+        if not isinstance(schema, dict) or depth >= DEEPEST:
+            return Node()
+        named = schema.get("type")
+        kinds = [kind for kind in (named if isinstance(named, list) else [named]) if kind]
+        node = Node(Counter({kind for kind in kinds if isinstance(kind, str)} - {"null"}))
+        if isinstance(members := schema.get("properties"), dict):
+            node.seen = node.seen or Counter({"object"})
+            node.members = {
+                name: self._node(one, depth + 1, within) for name, one in members.items()
+            }
+        if node.seen["array"] and "items" in schema:
+            node.items = self._node(schema["items"], depth + 1, within)
+        # A place where several kinds may be is what is seen there.
+        node.declared = len(node.seen) == 1
+        node.seen = node.seen if node.declared else Counter()
+        return node
+
+    def _at(self, target: str) -> Any:
+        """Follow a reference within the document; others describe nothing."""
+        place = self._document if target.startswith("#") else None
+        for part in target.split("/")[1:]:
+            place = place.get(part) if isinstance(place, dict) else None
+        return place
+
+
+def _complete(node: Node) -> bool:
+    """Return whether the schema describes everything, members and array items included."""
+    if not node.declared or (node.kind == "object" and not node.members):
+        return False
+    if node.kind == "array" and (node.items is None or not _complete(node.items)):
+        return False
+    return all(map(_complete, node.members.values()))
+
+
+def _observe(node: Node, value: Any, depth: int) -> None:
+    """Add what this value shows."""
+    if depth > DEEPEST or value is None or (node.declared and not node.seen):
+        return
+    if isinstance(value, dict):
+        kind = "object"
+        for name, inner in value.items():
+            if len(node.members) >= MAX_FIELDS:
+                raise CannotDecode(f"its messages have more than {MAX_FIELDS:,} fields")
+            _observe(node.members.setdefault(name, Node()), inner, depth + 1)
+    elif isinstance(value, list):
+        kind = "array"
+        node.items = node.items or Node()
+        for inner in value:
+            _observe(node.items, inner, depth + 1)
+    elif isinstance(value, bool):
+        kind = "boolean"
+    elif isinstance(value, int):
+        kind, node.widest = "integer", max(node.widest, abs(value))
+    else:
+        kind = "string" if isinstance(value, str) else "number"
+    if not node.declared:
+        node.seen[kind] += 1
+
+
+class _Fields:
+    """Turns nodes to fields. A place where nothing was seen gives no field."""
+
+    def __init__(self, fields: dict[str, list[FieldType]]) -> None:
+        self._fields = fields
+        self._count = 0
+
+    def add(self, name: str, node: Node) -> None:
+        fields = []
+        for member, inner in node.members.items():
+            self._count += 1
+            if self._count > MAX_FIELDS:
+                raise CannotDecode(f"its messages have more than {MAX_FIELDS:,} fields")
+            # A path could not tell such a name from its own dots and brackets.
+            if member and member.isprintable() and "." not in member and "[]" not in member:
+                made = self._field(f"{name}.{member}", member, inner, None)
+                fields += [made] if made else []
+        self._fields[name] = fields
+
+    def _field(self, path: str, name: str, node: Node, many: Many | None) -> FieldType | None:
+        if node.kind == "array" and node.items and many is None:
+            return self._field(path + "[]", name, node.items, Many(None))
+        if node.kind == "object":
+            message = _time(node) or path
+            self.add(message, node)
+            return FieldType(name, None, message, many)
+        base = _base(node)
+        return FieldType(name, base, None, many) if base else None
+
+
+def _time(node: Node) -> str | None:
+    for names, kind in zip(TIMES, JsonType.times, strict=True):
+        integers = all(
+            inner.seen["integer"] > inner.seen["number"] for inner in node.members.values()
+        )
+        if integers and node.members.keys() == set(names):
+            return kind
+    return None
+
+
+def _base(node: Node) -> str | None:
+    if node.kind == "integer" and not node.declared:
+        return "int64" if EXACT < node.widest < 1 << 63 else "float64"
+    return _KINDS.get(node.kind or "")
+
+
+class JsonParser:
+    """Values of parsed JSON messages."""
+
+    def parse(self, payload: bytes) -> Any:
+        return parse(payload)
+
+    def member(self, message: Any, field: FieldType) -> Any:
+        if not isinstance(message, dict) or field.name not in message:
+            raise Unparsable(f"field {field.name!r} is missing")
+        value = message[field.name]
+        if field.many and not isinstance(value, list):
+            raise Unparsable(f"{field.name!r} is not an array")
+        return value
+
+    def stamp_ns(self, value: Any) -> int:
+        for first, second in TIMES if isinstance(value, dict) else ():
+            if first in value and second in value:
+                parts = value[first], value[second]
+                if all(type(part) is int for part in parts):
+                    return int(parts[0] * 1_000_000_000 + parts[1])
+        raise Unparsable("not a valid time")
+
+    def array(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
+        kinds = set(map(type, values))
+        if leaf.kind == "string" and kinds <= {str}:
+            return objects(values)
+        if leaf.kind == "float64" and kinds <= {int, float, type(None)}:
+            if type(None) in kinds:
+                values = [math.nan if value is None else value for value in values]
+        elif not (leaf.kind == "bool" and kinds <= {bool}) and not (
+            leaf.kind == "int64" and kinds <= {int}
+        ):
+            raise Unparsable(f"{leaf.path} is not a {leaf.kind}")
+        try:
+            return np.array(values, DTYPES[leaf.kind])
+        except OverflowError:
+            raise Unparsable(f"{leaf.path} is out of range for {leaf.kind}") from None
+
+    def concatenate(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
+        return self.array(list(chain.from_iterable(values)), leaf)

@@ -24,7 +24,7 @@ from restock.ingest.task.tags import NAMED
 from restock.toml import Checked
 
 if TYPE_CHECKING:
-    from restock.ingest.decoding.field_paths import Leaf
+    from restock.ingest.decoding.columns import Leaf
 
 Reduce = Literal["min", "max", "mean", "sum", "count", "yaw"]
 NUMBER = pa.float64()

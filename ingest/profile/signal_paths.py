@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from restock.ingest.decoding.columns import FieldColumn, Ragged, take
 
 if TYPE_CHECKING:
-    from restock.ingest.decoding.field_paths import Leaf
+    from restock.ingest.decoding.columns import Leaf
 
 Rows = NDArray[np.intp]
 NAMES = "name"  # the sibling that names elements, as in sensor_msgs/JointState

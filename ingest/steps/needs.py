@@ -29,7 +29,7 @@ from restock.ingest.steps.input_columns import estimate_reduction
 from restock.words import counted
 
 if TYPE_CHECKING:
-    from restock.ingest.decoding.field_paths import Leaf
+    from restock.ingest.decoding.columns import Leaf
 
 NEARLY = 0.8  # of a name's letters: /plan is not /scan
 MAX_TOLD = 20  # topics in a message: a fleet's nightly log has one a recording

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from restock.errors import RecordingError
-from restock.ingest.decoding.field_paths import Leaf
+from restock.ingest.decoding.columns import Leaf
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.needs import field_paths, near, wanted_fields
 

@@ -34,7 +34,7 @@ from restock.cli.start.decisions import (
 )
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
-from restock.ingest.containers.discover import recordings_in
+from restock.ingest.containers.open_recording import recordings_in
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.propose import drives
 from restock.replay.store.store import Store

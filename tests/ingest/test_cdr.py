@@ -13,11 +13,9 @@ from support.bag_samples import STORE
 from support.paths import SHARED
 
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.cdr import ColumnDecoder
-from restock.ingest.decoding.columns import Ragged, equal
+from restock.ingest.decoding.columns import CannotDecode, Channel, Leaf, MessageBatch, Ragged, equal
+from restock.ingest.decoding.decoders import ColumnDecoder
 from restock.ingest.decoding.definitions import RosType, message_type
-from restock.ingest.decoding.field_paths import CannotDecode, Leaf
-from restock.ingest.decoding.messages import Channel, MessageBatch
 from restock.ingest.decoding.row_by_row import RowDecoder
 
 PRIMITIVES = [

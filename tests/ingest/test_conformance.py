@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 from support.paths import SHARED
 
-from restock.ingest.containers.formats.mcap_chunk import Chunk, inflate
-from restock.ingest.containers.formats.mcap_file import McapFile
-from restock.ingest.containers.formats.mcap_records import MAGIC, Op, parse, walk
+from restock.ingest.containers.mcap_file import McapFile
+from restock.ingest.containers.mcap_records import MAGIC, Chunk, Op, inflate, parse, walk
 
 pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 

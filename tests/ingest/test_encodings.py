@@ -28,12 +28,10 @@ from support.paths import ROOT
 from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import Ragged
+from restock.ingest.decoding.columns import CannotDecode, Channel, Ragged
 from restock.ingest.decoding.definitions import RosType, message_type
-from restock.ingest.decoding.field_paths import CannotDecode
-from restock.ingest.decoding.json_messages import JsonType
-from restock.ingest.decoding.messages import Channel
 from restock.ingest.decoding.protobuf_messages import protobuf_type
+from restock.ingest.decoding.row_by_row import JsonType
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter

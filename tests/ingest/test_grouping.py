@@ -17,8 +17,8 @@ from support.bag_samples import assert_same_columns, write_bag, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 
+from restock.ingest.containers import mcap_file, sqlite_file
 from restock.ingest.containers import topic_reading as reading
-from restock.ingest.containers.formats import mcap_file, sqlite_file
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding import columns as columns_module
 from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of

@@ -26,9 +26,8 @@ from restock.cli import main
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import recording
 from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import CannotDecode, Channel
 from restock.ingest.decoding.definitions import message_type
-from restock.ingest.decoding.field_paths import CannotDecode
-from restock.ingest.decoding.messages import Channel
 from restock.replay.store.store import Store
 
 # -- sqlite: programs in place of tables ----------------------------------------------------------

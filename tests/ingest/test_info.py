@@ -10,7 +10,7 @@ from support.bag_samples import TOPICS, write_bag, write_mcap
 from support.paths import ROOT, SHARED
 
 from restock.cli import main
-from restock.ingest.describe import offered
+from restock.cli.data.info import offered
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from support.bag_samples import STORE, TOPICS, assert_same_columns, write_mcap
 
 from restock.cli import main
-from restock.ingest.containers.formats.mcap_records import Op, parse, walk
+from restock.ingest.containers.mcap_records import Op, parse, walk
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from restock.ingest.containers import discover
-from restock.ingest.containers.discover import recordings_in
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers import open_recording as opening
+from restock.ingest.containers.open_recording import open_recording, recordings_in
+from restock.ingest.containers.storage import (
     Container,
     Damage,
     Extra,
@@ -20,8 +20,7 @@ from restock.ingest.containers.formats.storage import (
     Watch,
     unwatched,
 )
-from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.messages import Channel, MessageBatch
+from restock.ingest.decoding.columns import Channel, MessageBatch
 
 MAGIC = b"#JSONLINES\n"
 
@@ -66,7 +65,7 @@ ROW = Container(
 def test_a_container_is_one_class_and_one_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(discover, "CONTAINERS", (*discover.CONTAINERS, ROW))
+    monkeypatch.setattr(opening, "CONTAINERS", (*opening.CONTAINERS, ROW))
     lines = [json.dumps({"ns": ns, "message": {"mps": ns / 10}}) for ns in (10, 20, 30)]
     path = tmp_path / "run.jsonl"
     path.write_bytes(MAGIC + "\n".join(lines).encode())

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from restock.ingest.containers.formats import mcap_file
-from restock.ingest.containers.formats.mcap_file import AHEAD, ChunkReader, McapFile
+from restock.ingest.containers import mcap_file
+from restock.ingest.containers.mcap_file import AHEAD, ChunkReader, McapFile
 
 CHUNK = 4096
 MESSAGES = 400

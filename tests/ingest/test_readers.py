@@ -26,15 +26,11 @@ from support.bag_samples import (
 from support.paths import SHARED
 
 from restock.cli import main
+from restock.cli.data.info import describe_recording
 from restock.errors import ExitCode, RecordingError
-from restock.ingest.containers.open_recording import (
-    Recording,
-    TopicColumns,
-    open_recording,
-    recordings_in,
-)
-from restock.ingest.decoding.columns import Ragged, equal
-from restock.ingest.describe import describe_recording
+from restock.ingest.containers.open_recording import open_recording, recordings_in
+from restock.ingest.containers.recording import Recording
+from restock.ingest.decoding.columns import Ragged, TopicColumns, equal
 
 
 def everything(recording: Recording) -> dict[str, TopicColumns]:
@@ -381,7 +377,7 @@ def test_a_cut_sqlite_bag_is_refused_and_salvaged(tmp_path: Path) -> None:
 
 
 def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
-    from restock.ingest.containers.formats.mcap_file import McapFile
+    from restock.ingest.containers.mcap_file import McapFile
 
     chunks = McapFile(mcap)._contents.chunks
     assert len(chunks) > 3
@@ -462,7 +458,7 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
 
 
 def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
-    from restock.ingest.containers.formats.mcap_records import Op, walk
+    from restock.ingest.containers.mcap_records import Op, walk
 
     file = write_mcap(tmp_path / "run.mcap")
     content = bytearray(file.read_bytes())
@@ -484,7 +480,7 @@ def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
 
 def without_summary(path: Path, *, missing: int) -> Path:
     """Return the file without what comes after its data, and without one of its message indexes."""
-    from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, Op, walk
+    from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Op, walk
 
     content = path.read_bytes()
     kept, indexes = [MAGIC], 0

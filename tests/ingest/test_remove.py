@@ -19,8 +19,8 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import StoreError
+from restock.ingest.prepared import RemovedRecording, remove_recordings
 from restock.ingest.relabel import RecordingCorrections, correct_store
-from restock.ingest.remove import RemovedRecording, remove_recordings
 from restock.ingest.store.compaction import compact
 from restock.ingest.store.corrections import Correction
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS

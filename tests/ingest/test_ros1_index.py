@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.paths import SHARED
 
 from restock.errors import RecordingError
-from restock.ingest.containers.formats import ros1_file
+from restock.ingest.containers import ros1_file
 from restock.ingest.containers.open_recording import open_recording
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)

@@ -10,8 +10,8 @@ from support.bag_samples import write_mcap
 
 from restock.cli import main
 from restock.errors import RecordingError
-from restock.ingest.containers.formats.mcap_file import McapFile
-from restock.ingest.containers.formats.mcap_records import MAGIC, Op, walk
+from restock.ingest.containers.mcap_file import McapFile
+from restock.ingest.containers.mcap_records import MAGIC, Op, walk
 from restock.ingest.containers.open_recording import open_recording
 
 COUNT = 140

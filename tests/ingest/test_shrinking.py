@@ -92,7 +92,7 @@ def zeros(size: int) -> bytes:
 
 
 def test_zeros_in_a_chunk_and_in_a_compressed_file_are_damage(tmp_path: Path) -> None:
-    from restock.ingest.containers.formats.mcap_chunk import walked_messages
+    from restock.ingest.containers.mcap_records import walked_messages
 
     positions, cut = walked_messages(bytes(64 << 20))
     assert not positions

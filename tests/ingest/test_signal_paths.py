@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.ragged import nested, ragged
 
-from restock.ingest.decoding.columns import FieldColumn
+from restock.ingest.decoding.columns import FieldColumn, Leaf
 from restock.ingest.decoding.definitions import distro_types
-from restock.ingest.decoding.field_paths import Leaf
 from restock.ingest.profile.signal_paths import PathProblem, SignalPath
 
 

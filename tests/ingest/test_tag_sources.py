@@ -17,13 +17,13 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.storage import (
     MAX_ENTRIES,
     MAX_TEXT,
     Metadata,
     custom_data,
 )
-from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tag_rules import TagRules, path_pattern, resolve_tags
 from restock.ingest.task.tags import MAX_TAGS

@@ -14,7 +14,7 @@ from support.stores import one
 import restock
 from restock.errors import ArgumentError, ConfigError, QueryError
 from restock.ingest import IngestJob, StoreWriter, ingest, ingest_all, load_profile, relabel_store
-from restock.ingest.remove import remove_recordings
+from restock.ingest.prepared import remove_recordings
 from restock.replay import Store, build_panel, diff_stores, find_gaps, load_mixture, measure_drift
 from restock.replay.fleet.panel_difference import diff_panels
 from restock.train import compare, diagnose

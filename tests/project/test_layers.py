@@ -23,10 +23,9 @@ SHARED = {
     *("renamed", "state", "stats", "toml", "words"),
 }
 MAY_IMPORT = {
-    "ingest": "camera containers containers/formats decoding profile steps store task urdf",
+    "ingest": "camera containers decoding profile steps store task urdf",
     "ingest/decoding": "",
-    "ingest/containers": "containers/formats decoding",
-    "ingest/containers/formats": "decoding",
+    "ingest/containers": "decoding",
     "ingest/camera": "containers decoding profile task",
     "ingest/task": "",
     "ingest/urdf": "",
@@ -106,7 +105,7 @@ MAY_IMPORT = {
     "report/fleet": "look replay/fleet replay/store",
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
     "cli/data": (
-        "cli ingest ingest/containers ingest/containers/formats ingest/profile ingest/propose"
+        "cli ingest ingest/containers ingest/profile ingest/propose"
         " ingest/propose/evidence ingest/steps ingest/store ingest/task replay replay/export"
         " replay/fleet replay/mixture replay/panel replay/plan replay/store train/evaluation"
     ),

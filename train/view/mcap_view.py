@@ -24,7 +24,7 @@ from mcap.writer import CompressionType, Writer
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import RunError
-from restock.ingest.decoding.messages import Channel
+from restock.ingest.decoding.columns import Channel
 from restock.replay.trace.moment import Moment
 from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.dqn.config import TrainConfig, parse_config

@@ -105,7 +105,7 @@ class ProfileCommand:
     def _new(self) -> int:
         from restock.cli import output
         from restock.files import expect_file_place
-        from restock.ingest.containers.discover import recordings_in
+        from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.propose.drives import names_of, propose_for_drives
         from restock.ingest.propose.evidence.footprint import parse_footprint
 
@@ -219,8 +219,8 @@ class ProfileCommand:
 
     def _open(self, path: Path | str) -> Recording:
         from restock.cli import output
-        from restock.ingest.containers.formats.storage import unwatched
         from restock.ingest.containers.open_recording import open_recording
+        from restock.ingest.containers.storage import unwatched
         from restock.ingest.propose.evidence.roles import choose_robot
 
         with output.progress(f"opening {Path(path).name}", None) as advance:

@@ -94,7 +94,7 @@ class DemoCommand:
 
     def _check(self) -> None:
         """Raise RestockError if the user's recordings or profile cannot be found or read."""
-        from restock.ingest.containers.discover import recordings_in
+        from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.profile.profile import load_profile
 
         if self.logs is not None:

@@ -11,7 +11,7 @@ from restock.errors import ConfigError, ExitCode
 from restock.words import counted, quoted
 
 if TYPE_CHECKING:
-    from restock.ingest.remove import Removed
+    from restock.ingest.prepared import Removed
 
 SHOWN = 3  # recordings whose paths stand in the command that ingests them again
 
@@ -51,7 +51,7 @@ class RemoveCommand:
     def run(self) -> ExitCode:
         """Remove, and say what was removed and how to get it back."""
         from restock.cli import output
-        from restock.ingest.remove import remove_recordings
+        from restock.ingest.prepared import remove_recordings
         from restock.ingest.store.writer import StoreWriter
 
         store = StoreWriter(self.store)

@@ -22,8 +22,8 @@ from urllib.parse import quote
 import numpy as np
 
 from restock.errors import RecordingError
-from restock.ingest.containers.formats.sqlite_salvage import SalvagedSqliteFile
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
+from restock.ingest.containers.storage import (
     NOT_KEPT,
     Container,
     Damage,
@@ -35,7 +35,7 @@ from restock.ingest.containers.formats.storage import (
     custom_data,
     unwatched,
 )
-from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
+from restock.ingest.decoding.columns import Channel, MessageBatch, PendingBatch
 
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000

@@ -21,8 +21,8 @@ import numpy as np
 
 from restock.arrays import Bools, Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.formats.storage import Damage, Extra, Integrity, Metadata, Packed
-from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed
+from restock.ingest.decoding.columns import Channel, MessageBatch, PendingBatch
 
 LEAF, INTERIOR = 0x0D, 0x05  # of a table
 MIN_CELL = 4  # bytes

@@ -18,17 +18,19 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from restock.errors import visible
-from restock.ingest.containers.formats.mcap_chunk import HEAD_SIZE, Chunk, Definitions
-from restock.ingest.containers.formats.mcap_records import (
+from restock.ingest.containers.mcap_records import (
+    HEAD_SIZE,
     MAGIC,
     PREFIX,
+    Chunk,
+    Definitions,
     FileBytes,
     Malformed,
     Op,
     parse,
     walk,
 )
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers.storage import (
     Extra,
     Metadata,
     Watch,

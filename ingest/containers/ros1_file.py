@@ -29,8 +29,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from restock.arrays import Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.formats.compression import most_bytes
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers.storage import (
     Container,
     Damage,
     Extra,
@@ -38,9 +37,10 @@ from restock.ingest.containers.formats.storage import (
     Metadata,
     Packed,
     Watch,
+    most_bytes,
     unwatched,
 )
-from restock.ingest.decoding.messages import Channel, MessageBatch
+from restock.ingest.decoding.columns import Channel, MessageBatch
 
 # Of chunks that are read again: who proposes a profile reads topic after topic, and bz2 is slow.
 KEPT_BYTES = 128 << 20

@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.files import cores
-from restock.ingest.containers.formats import mcap_chunk
-from restock.ingest.containers.formats.mcap_chunk import (
+from restock.ingest.containers import mcap_records
+from restock.ingest.containers.mcap_contents import ROSBAG2, resume, survey
+from restock.ingest.containers.mcap_records import (
     LATEST_NS,
+    MAGIC,
+    PREFIX,
     BadChunk,
     Chunk,
     Definitions,
+    FileBytes,
     Indexed,
     Messages,
     Positions,
 )
-from restock.ingest.containers.formats.mcap_contents import ROSBAG2, resume, survey
-from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, FileBytes
-from restock.ingest.containers.formats.storage import (
+from restock.ingest.containers.storage import (
     NOT_KEPT,
     Container,
     Damage,
@@ -39,7 +41,7 @@ from restock.ingest.containers.formats.storage import (
     custom_data,
     unwatched,
 )
-from restock.ingest.decoding.messages import Channel, MessageBatch
+from restock.ingest.decoding.columns import Channel, MessageBatch
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 _Room: TypeAlias = tuple[Chunk, int, bytes | None]  # its bytes; of the cut one, what it still holds
@@ -103,9 +105,9 @@ class ChunkReader:
     def inflate(self, chunk: Chunk) -> bytes:
         """Return one chunk's records; nothing if they cannot be read."""
         if chunk is self._cut:
-            return mcap_chunk.inflate_partly(chunk, self._file)
+            return mcap_records.inflate_partly(chunk, self._file)
         try:
-            data = mcap_chunk.inflate(chunk, self._file[chunk.start : chunk.stop])
+            data = mcap_records.inflate(chunk, self._file[chunk.start : chunk.stop])
         except BadChunk as bad:
             self._checks.lost(chunk, bad)
             return b""
@@ -121,10 +123,10 @@ class ChunkReader:
             first = {n: int(walked[n].min()) for n in walked.keys() & channels}
         else:
             held = {n for n, count in chunk.counts().items() if count} & channels
-            first = {n: mcap_chunk.first_offset(self._file[slice(*chunk.index[n])]) for n in held}
+            first = {n: mcap_records.first_offset(self._file[slice(*chunk.index[n])]) for n in held}
         if not first:
             return set(), b""
-        return {*first}, mcap_chunk.inflate_partly(chunk, self._file, max(first.values()))
+        return {*first}, mcap_records.inflate_partly(chunk, self._file, max(first.values()))
 
     def walk(self, chunk: Chunk) -> Positions:
         """Find a chunk's messages by walking it, and remember them."""
@@ -175,7 +177,7 @@ class ChunkReader:
                 entries.setdefault(channel, []).append(one)
         located = {}
         for channel, indexed in entries.items():
-            messages = mcap_chunk.indexed_messages(buffer, indexed, channel)
+            messages = mcap_records.indexed_messages(buffer, indexed, channel)
             if messages is None:
                 return None
             if len(messages):
@@ -188,11 +190,11 @@ class ChunkReader:
         refused: list[_Outcome] = []
         for chunk in group:
             if chunk is self._cut:
-                torn = mcap_chunk.inflate_partly(chunk, self._file)
+                torn = mcap_records.inflate_partly(chunk, self._file)
                 rooms.append((chunk, len(torn), torn))
                 continue
             try:
-                mcap_chunk.refuse_implausible(chunk)
+                mcap_records.refuse_implausible(chunk)
             except BadChunk as bad:
                 refused.append((chunk, bad))
             else:
@@ -214,7 +216,7 @@ class ChunkReader:
             else:
                 try:
                     stored = self._file.large(chunk.start, chunk.stop)
-                    mcap_chunk.inflate_into(chunk, stored, room)
+                    mcap_records.inflate_into(chunk, stored, room)
                 except BadChunk as bad:
                     outcomes.append((chunk, bad))
                     continue
@@ -238,7 +240,7 @@ class ChunkReader:
             )
         positions = self._walk_part(chunk, buffer[base : base + size].data)
         return {
-            channel: mcap_chunk.messages_at(buffer, at + base)
+            channel: mcap_records.messages_at(buffer, at + base)
             for channel, at in positions.items()
             if channel in wanted
         }
@@ -246,7 +248,7 @@ class ChunkReader:
     def _walk_part(self, chunk: Chunk, part: bytes | memoryview) -> Positions:
         if chunk.at in self.walked:
             return self.walked[chunk.at]
-        positions, cut = mcap_chunk.walked_messages(part)
+        positions, cut = mcap_records.walked_messages(part)
         if cut and chunk is not self._cut:
             self._checks.damaged(f"chunk at byte {chunk.at:,}: {cut}", {})
         return positions
@@ -404,7 +406,7 @@ class McapFile:
     def _defined_in(self, chunk: Chunk) -> Definitions:
         """Return what a whole chunk defines, checked by its CRC; nothing if that does not match."""
         records = self._chunks.inflate(chunk)
-        return self._compared(mcap_chunk.definitions_in(records), chunk.crc > 0)
+        return self._compared(mcap_records.definitions_in(records), chunk.crc > 0)
 
     def _compared(self, found: Definitions, checked: bool) -> Definitions:
         """Compare the data section's definitions with the summary's copies; differences are damage.
@@ -505,7 +507,7 @@ class McapFile:
             ends = [_record_end(self._file, int(at[-1])) for at in some.values()]
             buffer = np.frombuffer(self._file[start : max(ends, default=start)], np.uint8)
             for channel, at in some.items():
-                yield channel, buffer, mcap_chunk.messages_at(buffer, at - start)
+                yield channel, buffer, mcap_records.messages_at(buffer, at - start)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
         group: list[Chunk] = []

@@ -1,1 +1,0 @@
-"""Container formats: MCAP, rosbag2's sqlite3 and ROS 1 bags, whole or damaged."""
