@@ -117,13 +117,9 @@ def _answer(options: argparse.Namespace) -> int:
 def primary_arms(study: Study) -> Study:
     """Return the study with the two arms of its primary contrast alone."""
     assert study.primary is not None
-    arms = [arm for arm in study.arms if arm.name in study.primary.pair]
-    base = next(arm for arm in arms if arm.name == study.primary.baseline)
-    arms = [
-        msgspec.structs.replace(arm, treatment=None, baseline=None) if arm is base else arm
-        for arm in arms
-    ]
-    return msgspec.structs.replace(study, arms=tuple(arms), baseline=base.name)
+    pair = next(pair for pair in study.pairs if pair.arm.name == study.primary.arm)
+    base = msgspec.structs.replace(pair.baseline, treatment=None, baseline=None)
+    return msgspec.structs.replace(study, arms=(base, pair.arm))
 
 
 def quick(study: Study) -> Study:
@@ -222,10 +218,7 @@ def curves(plan: StudyPlan) -> str:
     Beside it stands how far each arm is ahead of its baseline, paired by seed.
     """
     runs = {
-        arm.name: [
-            RunCurve(path, plan.study.rare) if (path / DONE).exists() else None
-            for path in plan.runs(arm)
-        ]
+        arm.name: [RunCurve(path) if (path / DONE).exists() else None for path in plan.runs(arm)]
         for arm in plan.study.arms
     }
     of = {

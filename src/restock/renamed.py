@@ -30,6 +30,11 @@ TRAINING_KEYS = {
 }
 STUDY_KEYS = {
     "space": "it was removed: call `restock train --set` from Optuna instead",
+    "baseline": "it was removed: name the baseline's arm first",
+    "rare": "it was removed: leave it out, as the rare conditions are those of the missions",
+    "primary.baseline": "it was removed: it is the arm's own baseline",
+    "evaluation.references": "it was removed: planner and operator drive once in every study",
+    "evaluation.seed": "it was removed: set evaluation.seed in the settings instead",
     "power": "it was removed: compute the number of seeds before the study, and leave it out",
 }
 MIXTURE_KEYS = {

@@ -21,11 +21,10 @@ from restock.train.study.contrasts import RunCurve, area, contrast
 from restock.train.study.study import StudyPlan, load_study
 from restock.train.study.study_run import contrasts, findings
 
-PRIMARY = 'primary = { arm = "quotas", baseline = "uniform", measure = "auc_wheel_slip" }\n'
+PRIMARY = 'primary = { arm = "quotas", measure = "auc_wheel_slip" }\n'
 STUDY = f"""
 seeds = [0, 1, 2, 3]
 {PRIMARY}measures = ["auc_rare", "success_rare", "auc_nominal"]
-rare = ["wheel_slip"]
 [[arms]]
 name = "uniform"
 [[arms]]
@@ -71,7 +70,7 @@ def test_the_area_by_hand() -> None:
 
 
 def test_blocked_aisles_count_by_half_each_whatever_was_drawn(tmp_path: Path) -> None:
-    run = RunCurve(curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}), ("wheel_slip", "blocked_aisle"))
+    run = RunCurve(curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}))
     assert run.value("auc_blocked_aisle") == 0.5  # one partly blocked, three wholly
     assert run.value("auc_partly_blocked") == 0.0
     assert run.value("auc_rare") == pytest.approx((0.6 + 0.5) / 2)

@@ -20,18 +20,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools
 from restock.files import write_table
 from restock.ingest.task.task import Task
 from restock.stats import cluster_counts, percentiles
-from restock.toml import Checked
 from restock.train.dqn.behaviour import PolicyNetwork
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.fitted_q import (
@@ -217,17 +215,12 @@ ALL = "all"
 FILE = "off_policy.parquet"  # in RUN/eval
 
 
-class OpeConfig(Checked, frozen=True):
-    """Settings of off-policy evaluation.
+@dataclass(frozen=True)
+class OpeConfig:
+    """Settings of off-policy evaluation."""
 
-    Raises:
-        ValueError: a value out of its range.
-    """
-
-    epsilon: Annotated[float, Meta(ge=0, le=1)] = 0.1  # of the greedy policy made soft
-    horizon: Annotated[int, Meta(ge=1)] | None = None  # steps that are weighted; None: all
-    ess_share: Annotated[float, Meta(ge=0, le=1)] = 0.2  # of the episodes, that weights must reach
-    ess_episodes: float = 5.0  # … and at least this many
+    epsilon: float = 0.1  # probability of a random action: the greedy policy made soft
+    horizon: int | None = None  # steps that are weighted; None: all
     seed: int = 0
     model: FittedQConfig = FittedQConfig()
 
@@ -297,7 +290,7 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
 def evaluate_run_off_policy(
     path: Path | str,
     logs: str | None,
-    config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
+    config: OpeConfig = OpeConfig(),
     progress: Callable[[int], None] | None = None,
     *,
     write: bool = True,
@@ -370,7 +363,7 @@ def evaluate_off_policy(
     *,
     discount: float,
     measures: tuple[Measure, ...] = ("return", "success"),
-    config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
+    config: OpeConfig = OpeConfig(),
     between: Callable[[], None] = lambda: None,
 ) -> list[dict[str, Any]]:
     """Rows of `off_policy`: measure x condition of the episode x estimator.
@@ -378,7 +371,7 @@ def evaluate_off_policy(
     `between` is called before every update of its models; what it raises ends the evaluation.
     """
     results: list[dict[str, Any]] = []
-    gate = EssGate(config.ess_share, config.ess_episodes)
+    gate = EssGate()
     probability, estimated = behaviour_probability(dataset, network.actions, config, between)
     for measure in measures:
         training = dataset.training.measured(measure)

@@ -3,7 +3,7 @@
 A measure is named `auc_WHAT` or `success_WHAT`. `auc` is the area under the run's own curve of
 success over environment steps (trapezoids, divided by the steps: a mean success on the way),
 `success` is the kept policy's, on the episodes that judge it and did not choose it. WHAT is a cell
-(`CELLS`), or `rare`, the mean over the study's rare conditions. Of blocked aisles the partly and
+(`CELLS`), or `rare`, the mean over the rare conditions. Of blocked aisles the partly and
 the wholly blocked count by half each, however many of each were drawn.
 """
 
@@ -78,9 +78,8 @@ class Contrast:
 class RunCurve:
     """A finished run's success by cell: on the way, and of the policy that it kept."""
 
-    def __init__(self, path: Path, rare: Sequence[str] = RARE) -> None:
+    def __init__(self, path: Path) -> None:
         self._run = Run.open(path)
-        self._rare = rare
         self._at = _by_step(self._run.table("evaluations"))
         self.steps = np.array(sorted(self._at))
 
@@ -115,12 +114,14 @@ class RunCurve:
 
     def _of(self, success: Mapping[tuple[str, str], float], what: str) -> float:
         if what == "rare":
-            return _mean(self._of(success, kind) for kind in self._rare)
-        own = [
-            success.get((condition, block or "none"), float("nan"))
-            for condition, block in CELLS[what]
-        ]
-        # Few episodes may all be blocked one way: that half then stands for both.
+            own = [self._of(success, kind) for kind in RARE]
+        else:
+            own = [
+                success.get((condition, block or "none"), float("nan"))
+                for condition, block in CELLS[what]
+            ]
+        # A study may leave out kinds, and few episodes may all be blocked one way: that half then
+        # stands for both.
         known = [value for value in own if not np.isnan(value)]
         return _mean(known) if known else float("nan")
 

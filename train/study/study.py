@@ -22,10 +22,10 @@ from restock.train.dqn.config import (
     parse_config,
     refuse_untaught,
 )
-from restock.train.evaluation.eval_run import wrong_seed
+from restock.train.evaluation.eval_run import FIRST_SEED, wrong_seed
 from restock.train.judge.comparability import Treatment
 from restock.train.libraries.library_arm import Library
-from restock.train.study.contrasts import CELLS, RARE, unknown_measure
+from restock.train.study.contrasts import unknown_measure
 from restock.train.twin.missions.registry import KINDS
 
 
@@ -39,7 +39,7 @@ class ArmConfig(Checked, frozen=True):
     library: Library | None = None  # library whose algorithm learns; None: Restock
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # arguments of that algorithm
     treatment: Treatment | None = None  # None: the study's treatment
-    baseline: str | None = None  # arm to compare with; None: the study's
+    baseline: str | None = None  # arm to compare with; None: the first
 
     def check(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
@@ -58,11 +58,11 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class StudyEvaluation(Checked, frozen=True):
+    """What every run drives at its end, with the planner and the operator beside it once."""
+
     # Of each kind, or by kind; a kind that a table leaves out is not driven.
     episodes: Count | dict[str, Count] = 40
     perturbations: tuple[str, ...] = ("none",)
-    seed: int = 10_000
-    references: tuple[str, ...] = ("planner", "operator")  # that drive the same episodes once
 
     def check(self) -> None:
         kinds = list(self.episodes) if isinstance(self.episodes, dict) else []
@@ -70,8 +70,6 @@ class StudyEvaluation(Checked, frozen=True):
             raise ValueError(
                 f"episodes: there is no {unknown[0]!r}; choose from {', '.join(KINDS)}"
             )
-        if wrong := wrong_seed(self.seed, max(self.of_kind.values(), default=1)):
-            raise ValueError(f"seed {wrong}")
 
     @property
     def of_kind(self) -> Mapping[str, int]:
@@ -84,17 +82,8 @@ class StudyEvaluation(Checked, frozen=True):
 class Primary(Checked, frozen=True):
     """The one contrast that a study is for, named before its runs."""
 
-    arm: str
-    baseline: str
+    arm: str  # compared with its baseline
     measure: str
-
-    @property
-    def pair(self) -> tuple[str, str]:
-        return self.arm, self.baseline
-
-    @property
-    def named(self) -> tuple[str, str, str]:
-        return self.arm, self.baseline, self.measure
 
 
 @dataclass(frozen=True)
@@ -109,33 +98,30 @@ class Pair:
 class Study(Checked, frozen=True):
     """The whole file."""
 
-    arms: tuple[ArmConfig, ...]
+    arms: tuple[ArmConfig, ...]  # the first is the baseline of those that name none
     doc: str = ""
     store: str | None = None  # store from which mixtures are made
     seeds: tuple[int, ...] = (0, 1, 2)
     treatment: Treatment = "mixture"  # where an arm names none
-    baseline: str | None = None  # where an arm names none; None: the first arm
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of all arms
     evaluation: StudyEvaluation = StudyEvaluation()
     primary: Primary | None = None
     # Of the other contrasts, whose p values are adjusted for their number.
     measures: tuple[str, ...] = ("auc_rare", "success_rare", "success_nominal")
-    rare: tuple[str, ...] = RARE  # conditions whose mean is `rare`
 
     def check(self) -> None:
         names = [arm.name for arm in self.arms]
         if len(names) < 2 or len(set(names)) != len(names):
             raise ValueError(f"arms must be two or more, each with its own name, got {names}")
-        for baseline in (self.baseline, *(arm.baseline for arm in self.arms)):
-            if baseline is not None and baseline not in names:
-                raise ValueError(f"baseline {baseline!r} is not one of the arms {names}")
         for arm in self.arms:
+            if arm.baseline is not None and arm.baseline not in names:
+                raise ValueError(f"baseline {arm.baseline!r} is not one of the arms {names}")
             if arm.baseline == arm.name:
                 raise ValueError(f"arm {arm.name!r} is its own baseline")
         if self.base.treatment is not None or self.base.baseline is not None:
             raise ValueError(
-                f"arm {self.base.name!r} is the study's baseline: it cannot have a treatment or a "
-                "baseline"
+                f"arm {self.base.name!r} is the first, the study's baseline: it cannot have a "
+                "treatment or a baseline"
             )
         self._check_seeds()
         if self.store is None and any(arm.mixture for arm in self.arms):
@@ -158,25 +144,15 @@ class Study(Checked, frozen=True):
         measures = (*self.measures, *((self.primary.measure,) if self.primary else ()))
         for wrong in filter(None, map(unknown_measure, measures)):
             raise ValueError(wrong)
-        if not self.rare or len(set(self.rare)) != len(self.rare):
+        if self.primary is not None and self.primary.arm not in names[1:]:
             raise ValueError(
-                f"rare must be at least one condition, without repetition; got {list(self.rare)}"
+                f"primary: {self.primary.arm!r} is not one of the arms after the first {names[1:]}"
             )
-        if unknown := [name for name in self.rare if name not in CELLS]:
-            raise ValueError(f"rare: there is no {unknown[0]!r}; choose from {', '.join(CELLS)}")
-        if self.primary is not None:
-            if missing := [name for name in self.primary.pair if name not in names]:
-                raise ValueError(f"primary: {missing[0]!r} is not one of the arms {names}")
-            if self.primary.pair not in [(p.arm.name, p.baseline.name) for p in self.pairs]:
-                raise ValueError(
-                    f"primary: {self.primary.arm!r} is not compared with "
-                    f"{self.primary.baseline!r}: set that as the arm's `baseline`"
-                )
 
     @property
     def base(self) -> ArmConfig:
         """The arm that the others are compared with, unless they name one of their own."""
-        return self._arm(self.baseline) if self.baseline is not None else self.arms[0]
+        return self.arms[0]
 
     @property
     def pairs(self) -> list[Pair]:
@@ -187,8 +163,7 @@ class Study(Checked, frozen=True):
                 self._arm(arm.baseline) if arm.baseline is not None else self.base,
                 arm.treatment or self.treatment,
             )
-            for arm in self.arms
-            if arm.name != self.base.name
+            for arm in self.arms[1:]
         ]
 
     def _arm(self, name: str) -> ArmConfig:
@@ -236,22 +211,19 @@ def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
 
     names = evaluation.perturbations
     refuse_unknown("perturbations", names, where=f"{where}: evaluation.perturbations")
-    if names := evaluation.references:  # none at all are not driven
-        refuse_unknown("policies", names, where=f"{where}: evaluation.references")
 
 
 def _refuse_shared_episodes(
     arm: ArmConfig, chosen: EvaluationConfig, evaluation: StudyEvaluation, where: str
 ) -> None:
     """Refuse to judge the kept policy on the episodes that chose it."""
-    judged = evaluation.seed, evaluation.seed + max(evaluation.of_kind.values())
+    judged = FIRST_SEED, FIRST_SEED + max(evaluation.of_kind.values())
     if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
         raise ConfigError(
             f"arm {arm.name!r} would be evaluated on seeds {judged[0]} to {judged[1] - 1}, which "
             f"include those that choose its policy (from {chosen.seed})",
             where=where,
-            remedy="set evaluation.seed of the study to another range than the evaluation.seed of "
-            "the settings",
+            remedy="set evaluation.seed in the settings to another range",
         )
 
 

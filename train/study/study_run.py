@@ -41,6 +41,7 @@ from restock.train.run.kept_evaluations import (
     read_evaluations,
 )
 from restock.train.study.contrasts import (
+    RARE,
     Contrast,
     RunCurve,
     contrast,
@@ -59,6 +60,7 @@ from restock.train.study.study import (
 )
 
 Say = Callable[[str], None]
+REFERENCES = ("planner", "operator")  # drive the episodes of the runs once
 
 
 def run_study(
@@ -202,7 +204,7 @@ def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
         text = ",".join(f"{kind}={count}" for kind, count in given.items())
     else:
         text = str(given)
-    return ["--episodes", text, "--seed", str(evaluation.seed)]
+    return ["--episodes", text]
 
 
 def _drive_references(plan: StudyPlan, say: Say) -> None:
@@ -212,13 +214,10 @@ def _drive_references(plan: StudyPlan, say: Say) -> None:
     """
     evaluation, path = plan.study.evaluation, plan.jobs[0].path
     done, requested = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
-    if not evaluation.references:
-        return
     if done.exists() and done.read_text(encoding="utf-8") == requested:
         return
-    say(f"driving {', '.join(evaluation.references)}")
-    policies = ",".join(evaluation.references)
-    arguments = ["eval", str(path), "--policies", policies, "--perturbations", "none"]
+    say(f"driving {', '.join(REFERENCES)}")
+    arguments = ["eval", str(path), "--policies", ",".join(REFERENCES), "--perturbations", "none"]
     restock_verb([*arguments, *_episodes_flags(evaluation)], plan.out / "logs" / "references.log")
     write_text(done, requested)
 
@@ -306,7 +305,7 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
     return {
         "doc": plan.study.doc,
         "seeds": list(plan.study.seeds),
-        "rare": list(plan.study.rare),
+        "rare": list(RARE),
         "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
         "contrasts": [one.as_json() for one in contrasts(plan, refused)],
         "arms": arms(plan),
@@ -374,9 +373,9 @@ def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
         for measure in study.measures
     ]
     if (first := study.primary) is not None:
-        own = next(p for p in study.pairs if (p.arm.name, p.baseline.name) == first.pair)
-        wanted = [one for one in wanted if (one[0].name, one[1].name, one[2]) != first.named]
-        wanted.insert(0, (own.arm, own.baseline, first.measure, True))
+        own = next(pair for pair in study.pairs if pair.arm.name == first.arm)
+        primary = own.arm, own.baseline, first.measure
+        wanted = [(*primary, True), *(one for one in wanted if one[:3] != primary)]
     found = [
         contrast(arm.name, baseline.name, measure, curves.pairs(arm, baseline), primary=primary)
         for arm, baseline, measure, primary in wanted
@@ -395,14 +394,14 @@ def arms(plan: StudyPlan) -> list[dict[str, Any]]:
     rows = []
     for arm in plan.study.arms:
         runs = [
-            _measured(plan, _driven_by(path, "agent"), planner_s)
+            _measured(_driven_by(path, "agent"), planner_s)
             for path in plan.runs(arm)
             if (path / DONE).exists()
         ]
         if runs:
             rows.append({"arm": arm.name, "runs": len(runs), **_over_seeds(runs)})
     for name, episodes in references.items():
-        measured = _measured(plan, episodes, planner_s)
+        measured = _measured(episodes, planner_s)
         rows.append({"arm": name, "runs": None, **_over_seeds([measured])})
     return rows
 
@@ -425,7 +424,7 @@ class _Curves:
 
     def _curve(self, path: Path) -> RunCurve:
         if path not in self._read:
-            self._read[path] = RunCurve(path, self._plan.study.rare)
+            self._read[path] = RunCurve(path)
         return self._read[path]
 
 
@@ -441,20 +440,18 @@ def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
 def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[str, Any]]]]:
     """Return the planner's times where it arrived, and the references' episodes, by name."""
     path = plan.jobs[0].path
-    names = plan.study.evaluation.references if path.is_dir() else ()
+    names = REFERENCES if path.is_dir() else ()
     episodes = {name: rows for name in names if (rows := _driven_by(path, name))}
     return planner_times(episodes.get("planner", [])), episodes
 
 
-def _measured(
-    plan: StudyPlan, episodes: list[dict[str, Any]], planner_s: dict[Any, float]
-) -> dict[str, float]:
+def _measured(episodes: list[dict[str, Any]], planner_s: dict[Any, float]) -> dict[str, float]:
     """One run's measures; NaN where nothing tells."""
     cells: dict[str, list[float]] = {}
     for row in episodes:
         if row["success"] is not None:
             cells.setdefault(cell_name(row["condition"], row["block"]), []).append(row["success"])
-    rare = [row for row in episodes if row["condition"] in plan.study.rare]
+    rare = [row for row in episodes if row["condition"] in RARE]
     lost = [
         row["time_s"] - planner_s[mission_of(row)]
         for row in rare

@@ -39,8 +39,6 @@ class CompareCommand:
     """The runs of the second method."""
     treatment: Literal["algorithm", "target", "mixture", "practice", "data", "method"] = "algorithm"
     """The treatment: what is compared, and therefore may differ."""
-    all_checks: bool = False
-    """Show all checks, not only those that found, or could not exclude, a difference."""
     page: Path | None = None
     """Write an HTML page that opens without a network. Replaces an existing file."""
     json: bool = False
@@ -72,7 +70,7 @@ class CompareCommand:
         if self.json:
             print_json(comparison.as_json())
         else:
-            _show(comparison, self.all_checks)
+            _show(comparison)
         return int(ExitCode.OK if comparison.verdict == "comparable" else ExitCode.FAILED)
 
 
@@ -107,7 +105,7 @@ def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
     return (one, other) if one and other and one != other else ("first", "second")
 
 
-def _show(comparison: Comparison, all_checks: bool) -> None:
+def _show(comparison: Comparison) -> None:
     from restock.cli.output import print_table, say
 
     refused = {difference.setting for difference in comparison.refused}
@@ -124,10 +122,8 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
         print_table(rows, title=f"what differs (treatment: {comparison.treatment})")
     checks = comparison.totals + comparison.checks
     deciding = comparison.deciding_checks
-    shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
-    if comparison.identical and not all_checks:
-        shown = []  # too few episodes show nothing of what is the same in any case
-    if shown:
+    shown = [check for check in checks if check.verdict != "comparable"]
+    if shown and not comparison.identical:  # too few episodes show nothing of the same runs
         treated = {
             "mixture": " (the treatment: shown, not compared)",
             "method": " (the treatment: shown, not compared)",

@@ -43,12 +43,8 @@ class DiagnoseCommand:
     """With --before-training: a perturbation that calibrates the twin, e.g. written by `restock
     twin fit`."""
     twin: bool = True
-    """With --before-training: do not compare rows with the twin; check them only against the task's
-    definitions."""
-    seed: int = 0
-    """With --before-training: the seed of the twin's episodes and of the bootstrap."""
-    rows: bool = True
-    """Do not compare the rows of the runs' panel with the twin, which takes some seconds."""
+    """Do not compare rows with the twin, which takes some seconds: those of a run's panel are not
+    diagnosed; with --before-training, they are checked only against the task's definitions."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None
@@ -67,7 +63,7 @@ class DiagnoseCommand:
             return self._before_training(self.before_training)
         refuse(
             self,
-            ("profile", "perturbation", "twin", "seed"),
+            ("profile", "perturbation"),
             "applies only to --before-training",
             remedy="leave it out",
         )
@@ -79,12 +75,12 @@ class DiagnoseCommand:
         if self.confirm is not None:
             check_place(self.confirm)
         own = diagnosis = diagnose(runs)
-        found, reason = rows_of(runs) if self.rows else (None, "")
+        found, reason = rows_of(runs) if self.twin else (None, "")
         if found is not None:
             diagnosis = with_rows(own, found)
         if not self.json:
             _show(diagnosis, self.runs)
-            if found is None and self.rows:
+            if found is None and self.twin:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
         confirmation = None
         # It confirms what the run's own figures show: no further run can tell if rows are at fault.
@@ -105,11 +101,9 @@ class DiagnoseCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _before_training(self, path: Path) -> int:
-        from restock.cli.command_line import refuse
         from restock.cli.output import print_json
         from restock.errors import ConfigError, ExitCode
         from restock.ingest.profile.profile import load_profile
-        from restock.train.evaluation.eval_run import wrong_seed
         from restock.train.judge.before_training import diagnose_before_training
         from restock.train.twin.physics.perturbation import load_perturbation
 
@@ -118,11 +112,6 @@ class DiagnoseCommand:
                 "--before-training cannot be combined with a run or --confirm",
                 where="restock diagnose",
             )
-        refuse(
-            self, ("rows",), "has no effect with --before-training", remedy="leave out one of them"
-        )
-        if wrong := wrong_seed(self.seed):
-            raise ConfigError(wrong, where="--seed")
         diagnosis = diagnose_before_training(
             path,
             profile=None if self.profile is None else load_profile(self.profile),
@@ -130,7 +119,6 @@ class DiagnoseCommand:
             perturbation=None
             if self.perturbation is None
             else load_perturbation(self.perturbation),
-            seed=self.seed,
         )
         if self.json:
             print_json(diagnosis.document())

@@ -69,9 +69,6 @@ class EvalCommand:
     on_logs: str | None = None
     """Off-policy evaluation on the episodes of this store, or on the held-out episodes of this
     panel. "own": the run's own panel."""
-    epsilon: float = 0.1
-    """With --on-logs: the probability that the evaluated policy takes a random action; otherwise it
-    is greedy."""
     horizon: int | None = None
     """With --on-logs: the number of steps over which importance weights are multiplied. Default:
     all."""
@@ -96,9 +93,7 @@ class EvalCommand:
             why = "cannot be combined with --on-logs, which drives nothing"
             refuse(self, _DRIVES, why, remedy="leave out one of them")
             return self._evaluate_off_policy(self.on_logs)
-        refuse(
-            self, ("epsilon", "horizon"), "applies only to --on-logs", remedy="give --on-logs, too"
-        )
+        refuse(self, ("horizon",), "applies only to --on-logs", remedy="give --on-logs, too")
         return self._drive()
 
     def _drive(self) -> int:
@@ -215,10 +210,9 @@ class EvalCommand:
         from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
         from restock.words import counted
 
-        try:
-            config = OpeConfig(epsilon=self.epsilon, horizon=self.horizon)
-        except ValueError as error:
-            raise ConfigError(str(error), where="restock eval") from error
+        if self.horizon is not None and self.horizon < 1:
+            raise ConfigError(f"must be at least 1, got {self.horizon}", where="--horizon")
+        config = OpeConfig(horizon=self.horizon)
         plan = plan_off_policy(self.run_path, None if logs == "own" else logs, config)
         document = plan.document()
         if self.dry_run:
