@@ -43,6 +43,12 @@ TWO = "[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
 PRIMARY = "primary = { arm = 'b', measure = 'auc_rare' }"
 
 
+@pytest.fixture(autouse=True)
+def no_references(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drive neither the planner nor the operator."""
+    monkeypatch.setattr(study_run, "_drive_references", lambda plan, say: None)
+
+
 @pytest.mark.slow
 def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, capsys) -> None:
     (tmp_path / "s.toml").write_text(SMALL)

@@ -18,7 +18,7 @@ is refused: a number from one episode is not printed as if it were from a hundre
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -222,7 +222,7 @@ class OpeConfig:
     epsilon: float = 0.1  # probability of a random action: the greedy policy made soft
     horizon: int | None = None  # steps that are weighted; None: all
     seed: int = 0
-    model: FittedQConfig = FittedQConfig()
+    model: FittedQConfig = field(default_factory=FittedQConfig)
 
 
 @dataclass(frozen=True)
