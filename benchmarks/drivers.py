@@ -29,16 +29,16 @@ from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.stats import interval_text, wilson
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
-from restock.train.twin.drivers.operator_policy import Operator
-from restock.train.twin.drivers.policies import (
+from restock.train.twin.env.drivers import (
     BehaviourPolicy,
     Handover,
+    Operator,
     PlannerFollower,
     RandomPolicy,
 )
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation
 

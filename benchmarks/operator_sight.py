@@ -21,7 +21,7 @@ from twin_runs import drive_missions
 
 from restock.arrays import F64, Bools, Ints
 from restock.stats import interval_text, wilson
-from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.env.drivers import Operator
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import PARKED_M
 

@@ -31,11 +31,10 @@ from restock.train.dqn.config import LossConfig
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run
-from restock.train.twin.drivers.operator_policy import Operator
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import Operator, PlannerFollower
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
 
 FIRST_SEED = 700_000

@@ -26,9 +26,9 @@ from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import label
 from restock.ingest.task.label_scores import true_names
 from restock.ingest.task.signals import STORED_SIGNALS
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 
 ROBOTS = 24
 RANDOM = 0.15  # of the actions

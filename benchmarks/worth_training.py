@@ -37,12 +37,11 @@ from twin_runs import trained
 from restock.stats import percentiles, wilson
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
-from restock.train.twin.drivers.operator_policy import Operator
-from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
+from restock.train.twin.env.drivers import Operator, PlannerFollower, RandomPolicy
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import PEOPLE
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
 
 FIRST_SEED = 500_000

@@ -61,11 +61,10 @@ from restock.train.run.run_profile import (
     run_panel,
 )
 from restock.train.session import Session, open_session
-from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
-from restock.train.twin.missions.registry import KINDS
-from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.missions import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec, refuse_unfit
 
 _EVALUATION_ENVS = 16
 

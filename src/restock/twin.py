@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from restock.public import lazy
 
 if TYPE_CHECKING:
-    from restock.train.twin.drivers.policies import PlannerFollower as PlannerFollower
+    from restock.train.twin.env.drivers import PlannerFollower as PlannerFollower
     from restock.train.twin.env.vector_env import WarehouseEnv as WarehouseEnv
     from restock.train.twin.env.vector_env import WarehouseVectorEnv as WarehouseVectorEnv
     from restock.train.twin.physics.episode import EpisodeSpec as EpisodeSpec

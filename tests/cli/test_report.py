@@ -43,7 +43,7 @@ from restock.train.run.kept_evaluations import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
-from restock.train.twin.floors.floor_file import write_floor
+from restock.train.twin.floors.floor_files import write_floor
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.occupancy_grid import into_frame
 from restock.words import policy_words

@@ -38,8 +38,8 @@ from restock.ingest.containers.open_recording import recordings_in
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.propose import drives
 from restock.replay.store.store import Store
-from restock.train.twin.floors.occupancy_map import write_pgm
-from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
+from restock.train.twin.floors.floor_files import write_pgm
+from restock.train.twin.missions import DEFAULT_CONDITIONS
 
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
 

@@ -21,7 +21,7 @@ from support.reader import Reader, reader
 from restock.ingest.profile.profile import parse_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.train.study.study import load_study
-from restock.train.twin.floors.floor_file import read_floor
+from restock.train.twin.floors.floor_files import read_floor
 
 LANGUAGES = (
     *RUN,

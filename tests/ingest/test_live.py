@@ -26,7 +26,7 @@ from restock.ingest.profile.tables import Frames
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.evaluation.policies import GreedyPolicy
-from restock.train.twin.recording.messages import typestore
+from restock.train.twin.recording.bag_writer import typestore
 
 BAG = ROOT / "sample_logs" / "amr_tuesday"
 PROFILE = load_profile("warehouse_amr")

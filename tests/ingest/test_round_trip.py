@@ -40,16 +40,19 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.env.drivers import Operator
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.fleet import (
+    HANDOVER,
+    VERSIONS,
     BehaviourPolicies,
     DrivenMission,
     ExternalPolicy,
     Fleet,
+    Mission,
+    schedule,
 )
-from restock.train.twin.recording.missions import HANDOVER, VERSIONS, Mission, schedule
 from restock.train.twin.recording.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import TOPICS

@@ -23,8 +23,8 @@ from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
+from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.robot_trial import robot_model
 
 PERIOD_S, STEPS = 0.2, 240
 SPEEDS, TURNS = (0.2, 0.4, 0.8, -0.4), (0.0, 0.0, 0.6, 1.2, -0.6, -1.2)

@@ -57,17 +57,17 @@ MAY_IMPORT = {
     "train/dqn": "twin/missions twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
-        "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel"
+        "dqn run twin/env twin/floors replay/mixture replay/panel"
         " replay/plan replay/sampling ingest/task ingest/profile ingest/store"
         " replay/fleet twin/physics"
     ),
     "train/evaluation": (
-        "dqn feed run twin/drivers twin/missions twin/env twin/floors twin/physics"
+        "dqn feed run twin/missions twin/env twin/floors twin/physics"
         " replay/panel replay/store ingest/live ingest/store ingest/profile ingest/task"
         " replay/sampling"
     ),
     "train/judge": (
-        "train dqn evaluation feed run twin/calibration twin/drivers"
+        "train dqn evaluation feed run twin/calibration"
         " twin/missions twin/env twin/physics replay/fleet replay/panel replay/store"
         " ingest/profile ingest/store ingest/task"
     ),
@@ -84,10 +84,8 @@ MAY_IMPORT = {
     "train/twin/env": (
         "twin/floors twin/missions twin/physics replay/fleet ingest/profile ingest/task"
     ),
-    "train/twin/drivers": "twin/env twin/floors twin/physics ingest/task",
     "train/twin/recording": (
-        "twin/drivers twin/missions twin/env twin/floors twin/physics replay/fleet"
-        " ingest/profile ingest/task"
+        "twin/missions twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
     ),
     "train/twin/survey": (
         "twin/floors replay/store ingest/containers ingest/decoding ingest/profile"
@@ -117,7 +115,7 @@ MAY_IMPORT = {
         "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace"
         " train train/judge train/dqn train/evaluation train/run"
         " train/study train/twin/floors train/twin/physics train/view ingest/task"
-        " replay/panel train/feed train/twin/env replay/store train/twin/calibration"
+        " replay/panel train/feed replay/store train/twin/calibration"
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from restock.ingest.live.node import Ros
-from restock.train.twin.recording.messages import build, serialise, stamp, typestore
+from restock.train.twin.recording.bag_writer import build, serialise, stamp, typestore
 
 Reliability = Enum("Reliability", "RELIABLE BEST_EFFORT")
 Durability = Enum("Durability", "VOLATILE TRANSIENT_LOCAL")

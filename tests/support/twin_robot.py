@@ -12,7 +12,7 @@ from restock.ingest.live.policy_file import FORMAT
 from restock.ingest.profile.profile import Profile, profile_toml
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.recording.messages import build, stamp
+from restock.train.twin.recording.bag_writer import build, stamp
 from support.ros_graph import Graph
 
 

@@ -49,7 +49,7 @@ from restock.train.twin.calibration.twin_gap import (
     trust_verdict,
     write_gap,
 )
-from restock.train.twin.drivers.policies import RandomPolicy
+from restock.train.twin.env.drivers import RandomPolicy
 
 Plant = Callable[[FedRows], FedRows]
 

@@ -20,7 +20,7 @@ from restock.train.run.kept_evaluations import (
     shown_evaluation,
 )
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 
 
 @pytest.mark.parametrize("policy", ["run:", "onnx:", "supervisor"])

@@ -14,7 +14,7 @@ from restock.ingest.task.conditions import label, primary
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.replay.sampling.ring import FreshRing
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.physics.episode import EpisodeSpec
 
 CONDITIONS = load_profile("warehouse_amr").conditions

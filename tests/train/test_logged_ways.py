@@ -24,7 +24,7 @@ from restock.replay.panel.panel import Panel
 from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
-from restock.train.twin.floors.floor_file import write_floor
+from restock.train.twin.floors.floor_files import write_floor
 from restock.train.twin.floors.floors import open_floors
 
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.4\n"

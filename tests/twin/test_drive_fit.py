@@ -17,8 +17,8 @@ from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
+from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.perturbation import Perturbation, load_perturbation
-from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.simulation import BodyState, Simulation
 
 TRUE = Perturbation(latency_s=0.12, gain=0.94)

@@ -16,10 +16,10 @@ from restock.ingest.task.label_scores import true_names
 from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.ingest.task.task import Rewards, Task
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.truth import EXPOSURES, Truth
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
 
 STORED = [signal.name for signal in STORED_SIGNALS]

@@ -19,12 +19,13 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.fit import FitConfig, _least_squares, fit
-from restock.train.twin.calibration.fit_parameters import (
+from restock.train.twin.calibration.fit_solver import (
     DEFAULT,
     PARAMETERS,
     Coordinates,
+    ReplayResiduals,
+    position_gap_m,
 )
-from restock.train.twin.calibration.fit_solver import ReplayResiduals, position_gap_m
 from restock.train.twin.calibration.fitted_twin import (
     FittedTwin,
     ParameterEstimate,

@@ -26,10 +26,17 @@ from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.train.prepare import prepare_new
-from restock.train.twin.env.floor_report import describe_floor
 from restock.train.twin.env.navigation import BlockFinder
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.floor_file import read_floor, write_floor
+from restock.train.twin.floors.floor_files import (
+    cells_of,
+    read_floor,
+    read_image,
+    read_map,
+    write_floor,
+    write_map,
+    write_pgm,
+)
 from restock.train.twin.floors.floors import (
     RECIPES,
     SPLITS,
@@ -41,16 +48,9 @@ from restock.train.twin.floors.floors import (
     split_of,
 )
 from restock.train.twin.floors.layout import OneWay, Warehouse, default_warehouse
-from restock.train.twin.floors.occupancy_map import (
-    cells_of,
-    read_image,
-    read_map,
-    write_map,
-    write_pgm,
-)
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.missions.registry import KINDS
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
+from restock.train.twin.missions import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec, describe_floor, draw_episode
 
 SEEDS = st.integers(0, 10_000)
 SAYS_TRUNCATED = pytest.mark.skipif(

@@ -14,8 +14,17 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from restock.errors import RecordingError
-from restock.train.twin.recording.bag_writer import Format, Message, Topic, recording_sink
-from restock.train.twin.recording.messages import MessageLayout, build, serialise, stamp, typestore
+from restock.train.twin.recording.bag_writer import (
+    Format,
+    Message,
+    MessageLayout,
+    Topic,
+    build,
+    recording_sink,
+    serialise,
+    stamp,
+    typestore,
+)
 from restock.train.twin.recording.robot_topics import plan
 
 STAMP_NS = 1_760_000_000_123_456_789

@@ -29,8 +29,8 @@ from restock.report.look.charts import CONDITION_COLOURS
 from restock.train.dqn.config import TrainConfig
 from restock.train.study.contrasts import CELLS, RARE
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.missions.registry import NATURAL
-from restock.train.twin.recording.missions import meets
+from restock.train.twin.missions import NATURAL
+from restock.train.twin.recording.fleet import meets
 kind = "bystander_close_by"
 env = WarehouseVectorEnv(4, conditions={kind: 1.0}, seed=1)
 env.reset(seed=1)

@@ -22,7 +22,7 @@ from restock.train.twin.floors.layout import default_warehouse, strip_warehouse
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.recording.missions import MAX_DRIVEN, OrderedMissions, meets
+from restock.train.twin.recording.fleet import MAX_DRIVEN, OrderedMissions, meets
 from restock.train.twin.recording.recorder import RecordingPlan
 
 FLOOR = default_warehouse()

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from restock.ingest.profile.profile import load_profile
 from restock.train.twin.floors.layout import NO_PATCH, PATCHES, default_warehouse, no_pallets
-from restock.train.twin.physics.contact import friction_at
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.model import build_model
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
@@ -22,6 +21,7 @@ from restock.train.twin.physics.robot_model import (
     MOTOR_LIMIT_NM,
     TRACK_M,
     WHEEL_RADIUS_M,
+    friction_at,
     stand_in,
 )
 from restock.train.twin.physics.simulation import BLOCK_S, Simulation, base_controller

@@ -19,9 +19,8 @@ from restock.ingest.profile.robot_file import MAX_BYTES, mjcf_problem
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.model import build_robot_alone
+from restock.train.twin.physics.model import build_robot_alone, robot_model
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.robot_trial import robot_model
 
 PAGE = (ROOT / "docs" / "robot.md").read_text()
 MODEL = re.findall(r"```xml\n(.*?)```", PAGE, re.DOTALL)[0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from restock.ingest.profile.profile import load_profile
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.placed import (

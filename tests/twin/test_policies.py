@@ -10,12 +10,13 @@ from support.long import one_in
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
-from restock.train.twin.drivers.operator_policy import Operator, harsh_actions
-from restock.train.twin.drivers.policies import (
+from restock.train.twin.env.drivers import (
     BehaviourPolicy,
     Handover,
+    Operator,
     PlannerFollower,
     RandomPolicy,
+    harsh_actions,
 )
 from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from restock.train.twin.recording.bag_writer import Message
-from restock.train.twin.recording.drive import EMPTY, Drive, Lidar, Motion, Odometer
-from restock.train.twin.recording.messages import typestore
+from restock.train.twin.recording.bag_writer import Message, typestore
 from restock.train.twin.recording.publish import LIDAR_LSB_M, Rates, Robot
 from restock.train.twin.recording.recorder import NOISELESS
-from restock.train.twin.recording.robot_topics import TOPICS
+from restock.train.twin.recording.robot_topics import EMPTY, TOPICS, Drive, Lidar, Motion, Odometer
 
 START_NS = 1_772_000_000_000_000_000
 TYPES = {topic.name: topic.type_name for topic in TOPICS}

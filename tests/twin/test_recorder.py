@@ -26,10 +26,9 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.drivers.operator_policy import Operator
-from restock.train.twin.drivers.policies import PlannerFollower
-from restock.train.twin.missions.registry import NATURAL
-from restock.train.twin.recording.missions import BLOCK, FLEET, parse_shares, schedule
+from restock.train.twin.env.drivers import Operator, PlannerFollower
+from restock.train.twin.missions import NATURAL
+from restock.train.twin.recording.fleet import BLOCK, FLEET, parse_shares, schedule
 from restock.train.twin.recording.recorder import (
     HARDWARE,
     RecordingPlan,

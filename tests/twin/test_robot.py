@@ -28,10 +28,9 @@ from restock.train.twin.floors.layout import AisleSegment, Rect, Warehouse, defa
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import floor_gap, rectangle
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode, with_room
-from restock.train.twin.physics.model import build_model
+from restock.train.twin.physics.model import build_model, robot_model
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_model import stand_in
-from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.simulation import Simulation
 
 AMR = load_profile("warehouse_amr")

@@ -17,11 +17,10 @@ from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.model import build_robot_alone
+from restock.train.twin.physics.model import build_robot_alone, robot_model
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.robot_trial import robot_model
 
 CAR = Robot(
     drive="ackermann", wheel_radius_m=0.1, track_m=0.4, wheelbase_m=0.5, mass_kg=40.0,

@@ -14,15 +14,15 @@ from support.paths import ROOT
 
 from restock.train.twin.floors.layout import PARKED_M
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.recording.bag_writer import Format
-from restock.train.twin.recording.drive import EMPTY, Scene
-from restock.train.twin.recording.messages import typestore
+from restock.train.twin.recording.bag_writer import Format, typestore
 from restock.train.twin.recording.recorder import HARDWARE, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import (
+    EMPTY,
     MARKERS,
     PERTURBATION,
     TOPICS,
     TRAFFIC,
+    Scene,
     mission_markers,
     perturbation_text,
     traffic_markers,

@@ -25,12 +25,11 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Zone
 from restock.ingest.propose.evidence.footprint import parse_footprint
 from restock.toml import Checked, read_toml, typed
-from restock.train.twin.drivers.policies import PlannerFollower
-from restock.train.twin.env.floor_report import describe_floor
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.floor_file import read_floor
+from restock.train.twin.floors.floor_files import read_floor
 from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame
-from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.physics.episode import EpisodeSpec, describe_floor
 from restock.train.twin.survey.picture import (
     LONG_SIDE,
     MARGIN,

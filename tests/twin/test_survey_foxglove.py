@@ -9,8 +9,8 @@ import pytest
 from support.foxglove_robot import BEAMS, FIELD_RAD, WALL_M, drive, pose, write_robot
 
 from restock.ingest.containers.open_recording import open_recording
+from restock.train.twin.survey.mapping import placed_scans
 from restock.train.twin.survey.poses import candidate_poses, choose_poses
-from restock.train.twin.survey.scans import placed_scans
 
 AHEAD_M, YAW_RAD = 0.2, 0.5  # of the lidar in the frame of its scans
 

@@ -20,9 +20,9 @@ from restock.ingest.task.signals import SIGNALS
 from restock.ingest.task.task import observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
-from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseEnv, WarehouseVectorEnv
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,

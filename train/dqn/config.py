@@ -23,7 +23,7 @@ from restock.replay.mixture.mixture import Portion
 from restock.toml import Checked, changed, read_toml, toml_value, typed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import LinearEpsilon
-from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
+from restock.train.twin.missions import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
 
 GIVEN = "given"  # the source of a teacher that Python code passed in

@@ -48,12 +48,11 @@ from restock.train.run.kept_evaluations import (
 from restock.train.run.run import PolicyOrigin, Run
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.missions.registry import KINDS
-from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.missions import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec, refuse_unfit, unfit_kinds
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,
     Perturbation,
@@ -81,8 +80,7 @@ def reference(name: str, seed: int = 0) -> Policy:
     Raises:
         ConfigError: there is none of the name.
     """
-    from restock.train.twin.drivers.operator_policy import Operator
-    from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
+    from restock.train.twin.env.drivers import Operator, PlannerFollower, RandomPolicy
 
     if name == "planner":
         return PlannerFollower(epsilon=0.0, seed=seed)
@@ -433,7 +431,7 @@ def drive_evaluation(
 ) -> list[dict[str, Any]]:
     """Drive all episodes, and add them to the run's `eval/episodes.parquet`: those rows."""
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
-    from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
+    from restock.train.twin.missions import DEFAULT_CONDITIONS
 
     profile = profile_of_run(plan.run)
     task = profile.task

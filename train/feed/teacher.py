@@ -68,7 +68,7 @@ class OperatorTeacher(Stateful):
     STATE: ClassVar[tuple[str, ...]] = ("_operator",)
 
     def __init__(self, seed: int) -> None:
-        from restock.train.twin.drivers.operator_policy import Operator
+        from restock.train.twin.env.drivers import Operator
 
         self._operator = Operator(epsilon=0.0, seed=seed)
 

@@ -42,10 +42,9 @@ from restock.train.twin.calibration.twin_gap import (
     UNTRUSTED,
     read_gap,
 )
-from restock.train.twin.drivers.operator_policy import Operator
-from restock.train.twin.drivers.policies import Handover, PlannerFollower
+from restock.train.twin.env.drivers import Handover, Operator, PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.perturbation import Perturbation
 
 GAP_CHECK = "twin gap"

@@ -23,7 +23,7 @@ from restock.errors import RunError
 from restock.stats import MIN_PAIRS, holm, nothing_varies, paired_t
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
-from restock.train.twin.missions.registry import MISSIONS
+from restock.train.twin.missions import MISSIONS
 from restock.words import counted
 
 CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {  # what a measure may name

@@ -26,7 +26,7 @@ from restock.train.evaluation.eval_run import FIRST_SEED, wrong_seed
 from restock.train.judge.comparability import Treatment
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import unknown_measure
-from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.missions import KINDS
 
 
 class ArmConfig(Checked, frozen=True):

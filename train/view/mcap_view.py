@@ -33,7 +33,7 @@ from restock.train.evaluation.policies import load_agent
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
-from restock.train.twin.recording.messages import build, serialise, stamp, typestore
+from restock.train.twin.recording.bag_writer import build, serialise, stamp, typestore
 
 if TYPE_CHECKING:
     from restock.train.view.evaluated import Beside, Evaluated

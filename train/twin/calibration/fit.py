@@ -24,19 +24,17 @@ from restock.ingest.task.robot import Robot
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
 from restock.toml import Checked
-from restock.train.twin.calibration.fit_parameters import (
+from restock.train.twin.calibration.fit_solver import (
     CHANNELS,
     DEFAULT,
     PARAMETERS,
     Coordinates,
-    FitScope,
-    fit_scope,
-)
-from restock.train.twin.calibration.fit_solver import (
     FitProblem,
+    FitScope,
     FitSolution,
     ReplayResiduals,
     channel_noise,
+    fit_scope,
     position_gap_m,
     search,
     solve,

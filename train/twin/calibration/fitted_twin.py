@@ -21,8 +21,8 @@ from restock.errors import ConfigError, StoreError
 from restock.files import write_text
 from restock.stats import cluster_counts
 from restock.toml import toml_value
-from restock.train.twin.calibration.fit_parameters import PARAMETERS
 from restock.train.twin.calibration.fit_solver import (
+    PARAMETERS,
     FitProblem,
     FitSolution,
     ReplayResiduals,

@@ -28,8 +28,8 @@ from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store, profiles_of
+from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.robot_model import RobotModel
-from restock.train.twin.physics.robot_trial import robot_model
 
 Strings = NDArray[np.str_]
 NOMINAL = "nominal"

@@ -21,11 +21,10 @@ from restock.arrays import F64
 from restock.errors import ConfigError, expect
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
-from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.missions.registry import KINDS, MISSIONS
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
+from restock.train.twin.missions import KINDS, MISSIONS
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, refuse_unfit
 from restock.train.twin.physics.perturbation import Schedule
 
 TRIES = 300  # seeds that are tried for a way through a zone

@@ -55,8 +55,8 @@ from restock.ingest.task.task import Task, reached_goal
 from restock.state import Stateful
 from restock.train.twin.env.interface import Info
 from restock.train.twin.floors.layout import AGENTS, pallet_half_m
+from restock.train.twin.missions import MISSIONS
 from restock.train.twin.missions.mission import Situation
-from restock.train.twin.missions.registry import MISSIONS
 from restock.train.twin.physics.simulation import Simulation
 
 if TYPE_CHECKING:

@@ -42,22 +42,24 @@ from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
-from restock.train.twin.env.floor_report import (
-    names_and_hashes,
-    refuse_other_floors,
-    refuse_too_large,
-    refuse_unfit,
-)
 from restock.train.twin.env.interface import Info, MadeAgain, Step, refuse_other_type
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.env.render import Renderer, View
 from restock.train.twin.env.truth import Truth, info_after, info_now
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
-from restock.train.twin.missions.registry import DEFAULT_CONDITIONS, KINDS
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, with_room
+from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS
+from restock.train.twin.physics.episode import (
+    EpisodeSpec,
+    draw_episode,
+    names_and_hashes,
+    refuse_other_floors,
+    refuse_too_large,
+    refuse_unfit,
+    with_room,
+)
+from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.perturbation import Perturbation, Schedule, find_perturbation
-from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BodyState, Simulation
 

@@ -5,8 +5,8 @@
 - `default`: the floor that comes with Restock;
 - `generated:SEED`, `narrow:SEED`: one floor; narrow ones have aisles that a robot just passes;
 - `generated:train`, `…:validation`, `…:test`, with `:COUNT`: the first floors of that split;
-- `FILE.toml` (`restock.train.twin.floors.floor_file`) or `map.yaml`
-(`restock.train.twin.floors.occupancy_map`);
+- `FILE.toml` (`restock.train.twin.floors.floor_files`) or `map.yaml`
+(`restock.train.twin.floors.floor_files`);
 - several of them, separated by commas.
 
 Every seed belongs to one split, by a hash of it: no floor is ever in two of them.
@@ -228,11 +228,11 @@ def _open(text: str) -> list[Warehouse]:
         return [_generated(kind, seed) for seed in _seeds(text, rest)]
     suffix = Path(text).suffix.lower()
     if suffix == ".toml":
-        from restock.train.twin.floors.floor_file import read_floor
+        from restock.train.twin.floors.floor_files import read_floor
 
         return [read_floor(Path(text))]
     if suffix in (".yaml", ".yml"):
-        from restock.train.twin.floors.occupancy_map import read_map
+        from restock.train.twin.floors.floor_files import read_map
 
         return [read_map(Path(text))]
     raise ConfigError(

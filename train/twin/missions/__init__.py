@@ -1,1 +1,28 @@
-"""The kinds of missions that the twin stages and scores, a file each."""
+"""The kinds of missions that the twin stages and scores, a file each.
+
+A module in this folder with a `MISSION` is a kind; nothing else lists them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Mapping
+
+from restock.train.twin.missions.mission import NOMINAL, Mission
+
+
+def _find() -> dict[str, Mission]:
+    modules = [
+        importlib.import_module(f"{__name__}.{found.name}")
+        for found in pkgutil.iter_modules(__path__)
+    ]
+    kinds = [NOMINAL, *(module.MISSION for module in modules if hasattr(module, "MISSION"))]
+    return {one.name: one for one in sorted(kinds, key=lambda one: (one.place, one.name))}
+
+
+MISSIONS: Mapping[str, Mission] = _find()
+KINDS = tuple(MISSIONS)
+# Shares of episodes in training, and of a site that runs well, if nothing else is requested.
+DEFAULT_CONDITIONS: Mapping[str, float] = {name: one.share for name, one in MISSIONS.items()}
+NATURAL: Mapping[str, float] = {name: one.natural for name, one in MISSIONS.items()}

@@ -1,6 +1,6 @@
-"""The interface of a kind of mission. Each kind is a module here with a `MISSION`.
+"""The interface of a kind of mission, and the plainest kind: nominal.
 
-The registry finds the modules; nothing else lists them.
+Every other kind is a module beside this one, with a `MISSION`.
 """
 
 from __future__ import annotations
@@ -67,3 +67,11 @@ def point_along(plan: F64, at_m: float) -> F64:
     first = min(int(place), len(plan) - 2)
     point: F64 = plan[first] + (place - first) * (plan[first + 1] - plan[first])
     return point
+
+
+def stage_nothing(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged:
+    """Stage nothing: the known map and a dry floor."""
+    return Staged()
+
+
+NOMINAL = Mission("nominal", stage_nothing, share=0.4, natural=0.80, colour="#6b7280", place=0)

@@ -23,7 +23,7 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.ingest.task.robot import Drive, Robot
 from restock.ingest.task.scan import Body
-from restock.train.twin.physics.contact import (
+from restock.train.twin.physics.robot_model import (
     CHASSIS_MASK,
     DRAWN_GROUP,
     FLOOR,
@@ -31,8 +31,8 @@ from restock.train.twin.physics.contact import (
     ROBOT_GROUP,
     ROLLING_MASK,
     SOFT,
+    RobotModel,
 )
-from restock.train.twin.physics.robot_model import RobotModel
 
 # Divergence is counted and reported: MuJoCo shall not write MUJOCO_LOG.TXT where the user stands.
 _log = mujoco.MjLogConfig.get()

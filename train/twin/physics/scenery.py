@@ -37,9 +37,9 @@ from restock.train.twin.floors.layout import (
     Walk,
     Warehouse,
 )
-from restock.train.twin.physics.contact import OBSTACLE_GROUP
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import MOVING_HALF_M, Handles, building_boxes
+from restock.train.twin.physics.robot_model import OBSTACLE_GROUP
 
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
 YIELD_M = 0.5

@@ -27,11 +27,16 @@ from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.state_lattice import rectangle
-from restock.train.twin.physics.contact import FLOOR_FRICTION, FloorFriction
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import Handles, build_model, yaw_of
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
-from restock.train.twin.physics.robot_model import LIDAR_BEAMS, RobotModel, stand_in
+from restock.train.twin.physics.robot_model import (
+    FLOOR_FRICTION,
+    LIDAR_BEAMS,
+    FloorFriction,
+    RobotModel,
+    stand_in,
+)
 from restock.train.twin.physics.scenery import Lidar, Scenery, quaternion, rotated
 
 GRAVITY_MPS2 = 9.81

@@ -27,7 +27,7 @@ from restock.ingest.task.signals import wrap_angle
 from restock.toml import Checked
 from restock.train.twin.recording import robot_topics as topics
 from restock.train.twin.recording.bag_writer import Message
-from restock.train.twin.recording.drive import Drive, Lidar, Odometer
+from restock.train.twin.recording.robot_topics import Drive, Lidar, Odometer
 
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8

@@ -29,21 +29,18 @@ from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.missions.registry import NATURAL
+from restock.train.twin.missions import NATURAL
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.recording.bag_writer import Format, recording_sink
-from restock.train.twin.recording.drive import Lidar, Odometer
 from restock.train.twin.recording.fleet import (
+    HANDOVER,
+    SCRIPTED,
+    VERSIONS,
     BehaviourPolicies,
     DrivenMission,
     ExternalPolicy,
     Fleet,
-)
-from restock.train.twin.recording.missions import (
-    HANDOVER,
-    SCRIPTED,
-    VERSIONS,
     Mission,
     OrderedMissions,
     meets,
@@ -51,7 +48,7 @@ from restock.train.twin.recording.missions import (
     schedule,
 )
 from restock.train.twin.recording.publish import Rates, Robot
-from restock.train.twin.recording.robot_topics import TOPICS
+from restock.train.twin.recording.robot_topics import TOPICS, Lidar, Odometer
 
 HARDWARE = Perturbation(
     name="stand-in hardware",

@@ -28,6 +28,7 @@ from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.evidence.footprint import Footprint, footprint_of
 from restock.ingest.task.signals import yaw_of
 from restock.replay.store.store import Store, is_store
+from restock.train.twin.floors.floor_files import FURTHEST_M, read_grid
 from restock.train.twin.floors.occupancy_grid import (
     FREE,
     MAX_CELLS,
@@ -35,8 +36,8 @@ from restock.train.twin.floors.occupancy_grid import (
     UNKNOWN,
     OccupancyGrid,
 )
-from restock.train.twin.floors.occupancy_map import FURTHEST_M, read_grid
 from restock.train.twin.floors.placed import COMPARED, Drive, logged_drives
+from restock.train.twin.survey.mapping import PlacedScans, placed_scans
 from restock.train.twin.survey.poses import (
     WELL_PLACED,
     Poses,
@@ -44,7 +45,6 @@ from restock.train.twin.survey.poses import (
     candidate_poses,
     choose_poses,
 )
-from restock.train.twin.survey.scans import PlacedScans, placed_scans
 from restock.words import counted
 
 TYPE = "nav_msgs/msg/OccupancyGrid"

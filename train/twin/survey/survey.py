@@ -32,6 +32,7 @@ from restock.train.twin.floors.occupancy_grid import (
 from restock.train.twin.floors.placed import SEEN, placed_on
 from restock.train.twin.survey.evidence import Evidence, gather
 from restock.train.twin.survey.mapping import (
+    PlacedScans,
     along_walls,
     driven_corridor,
     returns_on_walls,
@@ -39,7 +40,6 @@ from restock.train.twin.survey.mapping import (
     walls_agreement,
 )
 from restock.train.twin.survey.poses import Poses
-from restock.train.twin.survey.scans import PlacedScans
 
 Source = Literal["map", "scans", "corridor"]
 MARGIN_M = 0.05  # beyond half the body, when it drives along a wall

@@ -82,7 +82,7 @@ class CoverageCommand:
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
         from restock.report import write_coverage_page
-        from restock.train.twin.missions.registry import KINDS
+        from restock.train.twin.missions import KINDS
 
         advance(0, "what is missing")
         yields, gaps = find_gaps(

@@ -78,7 +78,7 @@ class GapsCommand:
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
         from restock.replay.store.store import Store
-        from restock.train.twin.missions.registry import KINDS
+        from restock.train.twin.missions import KINDS
 
         if self.min_rows < 0:
             raise ConfigError(f"must be 0 or more, got {self.min_rows}", where="--min-rows")

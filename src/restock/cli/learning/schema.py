@@ -80,7 +80,7 @@ def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
     from restock.replay.mixture.mixture import Mixture
     from restock.train.dqn.config import TrainConfig
     from restock.train.study.study import Study
-    from restock.train.twin.floors.floor_file import FloorFile
+    from restock.train.twin.floors.floor_files import FloorFile
     from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
     def as_it_is(_: dict[str, Any]) -> None:

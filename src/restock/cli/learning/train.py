@@ -290,8 +290,8 @@ _OF_LOGS = ("policies", "successes", "logs_share", "offline_updates")  # of a te
 def describe_run(prepared: Prepared) -> str:
     """Describe the run, and what not to expect of it, in a line each."""
     from restock.toml import changed
-    from restock.train.twin.env.floor_report import sealed
     from restock.train.twin.floors.floors import open_floors
+    from restock.train.twin.physics.episode import sealed
 
     config, panel, document = prepared.config, prepared.panel, prepared.document
     schedule = config.schedule

@@ -262,7 +262,7 @@ def evidence_lines(to: Settings) -> list[str]:
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
     """Train on the floors, on these kinds of episode; none: all."""
     from restock.toml import toml_value
-    from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
+    from restock.train.twin.missions import DEFAULT_CONDITIONS
 
     settings = [f"env.layouts={to.layouts}"]
     shares = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in kinds}
@@ -281,7 +281,7 @@ def missions_unseen(to: Settings, document: Document) -> str | None:
 
 def _unseen(to: Settings, document: Document) -> list[str]:
     """Return the kinds of episode that need a lidar, if the robot has none."""
-    from restock.train.twin.missions.registry import MISSIONS
+    from restock.train.twin.missions import MISSIONS
 
     task = _task(to.profile)
     if task is None or task.lidar:

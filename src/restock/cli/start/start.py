@@ -483,7 +483,7 @@ class StartCommand:
 
             check_urdf(self.urdf)
         if self.map is not None:
-            from restock.train.twin.floors.occupancy_map import read_grid
+            from restock.train.twin.floors.floor_files import read_grid
 
             read_grid(self.map)
 

@@ -69,10 +69,9 @@ class LayoutCommand:
         """Print, and write what was asked for."""
         from restock.cli import output
         from restock.files import write_text
-        from restock.train.twin.env.floor_report import describe_floor
         from restock.train.twin.env.render import draw_floor, write_png
-        from restock.train.twin.floors.floor_file import write_floor
-        from restock.train.twin.floors.occupancy_map import write_map
+        from restock.train.twin.floors.floor_files import write_floor, write_map
+        from restock.train.twin.physics.episode import describe_floor
         from restock.train.twin.survey.picture import write_picture
         from restock.train.twin.survey.survey import profile_zones
 

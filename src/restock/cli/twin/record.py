@@ -87,13 +87,13 @@ class RecordCommand:
         from restock.files import expect_place
         from restock.ingest.task.tags import parse_tags
         from restock.replay.fleet.missions_file import MissionsFile
-        from restock.train.twin.env.floor_report import refuse_unfit, sealed
         from restock.train.twin.floors.floors import open_floors
         from restock.train.twin.floors.planner import planners
-        from restock.train.twin.missions.registry import NATURAL
+        from restock.train.twin.missions import NATURAL
+        from restock.train.twin.physics.episode import refuse_unfit, sealed
         from restock.train.twin.physics.perturbation import find_perturbation
         from restock.train.twin.recording.bag_writer import refuse_existing
-        from restock.train.twin.recording.missions import parse_shares
+        from restock.train.twin.recording.fleet import parse_shares
         from restock.train.twin.recording.recorder import (
             FIRST_NS,
             HARDWARE,
@@ -188,7 +188,7 @@ def load_policy(name: str) -> Policy | None:
         ConfigError: no such policy, or one of another task.
         RunError: a run without a policy, or a damaged one.
     """
-    from restock.train.twin.recording.missions import SCRIPTED
+    from restock.train.twin.recording.fleet import SCRIPTED
 
     if name in SCRIPTED:
         return None

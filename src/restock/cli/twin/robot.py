@@ -34,13 +34,13 @@ class RobotCommand:
         from restock.errors import ConfigError
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.task.robot import refuse_beyond_steering
-        from restock.train.twin.physics.model import passed_over
-        from restock.train.twin.physics.robot_trial import (
+        from restock.train.twin.physics.model import (
             TIMESTEP_S,
             driven_actions,
             measured,
             outlined,
             outside,
+            passed_over,
             robot_model,
         )
         from restock.train.twin.physics.simulation import blocks_of

@@ -20,7 +20,7 @@ import numpy as np
 import vl_convert
 
 from restock.report.look.blocks import Drawing, Rows, words
-from restock.train.twin.missions.registry import MISSIONS
+from restock.train.twin.missions import MISSIONS
 
 Row = Mapping[str, Any]
 

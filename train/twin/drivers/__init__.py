@@ -1,1 +1,0 @@
-"""The twin's drivers: planner, operator, random actions, and handover between them."""
