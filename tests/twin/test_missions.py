@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from support.paths import ROOT
 
 KIND = '''
 from restock.train.twin.floors.layout import Walk
@@ -22,8 +25,8 @@ MISSION = Mission("bystander_close_by", stage, share=0.1, natural=0.05, colour="
 '''
 DRIVE = """
 import sys
-from restock.train.twin import missions
-missions.__path__.append(sys.argv[1])
+from restock.train import twin
+twin.__path__.insert(0, sys.argv[1])
 import numpy as np
 from restock.report.look.charts import CONDITION_COLOURS
 from restock.train.dqn.config import TrainConfig
@@ -44,7 +47,8 @@ assert [arm.name for arm in env.mission_arms(["block"])] == [kind]
 
 
 def test_a_kind_of_mission_is_one_file(tmp_path: Path) -> None:
-    (tmp_path / "bystander.py").write_text(KIND)
+    kinds = shutil.copytree(ROOT / "train/twin/missions", tmp_path / "missions")
+    (kinds / "bystander.py").write_text(KIND)
     done = subprocess.run(  # a process of its own: the registry is read once
         [sys.executable, "-c", DRIVE, str(tmp_path)], capture_output=True, text=True, check=False
     )
