@@ -71,8 +71,13 @@ def list_run_tables() -> Iterator[str]:
 def list_views() -> Iterator[str]:
     """Yield every view of a store, with every column."""
     from restock.ingest.task.schema import frame_schema, recording_schema, transition_schema
-    from restock.replay.store.column_docs import HELD, install_columns, view_docs
-    from restock.replay.store.definitions import FRAMES, definitions
+    from restock.replay.store.definitions import (
+        FRAMES,
+        HELD_CONDITIONS,
+        definitions,
+        install_columns,
+        view_docs,
+    )
 
     with duckdb.connect() as connection:
         connection.register("stored_transitions", transition_schema(2).empty_table())
@@ -83,7 +88,7 @@ def list_views() -> Iterator[str]:
         rows = connection.sql("FROM columns").fetchall()
     for view, doc in view_docs().items():
         of_view = [row[1:] for row in rows if row[0] == view]
-        if view == HELD:
+        if view == HELD_CONDITIONS:
             doc += ". It has the columns of `transitions`, and one more"
             of_view = [row for row in of_view if row[0] == "condition"]
         yield f"### {view}\n\n{doc[0].upper()}{doc[1:]}.\n"

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from restock.replay.sampling.sampler import Sampler as Sampler
     from restock.replay.store.audit import load_audits as load_audits
     from restock.replay.store.audit import load_thresholds as load_thresholds
+    from restock.replay.store.audit import recommend_capacity as recommend_capacity
     from restock.replay.store.audit import run_audits as run_audits
-    from restock.replay.store.capacity import recommend_capacity as recommend_capacity
     from restock.replay.store.frames import camera_frames as camera_frames
     from restock.replay.store.store import Store as Store
     from restock.replay.trace.trace import TracePlaces as TracePlaces

@@ -16,7 +16,7 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
-from restock.replay.fleet.gap_tables import install_gaps
+from restock.replay.fleet.shopping_list import install_gaps
 from restock.replay.panel.mixture_tables import install_mixtures
 from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import REMAKE, read_parquet

@@ -21,7 +21,7 @@ from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.packed_rows import row_width
 from restock.replay.sampling.ring import META
-from restock.replay.store.capacity import capacity_of_rows
+from restock.replay.store.audit import capacity_of_rows
 from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught
 from restock.train.feed.logs import check_terms

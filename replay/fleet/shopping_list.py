@@ -9,21 +9,47 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+import pyarrow as pa
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.replay.fleet.gaps import Gap
-from restock.replay.fleet.yields import Unit, Yields
+from restock.replay.fleet.gaps import Gap, Unit, Yields, find_gaps
+from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.plan.source_plan import (
     Forecast,
     forecast,
     missions_to_see_one,
     probability_to_close,
 )
+from restock.replay.store.store import Store
 
+# Of `FROM gaps(name)`, with their types.
+COLUMNS = {
+    "asked_by": "VARCHAR",
+    "stratum": "VARCHAR",
+    "condition": "VARCHAR",
+    "zone": "VARCHAR",
+    "action": "BIGINT",
+    "action_name": "VARCHAR",
+    "robot": "VARCHAR",
+    "counted": "VARCHAR",
+    "needed": "BIGINT",
+    "there": "BIGINT",
+    "missing": "BIGINT",
+    "unit": "VARCHAR",
+    "best": "VARCHAR",
+    "rate": "DOUBLE",
+    "rate_low": "DOUBLE",
+    "rate_high": "DOUBLE",
+    "amount": "DOUBLE",
+    "amount_low": "DOUBLE",
+    "amount_high": "DOUBLE",
+}
 HOUR_STEPS = 60  # of an hour that is planned
 _PART = 0.1  # of a gap that an order fills at least, to be named as for it
 
@@ -314,3 +340,34 @@ def _gap(one: FilledGap) -> dict[str, Any]:
         supply, missions = one.see_one
         line |= {"never_seen_in": supply.name, "at_least": missions}
     return line
+
+
+def install_gaps(store: Store) -> None:
+    """Make `gaps(name)` in a store's connection: what a mixture and the audits find missing.
+
+    Missions are of the kinds that the store's conditions name; `restock coverage gaps` takes those
+    that the twin can drive.
+    """
+    script = files("restock.replay.fleet") / "gaps.sql"
+    install_planned(store, ("gaps",), {"planned_gaps": (COLUMNS, _gaps_table)}, script, _list_of)
+
+
+def _list_of(own: Store, name: str) -> ShoppingList:
+    from restock.replay.mixture.mixture import load_mixture
+    from restock.replay.store.audit import load_thresholds
+
+    yields, gaps = find_gaps(
+        own,
+        load_mixture(name),
+        name=name,
+        folder=Path(name).parent,
+        kinds=[condition.name for condition in own.conditions()],
+        thresholds=load_thresholds(),
+    )
+    return shopping_list(yields, gaps)
+
+
+def _gaps_table(found: ShoppingList) -> pa.Table:
+    """Return a row a gap, columns COLUMNS."""
+    lines = [{**line, "unit": found.unit} for line in document(found)["gaps"]]
+    return pa.table({name: [line[name] for line in lines] for name in COLUMNS})

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -64,31 +65,50 @@ _RENAMED = {"stratum": "name", "drawn_share": "share"}  # to the fields of `Stra
 
 def install_mixtures(store: Store) -> None:
     """Make both macros in a store's connection."""
+    tables = {"planned_strata": (STRATA, strata_table), "planned_rows": (ROWS, rows_table)}
+    script = files("restock.replay.panel") / "mixture_tables.sql"
+    install_planned(store, ("mixture", "mixture_rows"), tables, script, _plan)
+
+
+def _plan(own: Store, name: str) -> PanelPlan:
+    from restock.replay.mixture.mixture import load_mixture
+    from restock.replay.panel.build import open_source
+    from restock.replay.plan.plan import plan_panel
+
+    mixture = load_mixture(name)
+    with open_source(own, mixture, folder=Path(name).parent) as source:
+        return plan_panel(source.connection, mixture, source.conditions, source.others)
+
+
+def install_planned(
+    store: Store,
+    macros: Sequence[str],
+    tables: Mapping[str, tuple[dict[str, str], Callable[[T], pa.Table]]],
+    script: Traversable,
+    plan: Callable[[Store, str], T],
+) -> None:
+    """Make macros in a store's connection whose rows come from a plan in Python.
+
+    Args:
+        macros: their names, each of which takes the name of a mixture.
+        tables: the SQL functions that `script` calls: their columns, and a plan as such a table.
+        plan: makes a plan on a store of its own, at the same version, for a mixture's name.
+    """
     limit = store.bare.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
+    path, version = store.path, store.version
 
     @functools.lru_cache(maxsize=1)
-    def planned(name: str, _changed_ns: int) -> PanelPlan:
-        from restock.replay.mixture.mixture import load_mixture
-        from restock.replay.panel.build import open_source
-        from restock.replay.plan.plan import plan_panel
+    def planned(name: str, _changed_ns: int) -> T:
+        with Store(path, version=version, memory_limit=limit) as own:
+            return plan(own, name)
 
-        with Store(store_path, version=version, memory_limit=limit) as own:
-            mixture = load_mixture(name)
-            with open_source(own, mixture, folder=Path(name).parent) as source:
-                return plan_panel(source.connection, mixture, source.conditions, source.others)
-
-    store_path, version = store.path, store.version
-    for function, columns, table_of in (
-        ("planned_strata", STRATA, strata_table),
-        ("planned_rows", ROWS, rows_table),
-    ):
-        install_function(store.bare, function, columns, table_of, planned)
-    store.checks.append(functools.partial(check_names, ("mixture", "mixture_rows")))
-    text = (files("restock.replay.panel") / "mixture_tables.sql").read_text(encoding="utf-8")
-    store.bare.execute(text)
+    for function, (columns, table_of) in tables.items():
+        _install_function(store.bare, function, columns, table_of, planned)
+    store.checks.append(functools.partial(_check_names, macros))
+    store.bare.execute(script.read_text(encoding="utf-8"))
 
 
-def check_names(macros: Sequence[str], text: str) -> None:
+def _check_names(macros: Sequence[str], text: str) -> None:
     """Raise ConfigError if a query asks one of these macros for a mixture that cannot be read.
 
     DuckDB calls a function when rows are fetched, and reports what it raised in its own words.
@@ -99,7 +119,7 @@ def check_names(macros: Sequence[str], text: str) -> None:
         load_mixture(name)
 
 
-def install_function(
+def _install_function(
     connection: duckdb.DuckDBPyConnection,
     function: str,
     columns: dict[str, str],

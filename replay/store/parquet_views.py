@@ -9,15 +9,29 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import duckdb
 import pyarrow as pa
+from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.lineage import damage_remedy
+from restock.ingest.store.lineage import (
+    StoredFile,
+    damage_named,
+    damage_remedy,
+    own_path,
+    stored_files,
+)
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
 
 # A file of a store, as DuckDB quotes it.
 _FILE = re.compile(
@@ -164,3 +178,151 @@ def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> di
 
 def _literal(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
+
+
+DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")
+_TEXT = pa.dictionary(pa.int32(), pa.string())
+FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
+
+
+@dataclass(frozen=True)
+class StoredTable:
+    """The files of one table at the version that is open, and what is read of them."""
+
+    place: Location
+    view: str
+    table: str
+    schema: pa.Schema
+    paths: Sequence[str]  # in the table
+
+    @cached_property
+    def addresses(self) -> list[str]:
+        """The files, as a reader of files names them."""
+        folder = self.place.table(self.table)
+        return [f"{folder}/{path}" for path in self.paths]
+
+    def present(self, connection: duckdb.DuckDBPyConnection, *, schema: str = "main") -> None:
+        """Create the view; files on S3 are read at each query.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        if self.paths and self.place.folder is not None:
+            kinds, files = column_types(connection, self.schema), self.addresses
+            read_parquet(connection, self.view, files, schema=schema, kinds=kinds)
+            return
+        with self.place.translate_errors():
+            register(connection, self.view, self._dataset(), schema=schema)
+
+    def read(self) -> pa.Table:
+        """Read all rows into memory; columns that a file lacks are null.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        try:
+            with self.place.translate_errors():
+                if len(self.paths) <= FEW_FILES and self.place.folder is not None:
+                    return self._read_each()
+                rows = self._dataset()
+                return rows if isinstance(rows, pa.Table) else rows.to_table()
+        except (OSError, pa.ArrowException) as error:
+            raise StoreError(
+                f"its manifests cannot be read: {first_line(error)}",
+                where=str(self.place),
+                remedy=damage_remedy(self.place, self.table),
+            ) from error
+
+    def row_groups(self, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """Yield the rows in parts: of these columns, as `Location.row_groups` names them.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        for path in self.paths:
+            place = f"{self.table}/{path}"
+            with damage_named(self.place, place):
+                yield from self.place.row_groups(place, columns)
+
+    def _dataset(self) -> pa.Table | Dataset:
+        if not self.paths:
+            return self.schema.empty_table()
+        from pyarrow import dataset
+
+        parquet = dataset.ParquetFileFormat(
+            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(
+                pre_buffer=True, page_checksum_verification=True
+            )
+        )
+        fragments = [
+            parquet.make_fragment(f"{self.table}/{path}", self.place.files) for path in self.paths
+        ]
+        return dataset.FileSystemDataset(fragments, self.schema, parquet, self.place.files)
+
+    def _read_each(self) -> pa.Table:
+        """File by file; a text that many recordings have stands once."""
+        schema = pa.schema(
+            [field.with_type(_TEXT) if field.name in DOCUMENTS else field for field in self.schema]
+        )
+        bare = []
+        for path in self.paths:
+            place = f"{self.table}/{path}"
+            with damage_named(self.place, place):
+                part = self.place.read(place, columns=schema.names, repeated=DOCUMENTS)
+            kinds = pa.schema([schema.field(name) for name in part.column_names])
+            if part.schema.types != kinds.types:  # other tools write text as views or large strings
+                part = part.cast(kinds)
+            bare.append(part.replace_schema_metadata(None))
+        return pa.concat_tables([schema.empty_table(), *bare], promote_options="default")
+
+
+def manifest_tables(
+    place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
+) -> tuple[StoredTable, StoredTable]:
+    """Return two tables of these transition files' manifests: without summaries, and summaries.
+
+    They are `stored_recordings`, which keeps the version of the summary, and `stored_summaries`.
+    """
+    paths = _manifests(place, recordings, held)
+    columns = pa.schema(recordings.schema().to_arrow())
+    reported = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
+    brief = pa.schema([*reported, SUMMARY_SCHEMA.field("summary_version")])
+    kept = [columns.field("ingest_id"), *(one for one in SUMMARY_SCHEMA if one.name in TABLES)]
+    return (
+        StoredTable(place, "stored_recordings", RECORDINGS, brief, paths),
+        StoredTable(place, "stored_summaries", RECORDINGS, pa.schema(kept), paths),
+    )
+
+
+def register(
+    connection: duckdb.DuckDBPyConnection,
+    view: str,
+    rows: pa.Table | Dataset,
+    *,
+    schema: str = "main",
+) -> None:
+    """Create a view of an Arrow table or data set in a schema that exists."""
+    name = view if schema == "main" else f"{schema}_{view}"
+    connection.register(name, rows)
+    if name != view:
+        connection.execute(f'CREATE VIEW "{schema}".{view} AS FROM "{name}"')
+
+
+def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
+    """Return the files of the manifests of these rows, those of an older version included.
+
+    A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
+    were before, by version or because the writer was between two commits, finds it by its name.
+    """
+    wanted = {one.ingest_id: one for file in held for one in file.ingests}
+    active = [
+        file
+        for file in stored_files(place, RECORDINGS, recordings)
+        if any(one.ingest_id in wanted for one in file.ingests)
+    ]
+    here = {one.ingest_id for file in active for one in file.ingests}
+    ingests = (one for ingest_id, one in wanted.items() if ingest_id not in here)
+    gone = sorted({own_path(one.recording_id, one.ingest_id) for one in ingests})
+    infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
+    found = [path for path, info in zip(gone, infos, strict=True) if info.is_file]
+    return [file.path for file in active] + found

@@ -1,6 +1,6 @@
 -- Rows that look like no other of their recording, and like one of another recording: by content (task,
 -- action, observation and pose, rounded to a thousandth), not by stamp, as each ingest estimates its own
--- clock. From the rows; where manifests have the content of theirs (shared_rows.py), nothing is read but
+-- clock. From the rows; where manifests have the content of theirs (same_drives.py), nothing is read but
 -- that.
 CREATE OR REPLACE VIEW shared_rows AS
 WITH places AS (

@@ -40,10 +40,9 @@ from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.interrupts import interrupts_raised
 from restock.replay.store.definitions import Definitions, install_common
-from restock.replay.store.parquet_views import damage
+from restock.replay.store.parquet_views import StoredTable, damage, manifest_tables, register
 from restock.replay.store.query import query
-from restock.replay.store.shared_rows import SHARED, install_shared_rows
-from restock.replay.store.stored_tables import StoredTable, manifest_tables, register
+from restock.replay.store.same_drives import SHARED, install_shared_rows
 
 # Joins are done as they are written, the right side in memory: of files whose columns are told
 # DuckDB takes every scan for one row, and would hold all transitions to look up their recordings.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,15 +10,126 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from restock.arrays import F32, F64
+from restock.arrays import F32, F64, Ints
 from restock.errors import RecordingError, StoreError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import RawMessage
-from restock.ingest.task.scan import outline_reach
+from restock.ingest.containers.recording import RawMessage, Recording
+from restock.ingest.decoding.columns import Ragged
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
+from restock.ingest.steps.clearance import angle_keys, beam_angles
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.task.scan import Body, outline_reach
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 from restock.replay.trace.origin import Origin, profile_of, rows_of, sql_file
-from restock.replay.trace.seen_at_ticks import Seen, SeenScan, seen_between
+
+BINS = 720  # of bearings, where scans are put together
+
+
+@dataclass(frozen=True)
+class SeenScan:
+    """A lidar's scan as it was recorded, its angles as seen from above."""
+
+    stamp_ns: int  # when it was measured, on the alignment clock
+    ranges_m: F64  # (B,); inf and NaN as the lidar has them
+    angle_min_rad: float
+    angle_increment_rad: float
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was known at T ticks. None where the profile has no such input, or nothing was fresh."""
+
+    stamp_ns: Ints  # (T,)
+    scans: list[SeenScan | None]
+    plans_m: list[F64 | None]  # of (P, 2) points in the fixed frame
+    goals_m: list[tuple[float, float] | None]
+
+
+def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: int) -> Seen:
+    """Return what the ticks in [low_ns, high_ns] of the alignment clock saw.
+
+    Raises:
+        RecordingError: the recording does not fit the profile.
+    """
+    aligned = align_inputs(profile, read_topics(recording, profile, reduced=False))
+    inside = [stamps[(stamps >= low_ns) & (stamps <= high_ns)] for stamps in aligned.ticks]
+    aligned = replace(aligned, ticks=inside)
+    stamps = np.concatenate(inside) if inside else np.zeros(0, np.int64)
+    return Seen(stamps, _scans(aligned, stamps), _plans(aligned, stamps), _goals(aligned, stamps))
+
+
+def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
+    """Return the scan at each stamp, as recorded or as seen from the body's own lidar.
+
+    The latter if the lidars are mounted elsewhere.
+    """
+    scans = aligned.profile.inputs.scans
+    if not scans or not scans.keys() <= aligned.inputs.by_name.keys():
+        return [None] * len(stamps)
+    seen = [_scans_of(aligned, name, stamps) for name in scans]
+    sources, body = list(scans.values()), aligned.profile.task.body
+    if sources[0].lidar_at_m is None:
+        return seen[0]
+    return [_from_the_middle(body, sources, parts) for parts in zip(*seen, strict=True)]
+
+
+def _from_the_middle(
+    body: Body, sources: Sequence[Input], scans: Sequence[SeenScan | None]
+) -> SeenScan | None:
+    """Merge the scans of several lidars at a tick: the nearest in each of BINS bearings."""
+    nearest, stamp_ns = np.full(BINS, np.inf), [scan.stamp_ns for scan in scans if scan is not None]
+    for source, scan in zip(sources, scans, strict=True):
+        if scan is None:
+            continue
+        back = np.flatnonzero(np.isfinite(scan.ranges_m) & (scan.ranges_m > 0))
+        bearing = scan.angle_min_rad + scan.angle_increment_rad * back
+        bearing += source.lidar_yaw_rad or 0.0
+        ahead_m, left_m = source.lidar_at_m or (body.lidar_x_m, 0.0)
+        x = ahead_m - body.lidar_x_m + scan.ranges_m[back] * np.cos(bearing)
+        y = left_m + scan.ranges_m[back] * np.sin(bearing)
+        place = ((np.arctan2(y, x) + np.pi) * (BINS / (2 * np.pi))).astype(np.int64)
+        np.minimum.at(nearest, np.minimum(place, BINS - 1), np.hypot(x, y))
+    width = 2 * np.pi / BINS
+    first = width / 2 - np.pi - body.lidar_yaw_rad
+    return SeenScan(max(stamp_ns), nearest, first, width) if stamp_ns else None
+
+
+def _scans_of(aligned: AlignedInputs, name: str, stamps: Ints) -> list[SeenScan | None]:
+    latest = aligned.latest(name)
+    ranges = aligned.inputs.column(name, "ranges_m")
+    source = aligned.inputs.by_name[name]
+    first, last = (aligned.inputs.numbers(name, key) for key in angle_keys(source.fields))
+    scans: list[SeenScan | None] = []
+    for row, age, fresh, stamp in zip(latest.row, latest.age_ns, latest.fresh, stamps, strict=True):
+        if not fresh:
+            scans.append(None)
+            continue
+        one = ranges[row]
+        values = np.atleast_1d(np.asarray(one.values if isinstance(one, Ragged) else one, float))
+        this, beams = slice(row, row + 1), np.array([len(values)])
+        angles = beam_angles(source, first[this], last[this], beams)
+        scans.append(SeenScan(int(stamp) - int(age), values, *(float(one[0]) for one in angles)))
+    return scans
+
+
+def _plans(aligned: AlignedInputs, stamps: Ints) -> list[F64 | None]:
+    if "plan" not in aligned.inputs.by_name:
+        return [None] * len(stamps)
+    latest, plans = aligned.latest("plan"), aligned.inputs.plans
+    known = zip(latest.row, latest.fresh, strict=True)
+    return [plans[row] if fresh and len(plans[row]) else None for row, fresh in known]
+
+
+def _goals(aligned: AlignedInputs, stamps: Ints) -> list[tuple[float, float] | None]:
+    if "goal" not in aligned.inputs.by_name:
+        return [None] * len(stamps)
+    latest, goals = aligned.latest("goal"), aligned.inputs.goals
+    known = zip(latest.row, latest.fresh, strict=True)
+    return [(float(goals[row, 0]), float(goals[row, 1])) if ok else None for row, ok in known]
+
 
 NS = 1_000_000_000
 

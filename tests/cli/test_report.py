@@ -28,7 +28,7 @@ from restock.cli.learning.eval import show_measures
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
-from restock.replay.store.capacity import capacity_of_rows
+from restock.replay.store.audit import capacity_of_rows
 from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.look.charts import POLICY_COLOURS, POLICY_SPARES, colours, lines, scale

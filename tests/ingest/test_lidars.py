@@ -26,7 +26,7 @@ from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.task.scan import MovedMap, SectorMap, outline_reach, with_unseen
-from restock.replay.trace.seen_at_ticks import seen_between
+from restock.replay.trace.moment import seen_between
 
 TASK = load_profile("warehouse_amr").task
 LEFT_M, RIGHT_M = 2.0, 0.2  # y of the walls: the robot drives along y = 1

@@ -17,7 +17,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
-from restock.replay.store.capacity import capacity_of_rows, recommend_capacity
+from restock.replay.store.audit import capacity_of_rows, recommend_capacity
 from restock.replay.store.store import Store
 from restock.train import resolve
 from restock.train.prepare import prepare_new

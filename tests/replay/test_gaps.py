@@ -16,14 +16,13 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.replay.fleet.gaps import Gap, find_gaps
+from restock.replay.fleet.gaps import Gap, Yields, find_gaps
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_toml, read_missions
 from restock.replay.fleet.shopping_list import shopping_list
-from restock.replay.fleet.yields import Yields
 from restock.replay.mixture.mixture import load_mixture, parse_mixture
 from restock.replay.places import add_computed_tables
 from restock.replay.plan.source_plan import forecast, missions_to_see_one, probability_to_close
-from restock.replay.store.capacity import recommend_capacity
+from restock.replay.store.audit import recommend_capacity
 from restock.replay.store.store import Store
 from restock.words import figure
 

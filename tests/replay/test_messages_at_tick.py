@@ -24,7 +24,7 @@ from restock.ingest.steps.frames import rotations
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import nearest_action
-from restock.replay.trace.messages_at_tick import MessageAtTick, messages_at_tick
+from restock.replay.trace.origin import MessageAtTick, messages_at_tick
 
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from restock.replay.store.shared_rows import MARKED, MetTwice, occurs_again
+from restock.replay.store.same_drives import MARKED, MetTwice, occurs_again
 
 NUMBERS = st.integers(-(2**63), 2**63 - 1)
 

@@ -23,7 +23,7 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
-from restock.replay.store.column_docs import column_docs, view_docs
+from restock.replay.store.definitions import column_docs, view_docs
 from restock.replay.store.store import Store, is_store
 
 

@@ -19,11 +19,12 @@ from restock.cli import main
 from restock.errors import ArgumentError, StoreError
 from restock.ingest.store.version import parse_version, split_version
 from restock.ingest.store.writer import StoreWriter
-from restock.replay.fleet.store_difference import diff_stores, shifted
-from restock.replay.fleet.two_sample import (
+from restock.replay.fleet.store_difference import (
+    diff_stores,
     false_discovery_adjusted,
     share_differences,
     shift,
+    shifted,
     standardised_difference,
 )
 from restock.replay.store.store import Store

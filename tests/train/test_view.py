@@ -24,8 +24,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.replay.trace.moment import find_moment
-from restock.replay.trace.seen_at_ticks import seen_between
+from restock.replay.trace.moment import find_moment, seen_between
 from restock.replay.trace.trace import Trace, TracePlaces, trace_row
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner

@@ -14,8 +14,7 @@ import numpy as np
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
-from restock.replay.trace.moment import NS, Moment
-from restock.replay.trace.seen_at_ticks import Seen
+from restock.replay.trace.moment import NS, Moment, Seen
 from restock.train.evaluation.eval_run import (
     CLEAN,
     EvaluationPlan,

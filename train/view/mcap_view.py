@@ -25,8 +25,7 @@ from mcap.writer import CompressionType, Writer
 from restock.arrays import F32, F64, Ints
 from restock.errors import RunError
 from restock.ingest.decoding.columns import Channel
-from restock.replay.trace.moment import Moment
-from restock.replay.trace.seen_at_ticks import SeenScan
+from restock.replay.trace.moment import Moment, SeenScan
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.policies import load_agent

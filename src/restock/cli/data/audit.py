@@ -246,7 +246,7 @@ class AuditCommand:
         from restock.cli import output
         from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
-        from restock.replay.store.capacity import recommend_capacity
+        from restock.replay.store.audit import recommend_capacity
 
         version = given_version(self.version)
         with open_place(

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from restock.replay.store.column_docs import UNITS
-from restock.replay.store.column_docs import unit as unit_of
+from restock.replay.store.definitions import UNITS
+from restock.replay.store.definitions import unit as unit_of
 from restock.report.look.blocks import Rows, words
 
 _MEANINGS = {  # what a signal measures; docs/coverage.md says how

@@ -10,7 +10,7 @@ import altair as alt
 from restock.errors import RestockError
 from restock.replay.plan.exclusions import DAY_NS
 from restock.replay.plan.source_plan import TOLERANCE
-from restock.replay.store.capacity import capacity_of_rows
+from restock.replay.store.audit import capacity_of_rows
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Drawing,
