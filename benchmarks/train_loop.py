@@ -29,7 +29,7 @@ from harness import finish, option_parser
 
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import parse_config
-from restock.train.feed.training_twin import make_twin
+from restock.train.feed.practice import make_twin
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new
 

@@ -19,9 +19,8 @@ from restock.arrays import Bools
 from restock.errors import ExitCode, RestockError
 from restock.interrupts import interrupts_raised
 from restock.train.dqn.algorithm import Loss
-from restock.train.dqn.config import GIVEN
+from restock.train.dqn.config import GIVEN, Hard
 from restock.train.dqn.network import clone
-from restock.train.dqn.target import Hard
 from restock.train.evaluation.evaluate import (
     Score,
     score,
@@ -31,7 +30,7 @@ from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batch_record import LEAVE_OUT, TRAIN_SLOWER, refuse
 from restock.train.feed.batches import ReplayBatch
-from restock.train.feed.probe import Probe
+from restock.train.feed.logs import Probe
 from restock.train.feed.teacher import TeacherFailed
 from restock.train.feed.update_blocks import Made
 from restock.train.run.run import resuming

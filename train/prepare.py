@@ -22,17 +22,23 @@ from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
 from restock.train import loop
-from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
+from restock.train.dqn.config import (
+    GIVEN,
+    TrainConfig,
+    apply_overrides,
+    describe,
+    load_config,
+    parse_config,
+)
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.network import update_path
-from restock.train.dqn.target import describe
 from restock.train.evaluation.evaluate import evaluation_time_s
 from restock.train.evaluation.logged_ways import ways_to_evaluate
 from restock.train.feed.batch_record import STOPPED
 from restock.train.feed.collector import FreshStrata, conditions_in_twin
 from restock.train.feed.logs import Logs
+from restock.train.feed.practice import check_missions, make_twin
 from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher, refuse_nothing_to_learn
-from restock.train.feed.training_twin import check_missions, make_twin
 from restock.train.loop import Notify, TrainResult
 from restock.train.resolve import (
     check_new_run,

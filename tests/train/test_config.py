@@ -12,9 +12,8 @@ import pytest
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.train.dqn.config import TrainConfig, load_config, parse_config
-from restock.train.dqn.target import Hard, Polyak
-from restock.train.feed.training_twin import make_twin
+from restock.train.dqn.config import Hard, Polyak, TrainConfig, load_config, parse_config
+from restock.train.feed.practice import make_twin
 from restock.train.prepare import prepare_new
 
 

@@ -14,8 +14,15 @@ import pytest
 
 from restock.cli import main
 from restock.errors import RunError
-from restock.train.dqn.config import TeacherConfig, TrainConfig, apply_overrides, parse_config
-from restock.train.dqn.target import Hard, Polyak, TargetRule
+from restock.train.dqn.config import (
+    Hard,
+    Polyak,
+    TargetRule,
+    TeacherConfig,
+    TrainConfig,
+    apply_overrides,
+    parse_config,
+)
 from restock.train.judge.before_training import RowDiagnosis
 from restock.train.judge.causes import Finding
 from restock.train.judge.diagnose import confirm, diagnose, swapped

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.toy_run import config, run_to_end, session, tables
 from support.toy_twin import TASK
 
-from restock.train.feed.sampled_rows import NEVER, WAITING, EpisodeLabels
+from restock.train.feed.fresh_log import NEVER, WAITING, EpisodeLabels
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.session import Session
 

@@ -26,8 +26,13 @@ from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.collector import Collector, ring_conditions
-from restock.train.feed.flush_fresh import flush
-from restock.train.feed.fresh_log import FreshEpisode, FreshLog, episode_files, write_episodes
+from restock.train.feed.fresh_log import (
+    FreshEpisode,
+    FreshLog,
+    episode_files,
+    flush,
+    write_episodes,
+)
 from restock.train.run import checkpoint
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.perturbation import Schedule

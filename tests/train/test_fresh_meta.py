@@ -13,7 +13,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import label, primary
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.replay.sampling.ring import FreshRing
-from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
+from restock.train.libraries.mixed_feed import FreshMeta, InfoLabels
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.physics.episode import EpisodeSpec
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from restock.train.feed import interval_tables
-from restock.train.feed.interval_tables import GreedyRows, SourceRows, first_places
+from restock.train.feed import sampled_rows
+from restock.train.feed.sampled_rows import GreedyRows, SourceRows, first_places
 
 STRATA, CONDITIONS, ACTIONS = (
     ("easy", "rare", "unmet"),
@@ -34,7 +34,7 @@ def test_one_place_of_each_value_however_far_apart_they_are(values: list[int], f
 @settings(max_examples=40)
 @given(arrays(np.float64, st.integers(1, 40), elements=st.floats(0, 2**40)))
 def test_every_age_is_in_the_bucket_of_its_power_of_two(age: np.ndarray) -> None:
-    columns = interval_tables.ages("days", age)
+    columns = sampled_rows.ages("days", age)
     assert sum(columns["count"]) == len(age)
     counted = zip(columns["bucket"].tolist(), columns["count"].tolist(), strict=True)
     for bucket, count in counted:
@@ -81,7 +81,7 @@ def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
 def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool) -> None:
     of = source(rows, seed, greedy=greedy)
-    strata = interval_tables.strata(of, np.array([rows, 0, 0]))
+    strata = sampled_rows.strata(of, np.array([rows, 0, 0]))
     weight = of.rows["weight"].astype(np.float64)
     for code in range(len(STRATA)):
         mine = of.stratum == code
@@ -99,7 +99,7 @@ def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool
             ("terminal_share", of.rows["discount"] == 0),
         ):
             assert strata[name][code] == pytest.approx(values[mine].mean(), abs=1e-6)
-    conditions = interval_tables.conditions(of)
+    conditions = sampled_rows.conditions(of)
     observed = Counter(CONDITIONS[code] for code in of.condition.tolist())
     assert dict(zip(conditions["condition"], conditions["drawn_rows"], strict=True)) == observed
 
@@ -108,7 +108,7 @@ def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool
 @given(st.integers(1, 80), st.integers(0, 99))
 def test_draws_of_an_episode_by_stratum_and_condition(rows: int, seed: int) -> None:
     of = source(rows, seed, greedy=False)
-    columns = interval_tables.sampled_episodes(of)
+    columns = sampled_rows.sampled_episodes(of)
     cells = zip(columns["episode"], columns["stratum"], columns["condition"], strict=True)
     found = dict(zip(cells, columns["drawn_rows"].tolist(), strict=True))
     counted: Counter[tuple[str, str, str]] = Counter(
@@ -123,7 +123,7 @@ def test_draws_of_an_episode_by_stratum_and_condition(rows: int, seed: int) -> N
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
 def test_every_action_has_a_row_even_if_never_drawn(rows: int, seed: int, greedy: bool) -> None:
     of = source(rows, seed, greedy=greedy)
-    columns = interval_tables.actions(of, ACTIONS)
+    columns = sampled_rows.actions(of, ACTIONS)
     cells = list(zip(columns["stratum"], columns["condition"], columns["name"], strict=True))
     observed = {(int(s), int(c)) for s, c in zip(of.stratum, of.condition, strict=True)}
     assert cells == [

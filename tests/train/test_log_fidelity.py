@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from restock.train.feed.probe import LogFidelity, Probe, discriminant
+from restock.train.feed.logs import LogFidelity, Probe, discriminant
 
 SIZE, ROWS = 12, 200
 CONDITIONS = ["nominal", "wheel_slip", "blocked_aisle"]

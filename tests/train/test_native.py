@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from restock import native
-from restock.train.dqn.flat_adam import FlatParameters
-from restock.train.dqn.network import Kernel, QNetwork, clone, update_path
+from restock.train.dqn.network import FlatParameters, Kernel, QNetwork, clone, update_path
 
 compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
 OBSERVATION, ACTIONS = 7, 4

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from restock.train.dqn.target import Hard, Polyak, TargetUpdate, describe, value_lag
+from restock.train.dqn.config import Hard, Polyak, describe
+from restock.train.dqn.learner import TargetUpdate, value_lag
 
 
 class One(nn.Module):

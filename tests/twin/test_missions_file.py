@@ -13,7 +13,7 @@ from restock.cli import main
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
 from restock.train.dqn.config import parse_config
-from restock.train.feed.training_twin import make_twin
+from restock.train.feed.practice import make_twin
 from restock.train.judge.comparability import kind_of
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionOrders

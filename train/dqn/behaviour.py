@@ -21,8 +21,15 @@ from restock.replay.mixture.mixture import value_at
 from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import TeacherConfig, TrainConfig
-from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
-from restock.train.dqn.network import QNetwork, UpdatePath, clone, differentiable
+from restock.train.dqn.network import (
+    FlatAdam,
+    FlatParameters,
+    QNetwork,
+    UpdatePath,
+    averaging_rate,
+    clone,
+    differentiable,
+)
 
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
 _SEED = 1 << 32  # apart from that of Q, which may be as large

@@ -21,7 +21,6 @@ from restock.renamed import TRAINING_KEYS
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.replay.mixture.mixture import Portion
 from restock.toml import Checked, changed, read_toml, toml_value, typed
-from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import LinearEpsilon
 from restock.train.twin.missions import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
@@ -59,6 +58,49 @@ class LossConfig(Checked, frozen=True):
     margin_size: NonNegative = 0.8  # the margin: how much better their action must be
     margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin
     margin_strata: tuple[str, ...] = ()  # only in these strata of the logs; empty: all
+
+
+class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
+    """Copy the online network at every `every`-th update (arXiv:1312.5602)."""
+
+    every: Annotated[int, Meta(ge=1)] = 1000
+
+    @property
+    def effective_lag(self) -> float:
+        """The mean age of the target in updates: C / 2."""
+        return self.every / 2
+
+    def syncs_at(self, gradient_step: int) -> bool:
+        """Return whether the target is copied after update number `gradient_step` (from 1)."""
+        return gradient_step % self.every == 0
+
+    def __str__(self) -> str:
+        return f"hard every {self.every}"
+
+
+class Polyak(Checked, frozen=True, tag_field="rule", tag="polyak"):
+    """target += tau * (online - target), after every update (arXiv:1509.02971)."""
+
+    tau: Annotated[float, Meta(gt=0, le=1)] = 0.005
+
+    @property
+    def effective_lag(self) -> float:
+        """The mean age of what the target holds, in updates: 1 / tau."""
+        return 1 / self.tau
+
+    def syncs_at(self, gradient_step: int) -> bool:
+        return True
+
+    def __str__(self) -> str:
+        return f"polyak tau {self.tau:g}"
+
+
+TargetRule = Hard | Polyak
+
+
+def describe(rule: TargetRule) -> dict[str, Any]:
+    """Return the rule as the run's config states it."""
+    return {**msgspec.to_builtins(rule), "effective_lag_updates": rule.effective_lag}
 
 
 class OptimizerConfig(Checked, frozen=True):

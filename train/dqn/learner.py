@@ -1,8 +1,13 @@
-"""One update: a batch of packed rows to a loss, a step of Adam, a tick of the target's clock."""
+"""One update: a batch of packed rows to a loss, a step of Adam, a tick of the target's clock.
+
+Two clocks run in DQN: the online network moves at every update, the target network by its own
+rule. The rule decides how old the values are that the critic learns from, so it is a typed value
+that the config, metrics and checkpoints of a run all carry.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,10 +20,16 @@ from restock.errors import ConfigError
 from restock.state import Stateful
 from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm
 from restock.train.dqn.behaviour import Behaviour, FilteredNetwork, Labelled, PolicyNetwork
-from restock.train.dqn.config import TrainConfig
-from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
-from restock.train.dqn.network import UpdatePath, clone, differentiable, update_path
-from restock.train.dqn.target import Polyak, TargetUpdate
+from restock.train.dqn.config import Polyak, TargetRule, TrainConfig
+from restock.train.dqn.network import (
+    FlatAdam,
+    FlatParameters,
+    UpdatePath,
+    averaging_rate,
+    clone,
+    differentiable,
+    update_path,
+)
 
 
 @dataclass(frozen=True)
@@ -229,6 +240,55 @@ class Learner(Stateful):
             self.behaviour.in_force = ratio  # the run's, not that of when the policy was kept
             self.behaviour.network.load_state_dict(self.behaviour.average.state_dict())
             self.behaviour.optimizer.forget()
+
+
+class TargetUpdate(Stateful):
+    """Applies a rule to the parameters of a pair of networks, in the same order."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("last_sync",)
+
+    def __init__(
+        self, rule: TargetRule, online: Iterable[torch.Tensor], target: Iterable[torch.Tensor]
+    ) -> None:
+        self.rule = rule
+        self.last_sync = 0  # the update after which the target last moved
+        self._online = list(online)
+        self._target = list(target)
+
+    @torch.no_grad()
+    def after(self, gradient_step: int) -> bool:
+        """Call after update number `gradient_step` (from 1); returns whether the target moved.
+
+        It does not again for an update that it has followed, as in `Learner.move`.
+        """
+        if gradient_step == self.last_sync or not self.rule.syncs_at(gradient_step):
+            return False
+        self.pull()
+        self.last_sync = gradient_step
+        return True
+
+    @torch.no_grad()
+    def pull(self) -> None:
+        """Move the target as the rule does when it is due."""
+        for slow, fast in zip(self._target, self._online, strict=True):
+            if isinstance(self.rule, Polyak):
+                slow.lerp_(fast, self.rule.tau)
+            else:
+                slow.copy_(fast)
+
+    @torch.no_grad()
+    def distance(self) -> float:
+        """|online - target| / |online|, over all parameters together (Euclidean)."""
+        apart = torch._foreach_norm(torch._foreach_sub(self._online, self._target))
+        size = torch._foreach_norm(self._online)
+        total = torch.stack(list(size)).norm()
+        return float(torch.stack(list(apart)).norm() / total.clamp_min(1e-12))
+
+
+@torch.no_grad()
+def value_lag(online_q: torch.Tensor, target_q: torch.Tensor) -> float:
+    """mean |Q - Q_target| / mean |Q| over values (B, A): how far apart the two clocks are."""
+    return float((online_q - target_q).abs().mean() / online_q.abs().mean().clamp_min(1e-12))
 
 
 def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

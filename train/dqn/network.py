@@ -1,4 +1,6 @@
-"""The Q network: observation to one value per action, and how it is differentiated.
+"""The Q network, how it is differentiated, and Adam over its parameters in one flat vector.
+
+Adam's step, the target's pull and the average of weights are each one operation over one tensor.
 
 A LayerNorm MLP. LayerNorm bounds how far values can extrapolate away from the data, which is what
 keeps off-policy learning on logs and fresh experience together stable (RLPD, arXiv:2302.02948).
@@ -10,14 +12,16 @@ whether there is one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Literal, Protocol, TypeVar
+from typing import ClassVar, Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from restock import native
+from restock.state import Stateful
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -198,3 +202,185 @@ class Kernel:
         if earlier is not None:
             self._gradient.add_(earlier)
         self._adds = True
+
+
+_ALIGNMENT = 16  # elements: every parameter begins on a cache line, as its own tensor would
+_SLICE = 4096  # elements that a GPU moves at a time: of one tensor, two blocks would move all
+
+
+class FlatParameters:
+    """The parameters of `network`, moved into `values`; their gradients are views of `gradient`.
+
+    `load_state_dict` and in-place writes go through the views. Whatever replaces a parameter's
+    `.data` (`Module.to`) must come before.
+
+    Args:
+        network: whose parameters are moved.
+        learns: whether they have gradients; else `gradient` is empty.
+    """
+
+    def __init__(self, network: nn.Module, *, learns: bool) -> None:
+        parameters = list(network.parameters())
+        self._shapes = [parameter.shape for parameter in parameters]
+        self._offsets, size = [], 0
+        for parameter in parameters:
+            self._offsets.append(size)
+            size += -(-parameter.numel() // _ALIGNMENT) * _ALIGNMENT
+        self.values = parameters[0].detach().new_zeros(size)
+        self.gradient = self.values.new_zeros(size if learns else 0)
+        for parameter, view in zip(parameters, self.views(self.values), strict=True):
+            view.copy_(parameter.detach())
+            parameter.data = view
+        if learns:
+            self.values.grad = self.gradient
+            for parameter, view in zip(parameters, self.views(self.gradient), strict=True):
+                parameter.grad = view
+
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """Return views of a tensor as long as `values`, one a parameter, in the network's order."""
+        return [
+            flat[offset : offset + shape.numel()].view(shape)
+            for offset, shape in zip(self._offsets, self._shapes, strict=True)
+        ]
+
+    def flat_of(self, pieces: list[Tensor]) -> Tensor:
+        """Return the inverse of `views`: a new tensor, 0 between parameters."""
+        flat = torch.zeros_like(self.values)
+        for view, piece in zip(self.views(flat), pieces, strict=True):
+            view.copy_(piece)
+        return flat
+
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
+_BETAS, _EPS = (0.9, 0.999), 1e-8  # Adam's
+
+
+def averaging_rate(rate: float, steps: int) -> float:
+    """Return the rate of an average of weights at step number `steps` (from 1).
+
+    The greedy policy of a single update is noisy: a small change of values turns over many
+    actions at once. The average over the last 1 / rate updates is not (Polyak and Juditsky 1992).
+    Until there are as many, it is the mean of all of them.
+    """
+    return max(rate, 1.0 / steps)
+
+
+class FlatAdam(Stateful):
+    """Adam on all parameters of `network` as one tensor.
+
+    By the function behind `torch.optim.Adam(fused=True)`, to the same bits: with one tensor a fifth
+    of the class's step goes into hooks, groups and schedules, of which there are none here.
+
+    Args:
+        network: whose parameters are moved into `values`, their gradients into `gradient`.
+        learning_rate: Adam's.
+        max_grad_norm: to which a longer gradient is cut; None: never.
+        compiled: by the compiled step, to the same bits: one pass over memory, the average's too.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("moments",)
+
+    def __init__(
+        self,
+        network: nn.Module,
+        learning_rate: float,
+        max_grad_norm: float | None = None,
+        *,
+        compiled: bool = False,
+    ) -> None:
+        self._flat = FlatParameters(network, learns=True)
+        self.values, self.gradient = self._flat.values, self._flat.gradient
+        self.learning_rate, self.max_grad_norm = learning_rate, max_grad_norm
+        self._compiled = compiled
+        # Written in place from here on: a CUDA graph keeps hold of them.
+        self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
+        # What `adam` moves, and counts in tensors: all as one, and on a GPU in slices.
+        device = self.values.device
+        size = len(self.values) if device.type == "cpu" else _SLICE
+        whole = (self.values, self.gradient, *self._moments)
+        self._moved = [list(torch.split(tensor, size)) for tensor in whole]
+        self._step = torch.zeros(len(self._moved[0]), device=device)
+        self._steps = 0
+
+    @torch.no_grad()
+    def step(self, average: Tensor | None = None, rate: float = 0.0) -> None:
+        """Move the parameters by the gradient that they have; then `average` to them, by `rate`."""
+        self.count(1)
+        if not self._compiled:
+            self.move(average, rate)
+            return
+        self._clip()
+        self._compiled_step(average, rate)
+
+    def count(self, steps: int) -> None:
+        """Count steps that were made by `move`."""
+        self._steps += steps
+
+    @torch.no_grad()
+    def move(self, average: Tensor | None, rate: float | Tensor) -> None:
+        """Step by operations on the device alone, which a CUDA graph can repeat."""
+        self._clip()
+        values, gradient, moved, squares = self._moved
+        adam(
+            *(values, gradient, moved, squares, [], list(self._step.unbind())),
+            fused=True,
+            amsgrad=False,
+            beta1=_BETAS[0],
+            beta2=_BETAS[1],
+            lr=self.learning_rate,
+            weight_decay=0.0,
+            eps=_EPS,
+            maximize=False,
+        )
+        if average is not None:
+            average.lerp_(self.values, rate)
+
+    def _clip(self) -> None:
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_([self.values], self.max_grad_norm)
+
+    def _compiled_step(self, average: Tensor | None, rate: float) -> None:
+        self._step.fill_(self._steps)
+        first, second = (1 - beta**self._steps for beta in _BETAS)
+        moved, squares = self._moments
+        native.compiled.adam(
+            self.values.detach().numpy(),
+            self.gradient.numpy(),
+            moved.numpy(),
+            squares.numpy(),
+            None if average is None else average.numpy(),
+            (*_BETAS, self.learning_rate / first, second**0.5, _EPS, rate),
+        )
+
+    def forget(self) -> None:
+        """Begin again without moments: the parameters were replaced."""
+        for tensor in (*self._moments, self._step):
+            tensor.zero_()
+        self._steps = 0
+
+    @property
+    def moved(self) -> list[Tensor]:
+        """Return all tensors that `move` changes, without the average."""
+        return [self.values, *self._moments, self._step]
+
+    @property
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        """Adam's moments a parameter, in the network's order, as if each were its own."""
+        if not self._steps:
+            return {}
+        moments = zip(*(self._flat.views(each) for each in self._moments), strict=True)
+        return {
+            str(index): {"step": self._step[0], **dict(zip(_MOMENTS, pair, strict=True))}
+            for index, pair in enumerate(moments)
+        }
+
+    @moments.setter
+    def moments(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
+        self.forget()
+        if not entries:
+            return
+        ordered = [entries[str(index)] for index in range(len(entries))]
+        self._step.copy_(ordered[0]["step"])
+        self._steps = int(self._step)
+        for moment, name in zip(self._moments, _MOMENTS, strict=True):
+            moment.copy_(self._flat.flat_of([entry[name] for entry in ordered]))

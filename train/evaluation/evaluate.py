@@ -27,11 +27,10 @@ from restock.ingest.task.limiter import NONE, STOP
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.sampling.ring import FreshRing
-from restock.train.dqn.learner import Learner
-from restock.train.dqn.target import value_lag
+from restock.train.dqn.learner import Learner, value_lag
 from restock.train.feed.collector import Collector
 from restock.train.feed.fresh_log import values_entries
-from restock.train.feed.probe import LogFidelity, Probe
+from restock.train.feed.logs import LogFidelity, Probe
 from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 

@@ -32,21 +32,20 @@ from restock.replay.mixture.share_controller import ShareController
 from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.algorithm import Loss
-from restock.train.feed import interval_tables
+from restock.train.feed import sampled_rows
 from restock.train.feed.batches import ReplayBatch
-from restock.train.feed.fresh_log import FreshPerturbations
-from restock.train.feed.interval_tables import GreedyRows, SourceRows
+from restock.train.feed.fresh_log import WAITING, EpisodeLabels, FreshPerturbations
 from restock.train.feed.logs import Logs
 from restock.train.feed.sampled_rows import (
     FRESH,
     GREEDY,
     LOGGED,
-    WAITING,
     BatchValues,
     Columns,
-    EpisodeLabels,
+    GreedyRows,
     HeldInterval,
     SampledRows,
+    SourceRows,
     add_names,
     fresh_audit,
     keep_rows,
@@ -285,7 +284,7 @@ class FeedRecord(Stateful):
         if interval.quotas is not None and self.quotas is not None:
             steps = {**interval.clocks, "phase": interval.phase}
             fresh = self._by_stratum(interval.rows["stratum"])
-            columns = interval_tables.fed(
+            columns = sampled_rows.fed(
                 self.quotas.names[: len(fresh) - 1], interval.quotas, fresh, interval.available
             )
             self.run.append_columns("fed", {**steps, **columns})
@@ -295,18 +294,18 @@ class FeedRecord(Stateful):
         total += np.bincount(source.stratum, minlength=len(total))
         of_phase = {**clocks, "phase": phase}
         tables: dict[str, tuple[Mapping[str, Any], Columns]] = {
-            "strata": (of_phase, interval_tables.strata(source, total.copy())),
-            "conditions": (of_phase, interval_tables.conditions(source)),
-            "sampled_episodes": (clocks, interval_tables.sampled_episodes(source)),
-            "policies": (clocks, interval_tables.policies(source)),
+            "strata": (of_phase, sampled_rows.strata(source, total.copy())),
+            "conditions": (of_phase, sampled_rows.conditions(source)),
+            "sampled_episodes": (clocks, sampled_rows.sampled_episodes(source)),
+            "policies": (clocks, sampled_rows.policies(source)),
         }
         if self.actions is not None:
-            rows = interval_tables.actions(source, self.actions)
+            rows = sampled_rows.actions(source, self.actions)
             tables["actions"] = of_phase, rows
         for name, (steps, columns) in tables.items():
             self.run.append_columns(name, {**steps, **columns})
         for unit, age in source.ages.items():
-            columns = {"source": source.name, **interval_tables.ages(unit, age)}
+            columns = {"source": source.name, **sampled_rows.ages(unit, age)}
             self.run.append_columns("ages", {**clocks, **columns})
 
     def _of_logs(self, logs: Logs) -> SourceRows:

@@ -36,8 +36,7 @@ from restock.replay.plan.strata import NOMINAL_PRIORITY, ResolvedStratum, assign
 from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful, saved
 from restock.train.dqn.behaviour import UNKNOWN
-from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries
-from restock.train.feed.sampled_rows import EpisodeLabels
+from restock.train.feed.fresh_log import EpisodeLabels, FreshLog, FreshPerturbations, values_entries
 from restock.train.feed.teacher import AskedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT

@@ -1,4 +1,4 @@
-"""Whole labelled episodes of the twin, kept to be put in a store like logs.
+"""Labelled episodes of the twin: labels that sampled rows wait for, and steps for a store.
 
 The ring keeps packed n-step rows and forgets the oldest. Here every labelled episode is kept in the
 run's directory, steps and signals, until `restock train --flush-fresh STORE` writes them as one
@@ -16,12 +16,30 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Bools
+from restock.arrays import F32, Bools, Ints
 from restock.state import Stateful, saved
 from restock.train.run import checkpoint
 
 if TYPE_CHECKING:
     from restock.train.feed.collector import EndedEpisode
+
+
+import hashlib
+import uuid
+
+import pyarrow as pa
+
+from restock.errors import RunError
+from restock.ingest.profile.profile import Profile
+from restock.ingest.store.episode_rows import EpisodeRows, label_table
+from restock.ingest.store.manifest import definitions, manifest_row, software_version
+from restock.ingest.store.transitions import Provenance, TransitionValues, transition_table
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import label, probabilities, reported, runnable
+from restock.ingest.task.label_scores import label_scores
+from restock.ingest.task.perturbation_columns import Perturbed
+from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
+from restock.train.run.run import now_ns
 
 _STEP = ("action", "probability", "reward", "progress_m", "truth", "exposure")
 _KINDS = {"action": "i2", "truth": "<U64", "exposure": "<U64"}
@@ -175,6 +193,63 @@ def read_episodes(folder: Path) -> list[FreshEpisode]:
 Entries = list[tuple[str, float]]
 
 
+WAITING, NEVER = -1, -2  # codes of a row without a condition: its episode goes on; it is not known
+
+
+class EpisodeLabels(Stateful):
+    """Conditions and strata of ended episodes since the last `clear`, by the ring's key."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("_keys", "_codes", "_given_up")
+
+    def __init__(self) -> None:
+        self._keys: list[int] = []
+        self._codes: list[NDArray[np.int16]] = []  # (2, T) of each: conditions and strata
+        self._given_up: list[int] = []  # keys
+
+    def note(self, key: int, codes: NDArray[Any], strata: NDArray[Any] | None = None) -> None:
+        """Keep the labels of ended episode `key`.
+
+        `codes[t]` (T,) is the condition of its step t, `strata[t]` its stratum; None: as the
+        condition.
+        """
+        self._keys.append(int(key))
+        both = (codes, codes if strata is None else strata)
+        self._codes.append(np.asarray(np.stack(both), np.int16))
+
+    def give_up(self, key: int) -> None:
+        """Mark episode `key` as one that will never have labels."""
+        self._given_up.append(int(key))
+
+    def clear(self) -> None:
+        """Forget the labels: rows that are drawn from now on have them."""
+        self._keys, self._codes = [], []
+
+    def restored(self) -> None:
+        self._codes = [np.asarray(codes, np.int16) for codes in self._codes]
+
+    def fill(
+        self, condition: NDArray[Any], stratum: NDArray[Any], key: Ints, step: NDArray[Any]
+    ) -> None:
+        """Fill in conditions and strata of WAITING rows (n,) that have labels by now."""
+        waiting = np.flatnonzero(condition == WAITING)
+        if self._given_up:
+            lost = np.isin(key[waiting], self._given_up)
+            condition[waiting[lost]] = NEVER
+            waiting = waiting[~lost]
+        if not len(waiting) or not self._keys:
+            return
+        order = np.argsort(self._keys)
+        keys = np.array(self._keys, np.int64)[order]
+        codes = [self._codes[at] for at in order.tolist()]
+        lengths = np.array([of_episode.shape[1] for of_episode in codes])
+        begins, flat = np.cumsum(lengths) - lengths, np.concatenate(codes, axis=1)
+        place = np.minimum(np.searchsorted(keys, key[waiting]), len(keys) - 1)
+        at = step[waiting].astype(np.int64)
+        known = (keys[place] == key[waiting]) & (at < lengths[place])
+        found = flat[:, begins[place[known]] + at[known]]
+        condition[waiting[known]], stratum[waiting[known]] = found
+
+
 class FreshPerturbations(Stateful):
     """Names and values by the ring's key of an episode, for the audit of sampled rows."""
 
@@ -211,3 +286,164 @@ class FreshPerturbations(Stateful):
 def values_entries(values: str) -> Entries:
     """Return a JSON object of numbers as the entries of a map column."""
     return [(field, float(value)) for field, value in json.loads(values).items()]
+
+
+FORMAT = "twin"
+AGENT = "dqn"  # who drove
+_MOVED = ("stamp_ns", "pose_stamp_ns")  # episodes begin at 0: laid out one after the other
+
+
+@dataclass(frozen=True)
+class Flushed:
+    """What a flush put in a store."""
+
+    recording_id: str
+    status: str  # written | unchanged
+    episodes: int
+    transitions: int
+    version: int | None  # of the store's transitions, if they were written
+
+
+def flush(run: Path, store: StoreWriter, profile: Profile, dropped_steps: int = 0) -> Flushed:
+    """Write the episodes that a run kept in its folder `fresh` as one recording.
+
+    Its id is a hash of what is in it: the same episodes are there once, however often they are
+    flushed, and a run that collected more since is another recording.
+
+    Raises:
+        RunError: the run kept no episode.
+        StoreError: the store cannot be written.
+    """
+    episodes = read_episodes(run / "fresh")
+    if not episodes:
+        raise RunError(
+            "kept no finished episode to flush",
+            where=str(run),
+            remedy="give --flush-fresh when the run starts: episodes are kept only from then on",
+        )
+    recording_id = _content_id(episodes)
+    count = sum(episode.count for episode in episodes)
+    for row in store.live(recording_id).to_pylist():
+        if all(row[name] == value for name, value in definitions(profile).items()):
+            return Flushed(recording_id, "unchanged", len(episodes), count, None)
+    provenance = Provenance(recording_id, uuid.uuid4().hex[:16], str(run), software_version())
+    rows = _lay_out(episodes, profile)
+    values = _values(rows, episodes, profile, run.name)
+    table = transition_table(profile, rows, values, provenance)
+    manifest = _manifest(rows, table, profile, provenance, dropped_steps)
+    version = store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
+    return Flushed(recording_id, "written", len(episodes), len(table), version)
+
+
+def _content_id(episodes: Sequence[FreshEpisode]) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for episode in episodes:
+        for name in ("observation", "action", "reward", "probability"):
+            digest.update(np.ascontiguousarray(getattr(episode, name)).tobytes())
+        for name in sorted(episode.signals):
+            digest.update(np.ascontiguousarray(episode.signals[name]).tobytes())
+    return digest.hexdigest()
+
+
+def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
+    """Lay all steps one after the other, as if one robot had driven the episodes in turn."""
+    lengths = np.array([episode.count + 1 for episode in episodes], np.int64)
+    first = np.concatenate([[0], np.cumsum(lengths)])[:-1].astype(np.int64)
+    tick = np.arange(lengths.sum(), dtype=np.int64)
+    step = tick - np.repeat(first, lengths)
+    signals = {
+        column.name: np.concatenate([episode.signals[column.name] for episode in episodes])
+        for column in SIGNAL_COLUMNS
+    }
+    period_ns = round(profile.task.control_period_s * 1e9)
+    for name in _MOVED:
+        signals[name] = signals[name] + np.repeat(first, lengths) * period_ns
+    labels = {
+        name: np.concatenate([episode.labels[name] for episode in episodes])
+        for name in episodes[0].labels
+    }
+    number = np.repeat(np.arange(len(episodes), dtype=np.int64), lengths)
+    is_end = step == np.repeat(lengths, lengths) - 1
+    evaluated = [condition for condition in profile.conditions if condition.name in labels]
+    steps = label_table(signals, number, step, pa.table({}))
+    probable = probabilities(steps, evaluated)
+    situations = reported(profile.exposures, lidar=profile.task.lidar)
+    exposures = label(steps, runnable(steps, situations))
+    return EpisodeRows(
+        tick, number, step, is_end, signals, labels, pa.table({}), probable, exposures
+    )
+
+
+def _values(
+    rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile, run: str
+) -> TransitionValues:
+    """Collect the values that were kept of each step, end to end."""
+    begin = rows.starts
+    number = rows.episode[begin]
+    version = [f"{run}@{episode.version}" for episode in episodes]
+
+    def each(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(episode, name) for episode in episodes])
+
+    return TransitionValues(
+        observation=each("observation"),
+        action=each("action"),
+        reward=each("reward"),
+        progress_m=each("progress_m"),
+        residual=np.zeros(len(begin)),  # the action is the command
+        terminates=np.array([episode.terminated for episode in episodes])[number],
+        zone=_zones(rows, episodes, profile)[begin].tolist(),
+        truth=each("truth").tolist(),
+        true_exposure=[reported or None for reported in each("exposure").tolist()],
+        policy=[AGENT] * len(number),
+        policy_version=[version[episode] for episode in number],
+        probability=each("probability"),
+        perturbation=_perturbed(episodes).columns(number),
+        goal_source="logged" if profile.goal_source else None,  # the twin orders its goals
+    )
+
+
+def _zones(
+    rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile
+) -> NDArray[np.object_]:
+    """Return the zone of every step: the profile's on the floor it describes, else the layout's."""
+    names = profile.zone_of(rows.signals["pose_x_m"], rows.signals["pose_y_m"])
+    zones = np.array(names, object)
+    for number, episode in enumerate(episodes):
+        if episode.zones is not None:
+            zones[rows.episode == number] = episode.zones
+    return zones
+
+
+def _perturbed(episodes: Sequence[FreshEpisode]) -> Perturbed:
+    """Return the perturbation of each episode."""
+    known = [
+        (episode.perturbation, json.loads(episode.perturbation_values)) for episode in episodes
+    ]
+    return Perturbed(known, np.arange(len(known), dtype=np.int64))
+
+
+def _manifest(
+    rows: EpisodeRows, table: pa.Table, profile: Profile, provenance: Provenance, dropped_steps: int
+) -> dict[str, Any]:
+    """Make the row of `recordings`, with log times such that the last step was just now."""
+    stamps = rows.signals["stamp_ns"]
+    return manifest_row(
+        profile,
+        provenance,
+        table,
+        label_scores(table, rows.labels, profile.task.control_period_s),
+        {"physics blew up": dropped_steps} if dropped_steps else {},
+        format=FORMAT,
+        integrity="verified",
+        duration_s=float(stamps[-1] - stamps[0]) * 1e-9,
+        start_stamp_ns=int(stamps[0]),
+        end_stamp_ns=int(stamps[-1]),
+        clock="simulated",
+        clock_offset_ns=now_ns() - int(stamps[-1]),
+        clock_jumps=0,
+        ticks=len(rows.tick) + dropped_steps,
+        steps=len(rows.tick),
+        episodes=int(rows.is_end.sum()),
+        episode_ends=int(rows.is_end.sum()),
+    )

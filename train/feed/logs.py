@@ -1,4 +1,21 @@
-"""The logged rows of a run, with the columns that the record and the loss terms need."""
+"""The logged rows of a run, and fixed rows of each condition to measure critic and labels on.
+
+`Probe` holds a few rows per condition, fixed for the whole run. Batches change with the policy and
+the mixture; the probe does not. So TD error by condition and the distance between the two networks'
+values can be compared over a run and between runs, as long as their probe hashes agree.
+
+`LogFidelity` checks whether logged rows are what their labels say, and follow from one another. A
+critic's errors do not show every fault of its replay: rows whose labels are wrong, or whose next
+observations are not what followed, may be memorised like any others. Two measures of each condition
+of the logs do:
+
+- *agreement*: how many of its rows a linear discriminant (Fisher 1936), trained on the conditions
+  and observations of fresh steps, assigns to it. Those of the evaluation and those of the ring
+  count, because the evaluation of a good policy may show few steps of a rare condition;
+- *unexplained*: how much of the variance of its next observations a linear model of observation
+  and action, fitted on half of the logs' rows, leaves unexplained on the other half. Above 1, the
+  mean would be a better guess.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +37,16 @@ from restock.train.dqn.config import LossConfig
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
+
+
+import hashlib
+from itertools import pairwise
+from typing import Any
+
+from restock.arrays import F64, splitmix64
+from restock.replay.sampling.packed_rows import GOLDEN
+from restock.replay.sampling.ring import FreshRing
+from restock.train.dqn.learner import Learner, value_lag
 
 _UNPLANNED = PlannedDraws()
 _IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped
@@ -225,3 +252,174 @@ def _known(key: str, names: tuple[str, ...], known: list[str]) -> None:
                 f"{key}: the logs have no {name!r}",
                 remedy=f"choose from what they have: {', '.join(dict.fromkeys(known))}",
             )
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Rows (n, W) float32, sorted by condition; `bounds[c]:bounds[c + 1]` are condition c's."""
+
+    rows: Tensor
+    conditions: list[str]
+    bounds: list[int]
+    source: str  # logs | fresh
+    hash: str  # 16 hex digits of the rows
+
+    @classmethod
+    def of_logs(cls, logs: Logs, per_condition: int) -> Probe | None:
+        """Choose the rows of each condition whose hashed transition ids come first."""
+        codes, names = logs.condition.codes, logs.condition.names
+        return cls._choose(codes, names, logs.transition_id, per_condition, logs.rows, "logs")
+
+    @classmethod
+    def of_ring(cls, ring: FreshRing, per_condition: int) -> Probe | None:
+        """Without logs: labelled rows of the ring, copied, so that they stay when it moves on."""
+        count = len(ring)
+        codes = ring.by_condition.stratum[:count].astype(np.int32)
+        key = (ring.meta["episode"][:count] << 20) | ring.meta["episode_step"][:count]
+        rows = torch.from_numpy(ring.rows[:count])
+        return cls._choose(codes, list(ring.conditions), key, per_condition, rows, "fresh")
+
+    @classmethod
+    def _choose(
+        cls,
+        codes: NDArray[Any],
+        names: list[str],
+        key: NDArray[np.int64],
+        per_condition: int,
+        rows: Tensor,
+        source: str,
+    ) -> Probe | None:
+        chosen: list[NDArray[np.int64]] = []
+        kept, bounds = [], [0]
+        for code, name in enumerate(names):
+            members = np.flatnonzero(codes == code)
+            if not len(members) or not per_condition:
+                continue
+            order = np.argsort(_scramble(key[members]), kind="stable")[:per_condition]
+            chosen.append(members[order])
+            kept.append(name)
+            bounds.append(bounds[-1] + len(order))
+        if not chosen:
+            return None
+        picked = rows[torch.from_numpy(np.concatenate(chosen))].clone()
+        digest = hashlib.blake2b(picked.numpy().tobytes(), digest_size=8).hexdigest()
+        return cls(picked, kept, bounds, source, digest)
+
+    def measure(self, learner: Learner) -> tuple[list[dict[str, Any]], float]:
+        """Rows for the run's `probe`, per condition, and the lag over all of it."""
+        td, q, slow = learner.td_error(self.rows.to(learner.device))
+        action = self.rows[:, -3].long().to(learner.device)
+        chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
+        rows = []
+        for index, name in enumerate(self.conditions):
+            part = slice(self.bounds[index], self.bounds[index + 1])
+            rows.append(
+                {
+                    "source": self.source,
+                    "condition": name,
+                    "rows": part.stop - part.start,
+                    "td_abs_mean": float(td[part].abs().mean()),
+                    "q_mean": float(chosen[part].mean()),
+                    "q_lag": value_lag(q[part], slow[part]),
+                    "probe_hash": self.hash,
+                }
+            )
+        return rows, value_lag(q, slow)
+
+
+def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Mix ids (splitmix64), so that the choice depends on ids, not on order."""
+    return splitmix64(key.astype(np.uint64) + np.uint64(GOLDEN))
+
+
+ROWS = 512  # of each condition, chosen by hash
+_MIN_ROWS = 50  # of a condition, to count
+_SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean
+_RIDGE = 1.0  # on standardised features
+
+
+class LogFidelity:
+    """Rows of each condition of a run's logs.
+
+    `unexplained` holds a condition's share of variance, >= 0; conditions of few rows are left out.
+    """
+
+    def __init__(self, rows: Probe, observation_size: int) -> None:
+        self._names, self._bounds = rows.conditions, rows.bounds
+        packed = np.asarray(rows.rows.numpy(), np.float64)
+        self._observation = packed[:, :observation_size]
+        self.unexplained = self._unexplained(
+            packed[:, observation_size : 2 * observation_size], packed[:, 2 * observation_size]
+        )
+
+    @classmethod
+    def of(cls, logs: Logs, observation_size: int) -> LogFidelity | None:
+        """Make it from a run's logs; None if they have no row."""
+        rows = Probe.of_logs(logs, ROWS)
+        return cls(rows, observation_size) if rows is not None else None
+
+    def agreement(self, *fresh: Probe) -> dict[str, float]:
+        """Return the share of each condition's rows that fresh steps of known condition confirm."""
+        size = self._observation.shape[1]
+        steps: dict[str, list[F64]] = {}
+        for probe in fresh:
+            observation = np.asarray(probe.rows.numpy(), np.float64)[:, :size]
+            for name, (begin, end) in zip(probe.conditions, pairwise(probe.bounds), strict=True):
+                steps.setdefault(name, []).append(observation[begin:end])
+        every = {name: np.concatenate(parts) for name, parts in sorted(steps.items())}
+        names = [name for name, rows in every.items() if len(rows) >= _MIN_ROWS]
+        if len(names) < 2:
+            return {}
+        parts = [every[name] for name in names]
+        predicted = discriminant(parts, self._observation)
+        return {
+            name: float(np.mean(predicted[part] == names.index(name)))
+            for name, part in self._parts()
+            if name in names
+        }
+
+    def _unexplained(self, next_observation: F64, action: F64) -> dict[str, float]:
+        """`next_observation` (n, D) are next observations, `action` (n,) indices."""
+        taken = np.eye(int(action.max()) + 1)[action.astype(np.int64)]
+        features = _standard(np.concatenate([self._observation, taken], axis=1))
+        features = np.concatenate([features, np.ones((len(features), 1))], axis=1)
+        target = _standard(next_observation)
+        fit = np.arange(len(features)) % 2 == 0  # rows of a condition are in the order of a hash
+        x, y = features[fit], target[fit]
+        weights = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ y)
+        error = (target - features @ weights) ** 2
+        shares = {}
+        for name, part in self._parts():
+            tested = np.arange(part.start, part.stop)
+            tested = tested[~fit[part]]
+            spread = ((target[tested] - target[tested].mean(axis=0)) ** 2).sum()
+            if spread > 0:
+                shares[name] = float(error[tested].sum() / spread)
+        return shares
+
+    def _parts(self) -> list[tuple[str, slice]]:
+        return [
+            (name, slice(self._bounds[index], self._bounds[index + 1]))
+            for index, name in enumerate(self._names)
+            if self._bounds[index + 1] - self._bounds[index] >= _MIN_ROWS
+        ]
+
+
+def discriminant(classes: list[F64], rows: F64) -> NDArray[np.int64]:
+    """Return the most likely class of each of `rows` (m, D), (m,), with equal priors.
+
+    `classes` are rows (n_k, D) of each; their covariance is taken to be the same.
+    """
+    means = np.stack([part.mean(axis=0) for part in classes])
+    within = [np.cov(part, rowvar=False) for part in classes]
+    covariance = np.mean(within, axis=0)
+    covariance = (1 - _SHRINKAGE) * covariance
+    covariance += _SHRINKAGE * np.eye(len(covariance)) * np.trace(covariance) / len(covariance)
+    direction = np.linalg.solve(covariance, means.T)  # (D, K)
+    score = rows @ direction - 0.5 * np.einsum("kd,dk->k", means, direction)
+    return np.asarray(score.argmax(axis=1), np.int64)
+
+
+def _standard(values: F64) -> F64:
+    spread = values.std(axis=0)
+    return np.asarray((values - values.mean(axis=0)) / np.where(spread > 1e-9, spread, 1.0))

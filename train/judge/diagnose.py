@@ -23,8 +23,7 @@ from typing import Any
 import msgspec
 
 from restock.errors import RestockError, RunError, expect
-from restock.train.dqn.config import apply_overrides, as_overrides, parse_config
-from restock.train.dqn.target import Polyak, TargetRule
+from restock.train.dqn.config import Polyak, TargetRule, apply_overrides, as_overrides, parse_config
 from restock.train.judge.before_training import RowDiagnosis, diagnose_before_training
 from restock.train.judge.comparability import refuse_dependent
 from restock.train.judge.windows import (

@@ -9,7 +9,7 @@ A window is one evaluation with the batches before it. Its figures, of a conditi
 
 A network that generalises, or memorises few rows, hides what is wrong with its replay from
 all of these. So three figures look at the rows, not at the critic
-(`restock.train.feed.probe`): how much of replay a condition is, beside how often it is met;
+(`restock.train.feed.logs`): how much of replay a condition is, beside how often it is met;
 how many of its logged rows look like it; and whether their next observations follow from them.
 And a condition may be well supplied, and an action of it not (`action_coverage`): neither logs nor
 fresh rows say what it leads to, and the policy wants it.

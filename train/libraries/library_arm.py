@@ -26,9 +26,8 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.interrupts import kill_as_interrupt
 from restock.train.dqn.algorithm import make_network
-from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
+from restock.train.dqn.config import Hard, NetworkConfig, TrainConfig, describe, load_config
 from restock.train.dqn.network import QNetwork
-from restock.train.dqn.target import Hard, describe
 from restock.train.evaluation.evaluate import (
     Score,
     fixed_episodes,
@@ -36,7 +35,7 @@ from restock.train.evaluation.evaluate import (
     score,
 )
 from restock.train.evaluation.policies import GreedyPolicy, save_agent
-from restock.train.feed.training_twin import make_twin
+from restock.train.feed.practice import make_twin
 from restock.train.libraries.mixed_feed import create_run
 from restock.train.resolve import resolve_config
 from restock.train.run.run import Run

@@ -24,10 +24,9 @@ from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig
 from restock.train.feed.batch_record import check_kept
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.feed.training_twin import mission_orders
-from restock.train.libraries.fresh_meta import InfoLabels
+from restock.train.feed.practice import mission_orders
 from restock.train.libraries.library_arm import Evaluations, as_network
-from restock.train.libraries.mixed_feed import PartialTables, episode_row
+from restock.train.libraries.mixed_feed import InfoLabels, PartialTables, episode_row
 from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
 from restock.train.run.run import Run
 from restock.train.twin.physics.perturbation import find_perturbation

@@ -18,7 +18,7 @@ from restock.words import quoted
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
     from restock.train.dqn.config import TeacherConfig, TrainConfig
-    from restock.train.feed.flush_fresh import Flushed
+    from restock.train.feed.fresh_log import Flushed
     from restock.train.loop import TrainResult
     from restock.train.prepare import Prepared
 
@@ -121,7 +121,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
     from restock.interrupts import went_on_after_interrupt
-    from restock.train.feed.flush_fresh import flush
+    from restock.train.feed.fresh_log import flush
     from restock.train.loop import TrainingInterrupted, nothing_to_do, train
     from restock.train.run.run import resuming
 
