@@ -18,7 +18,7 @@ import numpy as np
 
 from restock.errors import StoreError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.evidence.roles import KINDS, usable_topics
+from restock.ingest.propose.roles import KINDS, usable_topics
 from restock.replay import Store
 from restock.stats import interval_text, wilson
 

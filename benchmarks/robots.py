@@ -35,7 +35,7 @@ from restock.cli import main as restock
 from restock.files import read_json, write_text
 from restock.ingest import open_recording
 from restock.ingest.containers.open_recording import with_definitions
-from restock.ingest.propose.kinds import robot_kinds, robot_traits
+from restock.ingest.propose.drives import robot_kinds, robot_traits
 from restock.replay import Store
 from restock.stats import interval_text
 

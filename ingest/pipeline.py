@@ -24,6 +24,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
+from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import RecordingTags, resolve_tags
 from restock.ingest.steps.episodes import split, why_none
@@ -44,7 +45,6 @@ from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
-from restock.ingest.urdf.description import BASE_FRAMES
 from restock.interrupts import interrupts_raised
 from restock.words import counted
 

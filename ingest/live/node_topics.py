@@ -14,9 +14,9 @@ from typing import Any
 import msgspec
 
 from restock.errors import ConfigError
-from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import Input, is_motion
 from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.tables import CustomSignal
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.limiter import RULES
 

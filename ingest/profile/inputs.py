@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 from msgspec import Meta
 
 from restock.errors import ConfigError
-from restock.ingest.profile.signal_paths import PathProblem, pressed_paths
+from restock.ingest.profile.signal_paths import PathProblem, last_part, pressed_paths
 from restock.toml import Checked
 
 COMMAND_SOURCES = "command_sources"
@@ -83,11 +82,6 @@ _APPLIES_TO = {
     **dict.fromkeys(SCAN_SETTINGS, _SCAN),
     **dict.fromkeys(FIX_SETTINGS, _FIX),
 }
-
-
-def last_part(kind: str) -> str:
-    """Return a message type without package and namespace: "Twist" of `ros.geometry_msgs.Twist`."""
-    return re.split(r"[/.:]", kind)[-1]
 
 
 def is_motion(kind: str) -> bool:

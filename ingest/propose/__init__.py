@@ -1,1 +1,1 @@
-"""A first profile for an unknown robot."""
+"""Propose a first profile for an unknown robot, from what its recordings show."""

@@ -5,10 +5,17 @@ gap through which the robot drove on. What is the robot's is put together from a
 the clocks that the drives propose the one is taken that makes rows of most of their time, all
 together. Drives of another kind of robot are left out, and named. The kind of every recording is
 looked at, in a few of its topics; of many drives of one kind, the proposal reads the largest.
+
+Recordings tell themselves which are of one kind, never their file or folder. Two that both have a
+lidar, or both a robot's description, or both odometry, are of one kind only if these agree. And
+something must tell one robot from the next: lidar or description. Recordings with neither are of
+one kind if they have the same command, pose and odometry, and at least half of their topics in
+common. What fits two kinds that differ is of neither.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +25,20 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.evidence.clock_choice import drivable
-from restock.ingest.propose.evidence.commands import (
+from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.decoding.columns import Ragged
+from restock.ingest.profile.description import read_description
+from restock.ingest.profile.inputs import is_motion
+from restock.ingest.propose.clock_choice import drivable
+from restock.ingest.propose.commands import (
     CommandHold,
     Commands,
     commanded,
     limit_of,
     settled_at_most,
 )
-from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.gather import Evidence, GoalChoice, gather
-from restock.ingest.propose.evidence.robot_choice import DriveEvidence
-from restock.ingest.propose.kinds import RobotTraits, robot_kinds, robot_traits
+from restock.ingest.propose.footprint import Footprint, descriptions
+from restock.ingest.propose.gather import Evidence, GoalChoice, gather
 from restock.ingest.propose.proposal_lines import profile_lines
 from restock.ingest.propose.propose import (
     Proposal,
@@ -38,7 +47,11 @@ from restock.ingest.propose.propose import (
     propose_profile,
     tried,
 )
+from restock.ingest.propose.robot_choice import DriveEvidence
+from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.propose.trial import Advice, Trial
+from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.frames import FRAME_IDS, frame_id_path, plain
 
 MAX_DRIVES = 12  # of one kind, that a proposal reads
 MAX_NAMED = 5  # of those that it does not read, in a profile's first lines
@@ -361,3 +374,148 @@ def _left_out(others: Sequence[tuple[Path, RobotTraits]]) -> list[Advice]:
 
 
 __all__ = ["Drives", "drives_by_kind", "names_of", "pooled", "propose_for_drives"]
+
+
+SCANS = 40  # of a recording that are looked at
+BEAMS = 0.1  # of the beams, by which scans of one lidar may differ: some turn at their own pace
+RANGE = 0.01
+SIMULATED_NS = 10**8 * 10**9  # stamps before 1973 are of a simulation, which begins at 0
+SHARED = 0.5  # of all topics
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A lidar, as its scans describe it."""
+
+    frame: str
+    beams: int
+    range_max_m: float  # 0: they do not say
+    simulated: bool  # by their stamps
+
+    def agrees(self, other: Lidar) -> bool:
+        most = max(self.beams, other.beams, 1)
+        longest = max(self.range_max_m, other.range_max_m)
+        return (
+            self.frame == other.frame
+            and abs(self.beams - other.beams) <= BEAMS * most
+            and (
+                self.range_max_m == other.range_max_m
+                or abs(self.range_max_m - other.range_max_m) <= RANGE * longest
+            )
+            and self.simulated == other.simulated
+        )
+
+    def __str__(self) -> str:
+        clock = ", simulated clock" if self.simulated else ""
+        reach = f", {self.range_max_m:g} m" if self.range_max_m else ""
+        return f"lidar {self.frame}, {self.beams} beams{reach}{clock}"
+
+
+@dataclass(frozen=True)
+class RobotTraits:
+    """The traits of a robot in one recording; None and "" if it does not show them."""
+
+    command: str  # type of the topic that drives it
+    frames: str  # of its odometry: "odom -> base_link"
+    lidar: Lidar | None
+    description: str  # a digest of it
+    named: str  # the robot's name in it
+    inputs: frozenset[tuple[str, str]]  # topics, with their types, that command and locate it
+    topics: frozenset[tuple[str, str]]  # all of them
+
+    def fits(self, other: RobotTraits) -> bool:
+        """Return whether both may be one kind of robot, and something shows that they are."""
+        for mine, its in (
+            (self.command, other.command),
+            (self.frames, other.frames),
+            (self.description, other.description),
+        ):
+            if mine and its and mine != its:
+                return False
+        if self.lidar and other.lidar and not self.lidar.agrees(other.lidar):
+            return False
+        if (self.lidar and other.lidar) or (self.description and other.description):
+            return True
+        if self.lidar or other.lidar or self.description or other.description:
+            return False
+        shared = len(self.topics & other.topics)
+        return self.inputs == other.inputs and shared >= SHARED * len(self.topics | other.topics)
+
+    def __str__(self) -> str:
+        reported = [
+            self.named and f"described as {self.named}",
+            str(self.lidar or ""),
+            self.frames,
+            self.command.split("/")[-1],
+        ]
+        topics = ", ".join(sorted(name for name, _ in self.inputs))
+        return "; ".join(filter(None, reported)) or topics or "nothing that describes a robot"
+
+
+def robot_traits(recording: Recording) -> RobotTraits:
+    """Read the traits of a recording's robot, from a few of its scans and poses."""
+    topics = usable_topics(recording)
+    roles = {
+        role: topics_for(recording, topics, KINDS[role]) for role in ("command", "pose", "wheels")
+    }
+    command = roles["command"][0][0].type if roles["command"] else ""
+    odometry = next((t for fits in roles.values() for t, _ in fits if is_motion(t.type)), None)
+    frames = ""
+    if odometry is not None:
+        leaves = recording.leaves(odometry.name)
+        paths = [path for path in (*FRAME_IDS, "child_frame_id") if path in leaves]
+        ends = recording.read({odometry.name: paths})[odometry.name].fields
+        frames = " -> ".join(plain(str(np.asarray(ends[path], object)[0])) for path in paths)
+    texts = [text for _, text in descriptions(recording)]
+    described = read_description(texts[0]) if texts else ""
+    return RobotTraits(
+        command,
+        frames,
+        _lidar(recording, topics_for(recording, topics, KINDS["scan"])[:1]),
+        hashlib.blake2b(texts[0].encode(), digest_size=8).hexdigest() if texts else "",
+        "" if isinstance(described, str) else described.name,
+        frozenset((t.name, t.type) for fits in roles.values() for t, _ in fits),
+        frozenset((name, topic.type) for name, topic in recording.topics.items() if topic.expected),
+    )
+
+
+def robot_kinds(traits: Sequence[RobotTraits]) -> list[list[int]]:
+    """Group the recordings by kind, as indices of `traits`; each is in exactly one kind.
+
+    Kinds are in the order of their first recording.
+    """
+    rich_first = sorted(range(len(traits)), key=lambda one: (-_known(traits[one]), one))
+    kinds: list[list[int]] = []
+    for index in rich_first:
+        fitting = [k for k in kinds if all(traits[index].fits(traits[other]) for other in k)]
+        if len(fitting) == 1:
+            fitting[0].append(index)
+        else:
+            kinds.append([index])
+    return sorted(sorted(kind) for kind in kinds)
+
+
+def _known(traits: RobotTraits) -> int:
+    reported = (traits.description, traits.lidar, traits.frames, traits.command)
+    return sum(bool(each) for each in reported)
+
+
+def _lidar(recording: Recording, best: Sequence[tuple[TopicInfo, Kind]]) -> Lidar | None:
+    if not best:
+        return None
+    name, path = best[0][0].name, best[0][1].fields["ranges_m"]
+    leaves = recording.leaves(name)
+    wanted = [one for one in (*FRAME_IDS, "range_max", STAMP) if one in leaves]
+    columns = recording.read({name: [path, *wanted]})[name]
+    if not len(columns):
+        return None
+    fields, some = columns.fields, slice(SCANS)
+    ranges, frame = fields[path], frame_id_path(fields)
+    assert isinstance(ranges, Ragged)
+    stamps = np.asarray(fields[STAMP], np.int64)[some] if STAMP in fields else np.zeros(0)
+    return Lidar(
+        "" if frame is None else plain(str(np.asarray(fields[frame], object)[0])),
+        int(np.median(ranges.lengths[some])),
+        round(float(np.median(np.asarray(fields.get("range_max", [0]), np.float64)[some])), 3),
+        bool(len(stamps)) and 0 < int(np.median(stamps)) < SIMULATED_NS,
+    )

@@ -8,25 +8,38 @@ each guess, and with all that might become custom signals, commented out.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.evidence.clock_choice import by_log_time
-from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
-from restock.ingest.propose.evidence.gather import Evidence, GoalChoice, gather, without_first
-from restock.ingest.propose.evidence.roles import (
+from restock.ingest.propose.clock_choice import by_log_time
+from restock.ingest.propose.commands import off_the_floor
+from restock.ingest.propose.footprint import UPSIDE_DOWN, Footprint
+from restock.ingest.propose.gather import Evidence, GoalChoice, gather, without_first
+from restock.ingest.propose.proposal_lines import (
+    in_one_recording,
+    lidar_guess,
+    profile_lines,
+    steered_by,
+)
+from restock.ingest.propose.roles import (
+    KINDS,
     REQUIRED,
+    Kind,
     clouds_alone,
     robots_in,
     several_commands,
+    topics_for,
+    usable_topics,
 )
-from restock.ingest.propose.kinds import no_wheeled_robot
-from restock.ingest.propose.proposal_lines import in_one_recording, profile_lines, steered_by
-from restock.ingest.propose.task_lines import lidar_guess
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
@@ -264,3 +277,78 @@ def tried(recording: Recording, toml: str) -> Trial:
         return try_profile(profile, read_topics(recording, profile))
     except (ConfigError, RecordingError) as error:
         return Trial(problem=error.what)
+
+
+DRONES = ("mavros_msgs/", "px4_msgs/", "mav_msgs/", "ardupilot_msgs/", "crazyflie_interfaces/")
+MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
+ARMS = ("trajectory_msgs/msg/JointTrajectory", "control_msgs/", "moveit_msgs/")
+CAMERAS = re.compile(r"sensor_msgs/msg/(Image|CompressedImage|CameraInfo|PointCloud2?)$")
+ALONGSIDE = re.compile(r"tf2_msgs/|rcl_interfaces/|rosgraph_msgs/|std_msgs/|diagnostic_msgs/")
+RISES_M = 0.5  # of a pose between its 5th and 95th percentile: no floor's
+ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its velocity commands"
+
+
+def no_wheeled_robot(
+    recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
+) -> str | None:
+    """Say what a recording is taken for that is not of a robot on wheels, and what to do.
+
+    Else None.
+
+    `command` are the topics that may drive it, `located` whether anything says where it is.
+    """
+    types = {topic.type for topic in recording.topics.values() if topic.expected}
+    flying = sorted({t.split("/")[0] for t in types if t.startswith(DRONES) or t == MULTI_DOF})
+    if not (command and located) and flying:
+        reported = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
+        return f"this looks like a drone's recording (it has {reported}): {ON_WHEELS}"
+    rises_m, lifted = _rises_m(recording), _lifted(recording, command)
+    if rises_m > RISES_M and (flying or lifted):
+        reported = "commands go up and down" if lifted else f"it has topics of {flying[0]}"
+        return (
+            f"this looks like a drone's recording (it rises by {rises_m:.1f} m, {reported}): "
+            f"{ON_WHEELS}"
+        )
+    if command:
+        off, requested = off_the_floor(recording, command[0])
+        if 2 * off <= requested:
+            return None
+        return (
+            f"this looks like a robot arm's or a drone's recording ({off:,} of the {requested:,} "
+            f"commands to move of {command[0][0].name} have linear.z, angular.x or angular.y): "
+            f"{ON_WHEELS}"
+        )
+    arm = sorted(t for t in types if t.startswith(ARMS))
+    if arm and not located:
+        reported = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
+        return f"this looks like a robot arm's recording ({reported}): {ON_WHEELS}"
+    rest = [t for t in types if not CAMERAS.search(t) and not ALONGSIDE.match(t)]
+    if types and not rest and any(CAMERAS.search(t) for t in types):
+        return (
+            "this looks like a recording of sensors alone (it has images or point clouds, but no "
+            "velocity command and no odometry): also record the command and a pose"
+        )
+    return None
+
+
+def _rises_m(recording: Recording) -> float:
+    """Return how far the poses of a recording go up and down; 0 if there are none."""
+    rises = [0.0]
+    for topic, kind in topics_for(recording, usable_topics(recording), KINDS["pose"]):
+        path = kind.fields.get("x_m", "").removesuffix("x") + "z"
+        if path in recording.leaves(topic.name):
+            heights = np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])
+            heights = heights[np.isfinite(heights)]
+            rises.append(float(np.ptp(np.percentile(heights, [5, 95]))) if len(heights) else 0.0)
+    return max(rises)
+
+
+def _lifted(recording: Recording, command: Sequence[tuple[TopicInfo, Kind]]) -> bool:
+    """Return whether the driving command asks for speed upward."""
+    if not command:
+        return False
+    topic, kind = command[0]
+    path = kind.fields["speed_mps"].removesuffix("x") + "z"
+    if not path.endswith("linear.z"):
+        return False
+    return bool(np.any(np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])))

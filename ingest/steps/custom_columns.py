@@ -15,9 +15,14 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
-from restock.ingest.profile.conventions import Convention, conventions_of, said_in
-from restock.ingest.profile.custom_signal import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
-from restock.ingest.profile.signal_paths import PathProblem, PathValues
+from restock.ingest.profile.signal_paths import (
+    Convention,
+    PathProblem,
+    PathValues,
+    conventions_of,
+    said_in,
+)
+from restock.ingest.profile.tables import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
 from restock.ingest.steps.align import LatestMessages
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.task.signals import yaw_of

@@ -17,10 +17,16 @@ from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.conventions import Convention, conventions_of, said_in
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.signal_paths import PathProblem, element_of, pressed_in
+from restock.ingest.profile.signal_paths import (
+    Convention,
+    PathProblem,
+    conventions_of,
+    element_of,
+    pressed_in,
+    said_in,
+)
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.fixes import FixedPoses, fixes_of
 from restock.ingest.steps.frames import Placement, frame_path, plain

@@ -15,10 +15,10 @@ from restock.ingest.camera.images import TYPES
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
-from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import SCANS, Input
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import element_of, offer, pressed_paths
+from restock.ingest.profile.tables import CustomSignal
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.clearance import scan_reduction

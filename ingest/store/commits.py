@@ -44,7 +44,7 @@ class TableCommits(StoreReader):
         Columns that newer software writes are added; rows from before hold null in them.
         """
         self.expect_folder()
-        from restock.ingest.profile.custom_signal import refuse_other_signals
+        from restock.ingest.profile.tables import refuse_other_signals
 
         def create() -> None:
             if not self.path.has_table(name):

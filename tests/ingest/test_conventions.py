@@ -16,8 +16,8 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.conventions import CONVENTIONS, conventions_of
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.profile.signal_paths import CONVENTIONS, conventions_of
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 

@@ -19,8 +19,8 @@ from support.ragged import nested, ragged
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError, StoreError
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
-from restock.ingest.profile.custom_signal import refuse_other_signals
 from restock.ingest.profile.profile import parse_profile
+from restock.ingest.profile.tables import refuse_other_signals
 from restock.ingest.steps.custom_columns import column_of
 from restock.ingest.steps.steps import Steps, steps_of
 

@@ -16,8 +16,14 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose import drives as drives_module
-from restock.ingest.propose.drives import drives_by_kind, propose_for_drives
-from restock.ingest.propose.kinds import Lidar, RobotTraits, robot_kinds, robot_traits
+from restock.ingest.propose.drives import (
+    Lidar,
+    RobotTraits,
+    drives_by_kind,
+    propose_for_drives,
+    robot_kinds,
+    robot_traits,
+)
 from restock.ingest.propose.propose import tried
 
 TWIST = "geometry_msgs/msg/Twist"

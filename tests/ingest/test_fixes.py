@@ -276,8 +276,8 @@ HUSKY = ROOT.parent / "shared" / "bags" / "ros1" / "husky_robot_localization.bag
 @pytest.mark.skipif(not HUSKY.exists(), reason="recordings of others are not there")
 def test_a_husky_drives_as_far_by_fixes_as_by_wheels():
     from restock.ingest.containers.open_recording import open_recording
-    from restock.ingest.propose.evidence.pose_choice import fixes_in
-    from restock.ingest.propose.evidence.roles import KINDS
+    from restock.ingest.propose.pose_choice import fixes_in
+    from restock.ingest.propose.roles import KINDS
 
     with open_recording(HUSKY) as recording:
         (name,) = [n for n, t in recording.topics.items() if t.type == FIX]

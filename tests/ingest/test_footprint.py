@@ -8,7 +8,7 @@ from support.paths import SHARED
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.propose.evidence.footprint import (
+from restock.ingest.propose.footprint import (
     footprint_of,
     of_urdf,
     parse_footprint,

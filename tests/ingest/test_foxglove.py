@@ -27,7 +27,7 @@ from support.foxglove_robot import (
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import Profile, parse_profile
-from restock.ingest.propose.kinds import robot_traits
+from restock.ingest.propose.drives import robot_traits
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 

@@ -72,8 +72,7 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
 def test_the_page_has_all_signal_keys_and_reductions():
     from typing import get_args
 
-    from restock.ingest.profile.custom_signal import CustomSignal, Reduce
-    from restock.ingest.profile.tables import Frames
+    from restock.ingest.profile.tables import CustomSignal, Frames, Reduce
 
     for name in (*CustomSignal.__struct_fields__, *get_args(Reduce)):
         assert f"`{name}`" in PAGE or f"`{name} = " in PAGE, name

@@ -13,9 +13,9 @@ from support.paths import SHARED
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.robot_choice import RobotProposal
-from restock.ingest.propose.task_lines import actions_of
+from restock.ingest.propose.commands import Commands
+from restock.ingest.propose.proposal_lines import actions_of
+from restock.ingest.propose.robot_choice import RobotProposal
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task, nearest_action
 from restock.replay.store.store import Store

@@ -8,7 +8,7 @@ from support.cameras import FRONT, REAR, camera_bag, compressed, file_of, pictur
 
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.evidence.candidates import camera_topics
+from restock.ingest.propose.candidates import camera_topics
 from restock.ingest.propose.propose import propose_profile
 
 

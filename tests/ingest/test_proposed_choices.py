@@ -15,8 +15,8 @@ from support.paths import SHARED
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.propose.evidence.clock_choice import drivable
-from restock.ingest.propose.evidence.commands import CommandHold, command_hold
+from restock.ingest.propose.clock_choice import drivable
+from restock.ingest.propose.commands import CommandHold, command_hold
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.scan import Body

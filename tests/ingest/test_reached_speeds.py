@@ -8,7 +8,7 @@ from support.driven_robot import SPEED_MPS, Drive, columns, write_bag
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.propose.evidence.commands import limit_of, settled_speeds
+from restock.ingest.propose.commands import limit_of, settled_speeds
 
 TICKS_S = np.arange(0, 20, 0.1)
 TOLD = np.where(TICKS_S % 5 < 3, 0.5, 0.1)  # 3 s fast, 2 s slowly

@@ -14,14 +14,14 @@ from support.paths import ROOT
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.description import Description, read_description
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.evidence.footprint import footprint_of
-from restock.ingest.propose.evidence.robot_choice import propose_robot
-from restock.ingest.propose.evidence.roles import robots_in
+from restock.ingest.propose.described_robot import DescribedRobot, described_robot, read_urdf
+from restock.ingest.propose.footprint import footprint_of
 from restock.ingest.propose.proposal_lines import in_one_recording
 from restock.ingest.propose.propose import propose_profile
-from restock.ingest.urdf.described_robot import DescribedRobot, described_robot, read_urdf
-from restock.ingest.urdf.description import Description, read_description
+from restock.ingest.propose.robot_choice import propose_robot
+from restock.ingest.propose.roles import robots_in
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 

@@ -15,8 +15,8 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.evidence.roles import choose_robot, robots_in, usable_topics
 from restock.ingest.propose.propose import propose_profile
+from restock.ingest.propose.roles import choose_robot, robots_in, usable_topics
 from restock.replay.store.store import Store
 
 NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")

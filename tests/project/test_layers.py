@@ -23,15 +23,13 @@ SHARED = {
     *("renamed", "state", "stats", "toml", "words"),
 }
 MAY_IMPORT = {
-    "ingest": "camera containers decoding profile steps store task urdf",
+    "ingest": "camera containers decoding profile steps store task",
     "ingest/decoding": "",
     "ingest/containers": "decoding",
     "ingest/camera": "containers decoding profile task",
     "ingest/task": "",
-    "ingest/urdf": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": ("containers decoding live profile propose/evidence steps task urdf"),
-    "ingest/propose/evidence": ("camera containers decoding live profile steps task urdf"),
+    "ingest/propose": "camera containers decoding live profile steps task",
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "camera containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
@@ -89,7 +87,7 @@ MAY_IMPORT = {
     ),
     "train/twin/survey": (
         "twin/floors replay/store ingest/containers ingest/decoding ingest/profile"
-        " ingest/propose/evidence ingest/steps ingest/task ingest/urdf"
+        " ingest/propose ingest/steps ingest/task"
     ),
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
@@ -104,7 +102,7 @@ MAY_IMPORT = {
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose"
-        " ingest/propose/evidence ingest/steps ingest/store ingest/task replay replay/export"
+        " ingest/steps ingest/store ingest/task replay replay/export"
         " replay/fleet replay/mixture replay/panel replay/plan replay/store train/evaluation"
     ),
     "cli/fleet": (
@@ -118,13 +116,13 @@ MAY_IMPORT = {
         " replay/panel train/feed replay/store train/twin/calibration"
     ),
     "cli/start": (
-        "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
+        "cli ingest/containers ingest/decoding ingest/profile ingest/propose ingest/task"
         " replay/mixture replay/panel replay/store replay/trace train/judge train/dqn"
         " train/evaluation train/run train/twin/calibration"
         " train/twin/floors train/twin/missions"
     ),
     "cli/twin": (
-        "cli report report/run ingest/containers ingest/profile ingest/propose/evidence"
+        "cli report report/run ingest/containers ingest/profile ingest/propose"
         " ingest/store ingest/task replay/fleet replay/store train/evaluation"
         " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
         " train/twin/physics train/twin/recording train/twin/survey"

@@ -15,13 +15,13 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, PanelError
-from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.profile import (
     load_profile,
     profile_toml,
     read_profile_toml,
     with_conditions,
 )
+from restock.ingest.profile.tables import CustomSignal
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train.prepare import prepare_new, prepare_resumed

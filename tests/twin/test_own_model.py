@@ -14,8 +14,8 @@ from twin.test_robot import AMR, amr_with, driven
 
 from restock.cli.twin.robot import RobotCommand
 from restock.errors import ConfigError
+from restock.ingest.profile.description import MAX_BYTES, mjcf_problem
 from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
-from restock.ingest.profile.robot_file import MAX_BYTES, mjcf_problem
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

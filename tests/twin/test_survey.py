@@ -23,7 +23,7 @@ from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Zone
-from restock.ingest.propose.evidence.footprint import parse_footprint
+from restock.ingest.propose.footprint import parse_footprint
 from restock.toml import Checked, read_toml, typed
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

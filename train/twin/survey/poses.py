@@ -17,8 +17,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Frames
-from restock.ingest.propose.evidence.pose_choice import transform_edges, transform_frames
-from restock.ingest.propose.evidence.roles import (
+from restock.ingest.propose.pose_choice import transform_edges, transform_frames
+from restock.ingest.propose.roles import (
     KINDS,
     topics_for,
     usable_topics,

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.propose.evidence.footprint import Footprint
+from restock.ingest.propose.footprint import Footprint
 from restock.replay.store.store import is_store
 from restock.toml import toml_value
 from restock.train.twin.floors.layout import Rect, Warehouse

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
     from restock.ingest.prepared import IngestResult
     from restock.ingest.profile.profile import Profile
-    from restock.ingest.propose.drives import Drives
-    from restock.ingest.propose.kinds import RobotTraits
+    from restock.ingest.propose.drives import Drives, RobotTraits
 
 OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
 
@@ -107,7 +106,7 @@ class ProfileCommand:
         from restock.files import expect_file_place
         from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.propose.drives import names_of, propose_for_drives
-        from restock.ingest.propose.evidence.footprint import parse_footprint
+        from restock.ingest.propose.footprint import parse_footprint
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
@@ -194,8 +193,7 @@ class ProfileCommand:
             RecordingError: none can be read.
         """
         from restock.cli import output
-        from restock.ingest.propose.drives import drives_by_kind
-        from restock.ingest.propose.kinds import robot_traits
+        from restock.ingest.propose.drives import drives_by_kind, robot_traits
 
         if len(paths) == 1:
             return None, []
@@ -221,7 +219,7 @@ class ProfileCommand:
         from restock.cli import output
         from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.containers.storage import unwatched
-        from restock.ingest.propose.evidence.roles import choose_robot
+        from restock.ingest.propose.roles import choose_robot
 
         with output.progress(f"opening {Path(path).name}", None) as advance:
             recording = open_recording(

@@ -38,7 +38,7 @@ OF_ONE_ROBOT = ("urdf", "footprint", "robot")
 
 def fullest(document: Document) -> str | None:
     """Return the recording with most of what a profile needs: a command, a pose, and time."""
-    from restock.ingest.propose.evidence.roles import KINDS
+    from restock.ingest.propose.roles import KINDS
 
     def types(role: str) -> set[str]:
         return {kind.type for kind in KINDS[role]}

@@ -471,7 +471,7 @@ class StartCommand:
 
             load_profile(self.profile)
         if self.footprint is not None:
-            from restock.ingest.propose.evidence.footprint import parse_footprint
+            from restock.ingest.propose.footprint import parse_footprint
 
             parse_footprint(self.footprint)
         if self.device != "cpu":
@@ -479,7 +479,7 @@ class StartCommand:
 
             open_device(self.device)
         if self.urdf is not None:
-            from restock.ingest.propose.evidence.robot_choice import check_urdf
+            from restock.ingest.propose.robot_choice import check_urdf
 
             check_urdf(self.urdf)
         if self.map is not None:

@@ -144,7 +144,7 @@ class LayoutCommand:
             return open_floor(self.floor), None
         from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.profile.profile import load_profile
-        from restock.ingest.propose.evidence.footprint import parse_footprint
+        from restock.ingest.propose.footprint import parse_footprint
         from restock.train.twin.survey.survey import survey
 
         surveyed = survey(

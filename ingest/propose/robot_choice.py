@@ -20,14 +20,20 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
-from restock.ingest.propose.evidence.lidars import SeenScans, View
-from restock.ingest.propose.evidence.roles import shared
+from restock.ingest.profile.description import Description, read_description
+from restock.ingest.propose.described_robot import described_robot, read_urdf
+from restock.ingest.propose.footprint import (
+    Footprint,
+    SeenScans,
+    View,
+    descriptions,
+    of_urdf,
+    outline,
+)
+from restock.ingest.propose.roles import shared
 from restock.ingest.steps.motion import PoseSeries, motion_at
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.signals import wrap_angle
-from restock.ingest.urdf.described_robot import described_robot, read_urdf
-from restock.ingest.urdf.description import Description, read_description
 from restock.toml import toml_value
 
 TICK_NS = 100_000_000  # between two looks at the motion

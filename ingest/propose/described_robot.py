@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from restock.errors import ConfigError
-from restock.ingest.urdf.description import (
+from restock.ingest.profile.description import (
     BASE_FRAMES,
     F64,
     HEAVIEST_KG,

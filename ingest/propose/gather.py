@@ -10,21 +10,22 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.conventions import conventions_of
+from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.inputs import HINDSIGHT, Input, is_motion
-from restock.ingest.propose.evidence.candidates import (
+from restock.ingest.profile.signal_paths import conventions_of
+from restock.ingest.propose.candidates import (
     CameraTopic,
     Candidate,
     camera_topics,
     candidates,
 )
-from restock.ingest.propose.evidence.clock_choice import (
+from restock.ingest.propose.clock_choice import (
     PAUSE,
     ClockChoice,
     Gaps,
     choose_clock,
 )
-from restock.ingest.propose.evidence.commands import (
+from restock.ingest.propose.commands import (
     CommandChoice,
     CommandHold,
     Commands,
@@ -34,20 +35,18 @@ from restock.ingest.propose.evidence.commands import (
     read_commands,
     wheelbase_of,
 )
-from restock.ingest.propose.evidence.footprint import (
+from restock.ingest.propose.footprint import (
     GUESS,
     Footprint,
     ScannedOutline,
     footprint_of,
-    scanned_outline,
-)
-from restock.ingest.propose.evidence.lidars import (
     lidar_place,
     moved_in_frame,
+    scanned_outline,
     scans_of,
     with_lidar,
 )
-from restock.ingest.propose.evidence.pose_choice import (
+from restock.ingest.propose.pose_choice import (
     FrameGuess,
     MotionChoice,
     choose_motion,
@@ -55,13 +54,13 @@ from restock.ingest.propose.evidence.pose_choice import (
     transform_edges,
     transform_frames,
 )
-from restock.ingest.propose.evidence.robot_choice import (
+from restock.ingest.propose.robot_choice import (
     DriveEvidence,
     RobotProposal,
     propose_robot,
     urdf_footprint,
 )
-from restock.ingest.propose.evidence.roles import (
+from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
     NODE_TOPICS,
@@ -81,7 +80,6 @@ from restock.ingest.steps.frames import plain
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
-from restock.ingest.urdf.description import BASE_FRAMES
 
 RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
 MIN_ROWS = 100  # with a goal in hindsight, if these are wanted and the rest is left out

@@ -26,14 +26,14 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.inputs import is_motion
-from restock.ingest.propose.evidence.clock_choice import Gaps
-from restock.ingest.propose.evidence.robot_choice import (
+from restock.ingest.propose.clock_choice import Gaps
+from restock.ingest.propose.robot_choice import (
     DriveEvidence,
     RobotProposal,
     drive_evidence,
     shown_wheelbase_m,
 )
-from restock.ingest.propose.evidence.roles import BY_HAND, NAVIGATION, Kind, Roles
+from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.signals import wrap_angle
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
+from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.tables import Clock, Frames
-from restock.ingest.propose.evidence.roles import Roles, robots_in
+from restock.ingest.propose.roles import Roles, robots_in
 from restock.ingest.steps.align import align
 from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.steps.frames import Edges, Tree, transform_fields, upward
 from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import wrap_angle, yaw_of
-from restock.ingest.urdf.description import BASE_FRAMES
 
 FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")
 FIXED_FRAMES = ("map", "odom", "world")  # best first

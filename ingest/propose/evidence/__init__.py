@@ -1,1 +1,0 @@
-"""What a recording says of its robot: which topic is for what, and each choice with its reason."""

@@ -1,1 +1,0 @@
-"""What a robot's description (URDF) says of it: links, joints, shapes; drive, wheels, mass."""
