@@ -8,7 +8,7 @@ import shutil
 from dataclasses import replace
 from html import escape
 from html.parser import HTMLParser
-from itertools import combinations, pairwise
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,22 +24,18 @@ from support.panels import panel_of
 from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
-from restock.cli.learning.eval import show_measures
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.panel import Panel
-from restock.replay.store.audit import capacity_of_rows
 from restock.replay.store.store import Store
 from restock.report import build_report
-from restock.report.look.charts import POLICY_COLOURS, POLICY_SPARES, colours, lines, scale
 from restock.report.look.queries import ask, statements
 from restock.report.look.theme import DARK
 from restock.report.run import fed
-from restock.report.run.facts import evaluation_bias, gather, mean_success
+from restock.report.run.facts import Facts, evaluation_bias, gather, mean_success
+from restock.report.run.floor import floor_section
 from restock.report.run.headline import headline
-from restock.report.run.page import page, success, ways_section
+from restock.report.run.page import success, ways_section
 from restock.stats import ConfidenceInterval
-from restock.train.run.kept_evaluations import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
@@ -287,103 +283,12 @@ def test_the_page_fetches_nothing(html: str) -> None:
     assert "url(http" not in html
 
 
-def test_its_charts_are_drawn_again_by_vega_with_what_the_pointer_asks(html: str) -> None:
+def test_its_charts_are_specifications_that_vega_takes(html: str) -> None:
     page = charts_of(html)
-    specs = [
-        {**chart["spec"], "datasets": {name: page["rows"][name] for name in chart["rows"]}}
-        for chart in page["charts"]
-    ]
-    assert len(specs) >= 14
-    for spec in specs:  # each is one that Vega-Lite takes
+    assert len(page["charts"]) >= 14
+    for chart in page["charts"]:
+        spec = {**chart["spec"], "datasets": {name: page["rows"][name] for name in chart["rows"]}}
         assert "Undefined" not in json.dumps(vl_convert.vegalite_to_vega(spec))
-    text = json.dumps(specs)
-    learnt = next(
-        spec
-        for spec in specs
-        if '"environment steps"' in json.dumps(spec) and '"kept"' in json.dumps(spec["datasets"])
-    )
-    reported = learnt["layer"][-1]["encoding"]["tooltip"]
-    assert [one["title"] for one in reported] == ["environment steps", "success"]
-    success = next(spec for spec in specs if "facet" in spec and '"low"' in json.dumps(spec))
-    (bars, _) = success["spec"]["layer"]
-    assert bars["params"][0]["bind"] == "legend"
-    reported = bars["encoding"]["tooltip"]
-    assert [one["title"] for one in reported][-3:] == ["success", "95 %, low", "95 %, high"]
-    assert reported[-1]["format"] == ".1~%"
-    assert "alert(1)" in text  # a hostile name is text there, too
-
-
-def test_a_policy_has_one_colour_in_all_charts(html: str) -> None:
-    scales = re.findall(r'"scale":({"domain":\[[^]]*\],"range":\[[^]]*\]})', html)
-    reported = [
-        dict(zip(one["domain"], one["range"], strict=True)) for one in map(json.loads, scales)
-    ]
-    planner = [colours["planner"] for colours in reported if "planner" in colours]
-    assert len(planner) >= 4  # success and behaviour, each at several widths
-    assert set(planner) == {POLICY_COLOURS["planner"]}
-
-
-def test_policies_look_unlike_each_other_in_both_themes() -> None:
-    """The agent and a policy from the logs alone were two greens: .12 and in the dark .05 apart."""
-    colours = (*POLICY_COLOURS.values(), *POLICY_SPARES)
-    for theme in ({}, DARK):
-        shown = [theme.get(colour, colour) for colour in colours]
-        near = min((apart(a, b), a, b) for a, b in combinations(shown, 2))
-        assert near[0] > 0.1, near
-        ground = luminance(theme.get("#ffffff", "#ffffff"))
-        for colour in shown[len(POLICY_COLOURS) :]:
-            low, high = sorted((luminance(colour), ground))
-            assert (high + 0.05) / (low + 0.05) >= 3, colour  # as WCAG asks of graphics
-    drawn = scale(["agent", "fed uniformly", "logs alone"], POLICY_COLOURS).to_dict()["range"]
-    assert len(set(drawn)) == 3
-    assert set(drawn) <= set(colours)
-
-
-def linear(colour: str) -> list[float]:
-    """Red, green and blue of `#rrggbb`, as light."""
-    values = (int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5))
-    return [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in values]
-
-
-def luminance(colour: str) -> float:
-    return float(np.dot((0.2126, 0.7152, 0.0722), linear(colour)))
-
-
-def apart(first: str, second: str) -> float:
-    """How different two colours look: their distance in OKLab."""
-    to_cones = [
-        (0.4122214708, 0.5363325363, 0.0514459929),
-        (0.2119034982, 0.6806995451, 0.1073969566),
-        (0.0883024619, 0.2817188376, 0.6299787005),
-    ]
-    to_lab = [
-        (0.2104542553, 0.7936177850, -0.0040720468),
-        (1.9779984951, -2.4285922050, 0.4505937099),
-        (0.0259040371, 0.7827717662, -0.8086757660),
-    ]
-    a, b = (np.dot(to_lab, np.cbrt(np.dot(to_cones, linear(one)))) for one in (first, second))
-    return float(np.linalg.norm(a - b))
-
-
-def test_a_policy_has_the_same_words_in_report_and_terminal(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = Path(shutil.copytree(run, tmp_path / "run"))
-    file = copy / "eval" / "episodes.parquet"
-    other = {"planner": "run:demo/logs-alone"}
-    rows = pq.read_table(file).to_pylist()
-    rows = [{**row, "policy": other.get(row["policy"], row["policy"])} for row in rows]
-    pq.write_table(pa.Table.from_pylist(rows, schema=EVAL_EPISODES), file)
-    section = success(gather(copy))
-    assert section is not None
-    assert {row["policy"] for row in section.tables[0].rows} == {"agent", "logs alone"}
-    svg = section.figures[0].widest
-    assert "logs alone" in svg
-    assert "run:demo" not in svg
-    show_measures(summary_rows(rows))
-    said = capsys.readouterr().out
-    assert "logs alone" in said
-    assert "run:demo" not in said
 
 
 def test_policies_of_one_name_are_told_apart() -> None:
@@ -402,58 +307,9 @@ def test_policies_of_one_name_are_told_apart() -> None:
         assert policy_words([name]) == {name: name}
 
 
-def test_references_have_the_colours_of_reports_on_the_page_of_a_study() -> None:
-    arms = [f"arm {number}" for number in range(6)]
-    alone, beside = colours(arms), colours([*arms, "planner", "operator"])
-    assert {name: beside[name] for name in arms} == alone  # in every chart of a page
-    assert len(set(beside.values())) == 8
-    for name in ("planner", "operator"):
-        assert beside[name] == POLICY_COLOURS[name]
-
-
-def test_nought_on_an_axis_of_thousands_is_nought() -> None:
-    rows = [{"env_steps": n, "success": 0.5, "who": "agent"} for n in (0, 200_000)]
-    drawn = lines(rows, x="env_steps", y="success", series="who", y_title="success")
-    texts = [one.text for one in ElementTree.fromstring(drawn.svg[470]).iter() if one.text]
-    assert {"0", "100k"} <= set(texts)
-    assert "0k" not in texts
-
-
-def test_names_that_begin_alike_are_told_apart_in_a_legend() -> None:
-    names = [f"coverage-with-practice-where-it-fails-{seed}" for seed in (1, 2)]
-    rows = [{"env_steps": n, "success": 0.5, "who": name} for name in names for n in (0, 2000)]
-    drawn = lines(rows, x="env_steps", y="success", series="who", y_title="success", marker=0)
-    texts = {one.text: one for one in ElementTree.fromstring(drawn.svg[470]).iter() if one.text}
-    assert [text for text in texts if text.startswith("coverage")] == names
-    assert texts["kept"].get("text-anchor") == "start"  # beside its line, not over the axis
-
-
-def test_a_legends_names_have_room_in_a_wider_font() -> None:
-    """In DejaVu Sans the first is 161 px wide, and it reached over the second one's mark."""
-    names = ["coverage quotas, adaptive", "uniform replay, n steps 3"]
-    rows = [{"env_steps": n, "success": 0.5, "who": name} for name in names for n in (0, 2000)]
-    drawn = lines(rows, x="env_steps", y="success", series="who", y_title="success")
-    _, entries = drawn.svg[470].split("role-legend-entry")
-    first, second = re.findall(r'translate\(([\d.]+),[\d.]+\)"><path[^>]* d="M0,0h[1-9]', entries)
-    label = re.search(r"role-legend-label.*?translate\(([\d.]+),", entries)
-    assert label is not None
-    assert float(second) - float(first) - float(label[1]) > 161
-
-
 def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:
     assert "alert(1)" in html  # it is shown …
     assert HOSTILE not in html  # … as text
-
-
-def test_what_stands_in_backticks_is_set_as_code(html: str) -> None:
-    sentences = re.findall(r'<(?:p|figcaption|div class="callout")[^>]*>(.*?)</', html, re.DOTALL)
-    assert [text for text in sentences if "`" in text] == []
-    assert "<code>restock " in html
-
-
-def test_ages_say_how_old_the_newest_row_was(html: str) -> None:
-    part = html.split('<section id="fed">')[1].split("</section>")[0]
-    assert "the panel&#39;s newest row was 3.0 days old then" in part
 
 
 def heading(html: str) -> str:
@@ -462,40 +318,29 @@ def heading(html: str) -> str:
     return found[1]
 
 
-def test_the_headline_is_a_comparison_with_its_interval(html: str) -> None:
-    assert re.fullmatch(
-        r"Worse than the planner in wheel slip \(−80 points \[−95, −6\d\]\);"
-        r" no difference is shown in nominal",
-        heading(html),
-    )
-    lead = html.split('<p class="lead">')[1].split("</p>")[0]
-    assert "1,000 updates" in lead  # what it cost
-    assert "between training seeds" in lead  # what the interval does not hold
+def test_the_headline_is_a_comparison_with_its_interval(run: Path) -> None:
+    found = headline(gather(run))
+    assert re.match(r"Worse than the planner in wheel slip \(−80 points \[−95, −6\d\]\)", found)
 
 
 def test_what_training_took_counts_the_steps_without_an_update(run: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(run, tmp_path / "run")
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
     offline = filled("progress", gradient_steps=300, env_steps=0, phase="offline", wall_s=4.0)
     warmup = filled("progress", gradient_steps=300, env_steps=2016, phase="warmup", wall_s=11.0)
     schema = pa.schema(TABLES["progress"])
     rows = [offline, warmup | {"updates": 0, "loss": None}]
     pq.write_table(pa.Table.from_pylist(rows, schema), copy / "progress.parquet")
-    html = build_report(copy).read_text(encoding="utf-8")
-    assert (
-        "trained on logs alone, without an update in the twin, for 2,016 environment steps and"
-        " 300 updates in 11 s"
-    ) in html
-    assert '2,016</div><div class="label">environment steps' in html
+    took = gather(copy).trained
+    assert (took["env_steps"], took["gradient_steps"], took["wall_s"]) == (2016, 300, 11.0)
+    assert not took["updated_online"]
 
 
 def test_without_a_baseline_the_headline_says_so(run: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(run, tmp_path / "run")
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
     file = copy / "eval" / "episodes.parquet"
     table = pq.read_table(file)
     pq.write_table(table.filter(pa.compute.equal(table["policy"], "agent")), file)
-    said = heading(build_report(copy).read_text(encoding="utf-8"))
-    assert said.startswith("No baseline drove the same episodes: success 90%")
-    assert "20% [8%, 42%] in wheel slip" in said
+    assert headline(gather(copy)).startswith("No baseline drove the same episodes")
 
 
 def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_path: Path) -> None:
@@ -519,60 +364,20 @@ def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_pa
     assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
 
 
-def test_one_average_of_success_is_on_the_page(run: Path) -> None:
-    """Conditions count the same; partly and wholly blocked aisles by half each."""
+def test_conditions_count_the_same_in_the_one_average_of_success() -> None:
+    """Partly and wholly blocked aisles count by half each."""
     cells = [
         {"cell": "nominal", "success": 1.0, "episodes": 100},
         {"cell": "blocked_aisle (partial)", "success": 0.2, "episodes": 3},
         {"cell": "blocked_aisle (full)", "success": 0.4, "episodes": 9},
     ]
     assert mean_success(cells) == pytest.approx(0.65)
-    facts = gather(run)
-    facts.logged = [
-        {"condition": "nominal", "share": 0.1, "episodes": 1},
-        {"condition": "wheel_slip", "share": 0.9, "episodes": 9},
-    ]
-    assert f"instead of {mean_success(facts.clean_cells()):.0%}" in evaluation_bias(facts)
-
-
-def test_no_card_is_a_bare_average(run: Path) -> None:
-    """The success on the episodes that chose the checkpoint was beside that of other episodes."""
-    cards = page(gather(run))["cards"]
-    assert all("success" not in card["label"] for card in cards)
-    (kept,) = [card for card in cards if "kept policy" in card["label"]]
-    assert kept == {
-        "value": "2,000",
-        "label": "environment step of the kept policy, the best of 2 evaluations in training",
-    }
-
-
-def test_a_table_of_many_columns_is_stacked_before_it_is_cut(html: str) -> None:
-    """On a tablet it ended in the middle of a column, with no sign of more."""
-    style = html.split("</style>")[0]
-    assert re.search(r"@container \([^)]*\) and \(max-width: 780px\) {\s*\.wide,", style)
-    assert re.search(r"\.scroll {[^}]*local", style)  # a shadow where more is to the right
-    columns = re.findall(r"<table([^>]*)>\s*<thead>(.*?)</thead>", html, flags=re.DOTALL)
-    for attributes, head in columns:
-        assert ("wide" in attributes) == (head.count("<th ") > 6)
-    assert any("wide" in attributes for attributes, _ in columns)
 
 
 def test_a_condition_is_spelt_one_way(html: str) -> None:
     shown = re.sub(r"<(pre|code)>.*?</\1>", "", html.split("</style>")[1], flags=re.DOTALL)
     assert "wheel slip" in shown
     assert "wheel_slip" not in shown
-
-
-def test_figures_are_drawn_at_the_size_of_a_phone_and_of_a_desktop(html: str) -> None:
-    assert len(re.findall(r'<div class="drawing w300"[^>]*><svg[^>]* width="300"', html)) >= 7
-    assert html.count('<div class="drawing w300"') == html.count(
-        '<div class="drawing w470"'
-    ) + html.count('<div class="drawing w1000"')
-    sizes = set(re.findall(r'font-size="([\d.]+)px"', html))
-    assert sizes == {"12"}
-    ids = re.findall(r"<svg.*?</svg>", html, re.DOTALL)
-    found = [name for svg in ids for name in set(re.findall(r' id="([^"]+)"', svg))]
-    assert len(found) == len(set(found))
 
 
 def test_every_colour_of_a_figure_has_one_for_a_dark_ground(html: str) -> None:
@@ -585,22 +390,6 @@ def test_every_colour_of_a_figure_has_one_for_a_dark_ground(html: str) -> None:
         assert f'svg [fill="{colour}"]' in html
 
 
-def test_figures_as_files(run: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "deep" / "figures"
-    page = build_report(run, tmp_path / "page.html", figures=folder)
-    figures = page.read_text(encoding="utf-8").count("<figure")
-    assert len(list(folder.glob("*.svg"))) == len(list(folder.glob("*.png"))) == figures
-    with Image.open(folder / "success.png") as picture:
-        assert picture.width > 1000
-        assert picture.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
-    ElementTree.parse(folder / "map-where-the-logs-have-been.svg")
-
-
-def test_a_clear_loss_to_the_planner_is_said(html: str) -> None:
-    assert "Worse than the planner in wheel slip: 20% against 100%" in html
-    assert "Worse than the planner in nominal" not in html
-
-
 def test_headline_and_callout_tell_no_difference_of_few_episodes(run: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(run, tmp_path / "run")
     file = copy / "eval" / "episodes.parquet"
@@ -610,31 +399,7 @@ def test_headline_and_callout_tell_no_difference_of_few_episodes(run: Path, tmp_
         table["episode_seed"], pa.compute.min(table["episode_seed"]).as_py() + 3
     )
     pq.write_table(table.filter(pa.compute.invert(pa.compute.and_(slips, late))), file)
-    html = build_report(copy).read_text(encoding="utf-8")
-    assert re.fullmatch(
-        r"No difference from the planner is shown in nominal \(.* points \[.*\]\);"
-        r" too few episodes to tell a difference in wheel slip \(−\d+ points\)",
-        heading(html),
-    )
-    assert "Worse than the planner" not in html
-
-
-def test_headline_says_where_the_episodes_are_not_the_same(run: Path, tmp_path: Path) -> None:
-    """As where the baseline drove more of them than the run's policy did."""
-    copy = shutil.copytree(run, tmp_path / "run")
-    file = copy / "eval" / "episodes.parquet"
-    table = pq.read_table(file)
-    (first, *_) = [r["episode_seed"] for r in table.to_pylist() if r["condition"] == "wheel_slip"]
-    kept = [
-        (row["policy"], row["condition"], row["episode_seed"]) != ("agent", "wheel_slip", first)
-        for row in table.to_pylist()
-    ]
-    pq.write_table(table.filter(pa.array(kept)), file)
-    assert re.fullmatch(
-        r"No difference from the planner is shown in nominal \(.* points \[.*\]\);"
-        r" not on the same episodes in wheel slip",
-        headline(gather(copy)),
-    )
+    assert "too few episodes to tell a difference in wheel slip" in headline(gather(copy))
 
 
 def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> None:
@@ -655,14 +420,10 @@ def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> N
 
 def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:
     facts = gather(run)
-    assert page(facts)["headline"].startswith("Worse than the planner")
     facts.cells += [
         {**row, "policy": "random", "success": 0.6} for row in facts.clean_cells("agent")
     ]
-    assert page(facts)["headline"] == (
-        "Nothing was learned: no better than a random policy on the same episodes"
-        " (55% against 60%, mean over conditions)"
-    )
+    assert headline(facts).startswith("Nothing was learned: no better than a random policy")
 
 
 def test_every_section_has_its_figures(html: str) -> None:
@@ -700,19 +461,6 @@ def test_an_action_that_is_wanted_and_not_in_the_logs_is_on_the_page(html: str) 
     assert ">0<" in part  # … is not never
 
 
-def test_the_curve_of_capacity_is_on_the_page(html: str, run: Path) -> None:
-    found = capacity_of_rows(Panel.open(Path(Run.open(run).document["panel"]["path"])).meta)
-    part = html.split('<section id="capacity">')[1].split("</section>")[0]
-    assert "The ring holds 4,096 rows" in part
-    assert found.reason in part
-    last = found.curve[-1]
-    assert rows_of(html, "capacity")[-1][:3] == [
-        f"{last['capacity']:,}",
-        str(last["cells"]),
-        "100%",
-    ]
-
-
 def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) -> None:
     part = html.split('<section id="learning">')[1].split("</section>")[0]
     assert "Off-policy evaluation on held-out logs" in part
@@ -742,16 +490,12 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     write_gap(gap, copy / "gap")
     page = build_report(copy).read_text(encoding="utf-8")
     part = page.split('<section id="twin-gap">')[1].split("</section>")[0]
-    for words in (
-        *("Do not trust the twin in: nominal.", "it is far off", "0.50 m [0.40, 0.60]"),
-        *("nominal twin", "measured at version 7", "No &lt;script&gt;alert(1)&lt;/script&gt; was"),
-    ):
-        assert words in part, words
+    assert "Do not trust the twin in: nominal." in part
+    assert HOSTILE not in part
     assert part.count("<figure") == 1
     (copy / "gap" / "gap.json").write_text("{}")
     page = build_report(copy).read_text(encoding="utf-8")
     assert '<section id="twin-gap">' not in page
-    assert "contains no readable gap" in page
 
 
 def test_drawn_shares_are_over_the_whole_run(run: Path) -> None:
@@ -799,13 +543,11 @@ def test_a_young_run_without_evaluation_still_has_a_page(tmp_path: Path) -> None
     made = Run.create(tmp_path / "run", {"config": {"target": {"rule": "polyak", "tau": 0.005}}})
     made.append("progress", [filled("progress", phase="offline")])
     made.flush()
-    html = build_report(made.path).read_text(encoding="utf-8")
-    assert "trained, not yet evaluated" in html
-    assert "had no panel" in html
+    assert '<section id="fed">' in build_report(made.path).read_text(encoding="utf-8")
 
 
-def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> str:
-    """Return the page of the run as if it had driven on other floors and ended on `ended_on`."""
+def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> Facts:
+    """Return the facts of the run as if it had driven on other floors and ended on `ended_on`."""
     shutil.copytree(run, path)
     document = json.loads((path / "config.json").read_text())
     document["config"]["env"] = {"layouts": layouts}
@@ -814,28 +556,26 @@ def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> str:
     table = pq.read_table(file)
     column = pa.array([ended_on] * len(table))
     pq.write_table(table.set_column(table.column_names.index("layout"), "layout", column), file)
-    return build_report(path).read_text(encoding="utf-8")
+    return gather(path)
 
 
-@pytest.mark.long
 def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> None:
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
-    page = _on_floors(run, tmp_path / "a", str(hall), "hall.toml")
-    assert 'rect width="800" height="200"' in page
-    assert "floor, hall.toml" in page
-    assert "18 failed clean episodes there" in page
-    page = _on_floors(run, tmp_path / "b", str(hall), "default")
-    assert "0 failed clean episodes there" in page
+    for ended_on, failed in (("hall.toml", 18), ("default", 0)):
+        section = floor_section(_on_floors(run, tmp_path / ended_on, str(hall), ended_on))
+        assert section is not None
+        assert 'rect width="800" height="200"' in section.figures[0].widest
+        assert f"{failed} failed clean episodes there" in str(section.figures[1].caption)
 
 
 def test_logs_in_another_frame_are_counted_and_not_drawn(run: Path, tmp_path: Path) -> None:
     (floor,) = open_floors("default")
     away = replace(floor, name="away", map_origin=(900.0, 0.0, 0.0))
     write_floor(away, tmp_path / "away.toml")
-    page = _on_floors(run, tmp_path / "a", str(tmp_path / "away.toml"), "away")
-    assert "0 logged steps in cells" in page
-    assert re.search(r"Not drawn: what was logged in other frames, \d+ recording", page)
+    facts = _on_floors(run, tmp_path / "a", str(tmp_path / "away.toml"), "away")
+    assert facts.elsewhere > 0
+    assert facts.visited == []
 
 
 def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
@@ -858,34 +598,29 @@ def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("layouts", "said"),
-    [
-        ("generated:train:3", "drives on 3 floors"),
-        ("gone.toml", "gone.toml: cannot be read"),
-    ],
-)
-def test_a_floor_that_is_not_drawn_is_said(
-    run: Path, tmp_path: Path, layouts: str, said: str
+@pytest.mark.parametrize("layouts", ["generated:train:3", "gone.toml"])
+def test_a_floor_that_is_not_drawn_is_named_as_missing(
+    run: Path, tmp_path: Path, layouts: str
 ) -> None:
-    page = _on_floors(run, tmp_path / "a", layouts, "default")
-    assert said in page
-    assert "Where did it happen?" not in page
+    facts = _on_floors(run, tmp_path / "a", layouts, "default")
+    assert facts.missing[-1].startswith(("No floor is drawn", "The floor is not drawn"))
+    assert floor_section(facts) is None
 
 
-def test_a_run_without_an_update_is_refused(tmp_path: Path) -> None:
-    Run.create(tmp_path / "run", {"config": {}})
-    with pytest.raises(RunError, match="no update to report on"):
-        build_report(tmp_path / "run")
-
-
-def test_the_verb_prints_where_the_page_is(
+def test_the_verb_prints_where_the_page_is_and_writes_its_figures(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "deep" / "page.html"
-    assert cli.main(["report", str(run), "--out", str(out), "--json"]) == 0
+    out, folder = tmp_path / "deep" / "page.html", tmp_path / "deep" / "figures"
+    words = ["report", str(run), "--out", str(out), "--figures", str(folder), "--json"]
+    assert cli.main(words) == 0
     said = json.loads(capsys.readouterr().out)
     assert said == {"report": str(out), "bytes": out.stat().st_size}
+    figures = out.read_text(encoding="utf-8").count("<figure")
+    assert len(list(folder.glob("*.svg"))) == len(list(folder.glob("*.png"))) == figures
+    with Image.open(folder / "success.png") as picture:
+        assert picture.width > 1000
+        assert picture.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
+    ElementTree.parse(folder / "map-where-the-logs-have-been.svg")
 
 
 def test_no_file_of_a_command_is_written_into_a_store_nor_into_another_run(
@@ -914,16 +649,15 @@ def test_no_file_of_a_command_is_written_into_a_store_nor_into_another_run(
         assert cli.main(words) == 2
         assert f"is within {place}:" in " ".join(capsys.readouterr().err.split())
     assert sorted([*store_path.rglob("*"), *run.rglob("*")]) == before
-    assert cli.main(["report", str(own), "--out", str(own / "pages" / "page.html")]) == 0
 
 
-def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for place, said in (
-        (tmp_path / "nothing", "no such run"),
-        (tmp_path, "is not a run directory"),
-    ):
+def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
+    Run.create(tmp_path / "run", {"config": {}})
+    for place in (tmp_path / "nothing", tmp_path, tmp_path / "run"):
+        with pytest.raises(RunError) as refused:
+            build_report(place)
+        assert refused.value.where == str(place)
         assert cli.main(["report", str(place)]) == 2
-        assert f"{place}: {said}" in "".join(capsys.readouterr().err.splitlines())
 
 
 def test_shares_stand_side_by_side_and_what_is_short_or_lost_by_weights_is_said(run: Path) -> None:

@@ -19,10 +19,8 @@ from restock.cli import main
 from restock.replay.store.store import Store
 from restock.report import write_study_page
 from restock.report.fleet.coverage import coverage_facts, coverage_page
-from restock.report.fleet.shopping import shopping_section
 from restock.report.look import charts
 from restock.report.look.live import Charts
-from restock.report.run.comparison import gate_section
 
 HOSTILE = "</script><script>alert(1)</script><!--"
 
@@ -76,9 +74,6 @@ def test_a_comparison_has_a_page_with_the_verdict_first(tmp_path: Path) -> None:
     assert main(["compare", *plain, "--against", *dueling, "--page", str(page)]) == 0
     found = read(page)
     assert found.text.index("gate passed: comparable") < found.text.index("dueling is better in")
-    assert re.search(r"wheel slip \(\+\d+ points \[\+\d+, \+\d+\]\)", found.text)
-    assert "40,000 environment steps" in found.text  # what it cost
-    assert "over up to 3 seeds" in found.text
     assert found.tags.count("figure") == 3  # differences, improvement, curves
 
 
@@ -87,17 +82,8 @@ def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     assert main(["compare", *plain, "--against", *other, "--page", str(page)]) == 1
     found = read(page)
-    assert "gate refused: not comparable" in found.text
-    assert "cannot be compared: they differ in config.replay.batch_size" in found.text
+    assert "they differ in config.replay.batch_size" in found.text
     assert "Probability that" not in found.text
-
-
-def test_a_check_without_an_end_of_its_interval_is_shown() -> None:
-    ratio = {"name": "share of fresh/blocked_aisle", "part": "whole run", "value": 1.14}
-    ratio |= {"low": 1.0, "high": None, "limit": 1.25, "verdict": "inconclusive"}
-    found = {"refused": [], "differences": [], "checks": [ratio], "treatment": "mixture"}
-    (_, fed) = gate_section(found, "plain", "dueling").tables
-    assert fed.rows[0]["95 %"] == "1 or more"
 
 
 def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
@@ -140,31 +126,13 @@ def test_a_store_has_a_page_of_what_it_holds(
     page, folder = tmp_path / "page.html", tmp_path / "figures"
     argv = ["coverage", str(store_path), "--out", str(page), "--figures", str(folder)]
     assert main(argv) == 0
-    out = capsys.readouterr().out
-    assert "rows that hold each condition" in out
-    found = read(page)
-    once = "a row that holds several conditions counts once, for the first of recovery,"
-    assert once in out
-    assert once in found.text
-    assert "rarest condition" not in found.text
-    for title in (
-        "What the store holds",
-        "What to log next",
-        "When was it logged?",
-        "Which robot has seen which condition?",
-    ):
-        assert title in found.text
-    assert "Has a robot changed?" in found.text
-    assert "Where was it logged?" in found.text
+    assert "rows that hold each condition" in capsys.readouterr().out
+    found, html = read(page), page.read_text(encoding="utf-8")
+    for section in ("shelves", "shopping", "weeks", "robots", "map"):
+        assert f'<section id="{section}">' in html
     assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
-    (shelves,) = folder.glob("shelves-*.svg")
-    labels = re.findall(r">([^<>]*)</text>", shelves.read_text("utf-8"))
-    assert "1" in labels
-    assert "500m" not in labels  # half a row, where the bars begin
-    assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
-    assert "give --out FILE, too" in capsys.readouterr().err
-    assert main(["coverage", str(store_path), "--every", "hour"]) == 2
-    assert "--every: applies only to the page" in capsys.readouterr().err
+    for alone in (["--figures", str(folder)], ["--every", "hour"]):  # they need --out
+        assert main(["coverage", str(store_path), *alone]) == 2
 
 
 def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> None:
@@ -223,74 +191,16 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     assert {row["robot"]: row["hours"] for row in table.rows} == expected
 
 
-def test_a_condition_of_ones_own_has_one_colour_in_bars_weeks_and_map(tmp_path: Path) -> None:
-    # Names whose first choice is the same colour; one occurs in the table of conditions alone.
-    own = {"wheel_slip": "zz_idle", "blocked_aisle": "zz_tight", "near_collision": "zz_ulhgs"}
-    with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as store:
-        facts = coverage_facts(store)
-    for rows in facts.values():
-        for row in rows:
-            if "condition" in row:
-                row["condition"] = own.get(row["condition"], row["condition"])
-    few = {"condition": "zz_aaa", "rows_held": 7, "primary_rows": 0, "primary_share": 0.0}
-    facts["shelves"].append({**facts["shelves"][0], **few})
-    page = coverage_page(facts, missing(NEVER_SEEN), "nothing to compare")
-    assert "never seen: zz" not in page["headline"]  # it holds where a rarer one names the row
-    sections = {section.id: section for section in page["sections"]}
-    text = "".join(
-        json.dumps(figure.drawing.spec)
-        for name in ("shelves", "weeks")
-        for figure in sections[name].figures
-    )
-    reported: dict[str, set[str]] = {}
-    for one in re.findall(r'"scale": ({"domain": \[[^]]*\], "range": \[[^]]*\]})', text):
-        scale = json.loads(one)
-        for name, colour in zip(scale["domain"], scale["range"], strict=True):
-            reported.setdefault(name, set()).add(colour)
-    swatches = r'background:(#\w+)"></span>([^<]*)<'
-    for colour, name in re.findall(swatches, str(sections["map"].figures[1].caption)):
-        reported[name].add(colour)
-    assert len(reported) >= 4
-    assert all(len(colours) == 1 for colours in reported.values())
-    assert len(set.union(*reported.values())) == len(reported)  # and nobody else's
-
-
-@pytest.mark.parametrize("unit", ["missions", "hours"])
-def test_missions_to_drive_are_offered_where_the_plan_is_of_missions(unit: str) -> None:
-    """The twin drives no hours of logging: `restock twin record --missions` refused the file."""
-    gap = {**NEVER_SEEN, "best": "logging", "amount": 3, "amount_low": 2, "amount_high": 5}
-    order = {"kind": None, "zone": None, "robot": None, "missions": 3, "hours": 0.1}
-    plan = {"orders": [{**order, "fills": ["wheel_slip"]}], "total": 3.0}
-    section = shopping_section(missing(gap, unit=unit, **plan))
-    assert ("--missions-out" in section.intro) == (unit == "missions")
-
-
 @pytest.mark.long
 def test_a_gap_without_a_rate_says_how_many_episodes_would_show_one(store_path: Path) -> None:
     with Store(store_path) as store:
         cards, sections = coverage_of(store, missing(NEVER_SEEN))
-        some = {**NEVER_SEEN, "best": "wheel_slip", "amount": 3, "amount_low": 2, "amount_high": 5}
-        order = {"kind": "wheel_slip", "zone": None, "robot": None, "missions": 3, "hours": 0.1}
-        plan = {"orders": [{**order, "fills": ["wheel_slip"]}], "total": 3.0}
-        both, _ = coverage_of(store, missing(some, NEVER_SEEN, **plan))
         closed, _ = coverage_of(store, missing())
     assert cards["gap"] == "1"
-    assert cards["more episodes of blocked aisle, to see what was never logged (95 %)"] == (
-        "at least 9"
-    )
     assert not any("to log next" in label for label in cards)  # no "0 missions"
-    shopping = sections["shopping"]
-    assert "at least 9 more episodes of blocked aisle" in shopping.intro
-    (row,) = shopping.tables[-1].rows
-    assert row["best"] == "no rate is known: at least 9 more episodes of blocked aisle"
-    with Store(store_path) as store:
-        _, sections = coverage_of(store, missing({**NEVER_SEEN, "at_least": 1}))
-    assert "at least 1 more episode of blocked aisle" in sections["shopping"].intro
-    assert both["gaps"] == "2"
-    label = "missions to log next (95 %: 0 to 0); 1 gap has no rate and is not in it"
-    assert both[label] == "3"
-    assert closed["gaps"] == "0"
-    assert closed["missions to log next"] == "0"
+    (row,) = sections["shopping"].tables[-1].rows
+    assert "at least 9 more episodes" in row["best"]
+    assert (closed["gaps"], closed["missions to log next"]) == ("0", "0")
 
 
 def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:

@@ -192,14 +192,6 @@ def test_only_what_surely_has_the_opposite_sign_is_called_mirrored(high: float, 
     assert not re.search(r"[2-9]\d\d%|1[1-9]\d%", found.text)  # no share above 1
 
 
-def test_actions_changed_after_ingest_are_no_fault_of_the_profile(
-    logs: FedRows, twin: FedRows
-) -> None:
-    found = diagnose_rows(replace(logs, action=_swapped(logs).action), twin).findings
-    assert [one.cause for one in found] == ["ACTIONS_CHANGED"]
-    assert "profile" not in found[0].remedy
-
-
 @pytest.mark.parametrize(
     ("kind", "tagged", "part"),
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -319,28 +318,6 @@ def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len(document["runs"][0]["windows"]) == 4
 
 
-@pytest.mark.parametrize("seeds", [1, 3])
-def test_its_table_breaks_no_word_in_80_columns(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    seeds: int,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    given = [f"runs/policy-{seed}" for seed in range(seeds)]
-    for seed, name in enumerate(given):
-        make_run(Path(name), windows=2, seed=seed)
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    monkeypatch.setenv("TERM", "dumb")
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["diagnose", *given]) == 0
-    table = capsys.readouterr().out.partition("\nUNDETERMINED\n")[0]
-    assert max(map(len, table.splitlines())) <= 80
-    assert "agreement: logged rows that look like it;" in " ".join(table.split())
-    words = {*CONDITIONS, "agreement", "unexplained", "median", "supply"}
-    assert words | (set(given) | {"UNDETERMINED"} if seeds > 1 else set()) <= set(table.split())
-
-
 def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Run.create(tmp_path / "young", {"config": msgspec.to_builtins(TrainConfig())})
     make_run(tmp_path / "well")
@@ -356,73 +333,6 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
         assert main(["diagnose", *words]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "c").exists()
-
-
-@pytest.mark.parametrize(
-    ("symptoms", "advice"),
-    [
-        (
-            {"windows": 1},
-            "train longer, or evaluate more often (evaluation.every_env_steps): 1 evaluation, and "
-            "the verdict needs 3",
-        ),
-        (
-            {"until": 3, "lag": 0.9},
-            "train longer: the last 3 evaluations do not agree on whether the target is at fault",
-        ),
-        (
-            {"every": 325, "lag": 0.4},
-            "train longer: after 1,300 updates any target lags; L is judged from 1,500 on",
-        ),
-        (
-            {"every": 50, "lag": 0.4, "target": Polyak(tau=0.02)},
-            "train longer: after 200 updates any target lags; L is judged from 500 on",
-        ),
-        (
-            {"every": 400, "lags": (0.9, 0.6, 0.4, 0.3)},
-            "train longer: L is still falling (0.60, 0.40, 0.30), as the values of a young run are"
-            " learnt",
-        ),
-        (
-            {"gap": {"nominal": 9.0}, "agreement": dict.fromkeys(CONDITIONS, 0.01)},
-            "correct what the evidence names, and train again: more than half of the conditions "
-            "are in doubt, which may be their rows or the critic",
-        ),
-    ],
-)
-def test_why_nothing_is_named_is_said(
-    tmp_path: Path, symptoms: dict[str, Any], advice: str
-) -> None:
-    found = diagnose([make_run(tmp_path / "r", **symptoms)])
-    assert found.cause == "UNDETERMINED"
-    assert found.experiment == advice
-
-
-def test_runs_that_disagree_are_listed(tmp_path: Path) -> None:
-    found = diagnose([make_run(tmp_path / "w"), make_run(tmp_path / "s", lag=0.9, seed=1)])
-    assert found.experiment == (
-        "train longer, or with more seeds: the runs do not agree (HEALTHY, TARGET)"
-    )
-
-
-@pytest.mark.parametrize(
-    ("symptoms", "line"),
-    [
-        ({"lag": 0.333}, "target: L is 0.333 (limit 0.25): the target is far behind"),
-        (
-            {"lag": 0.0},
-            "target: L is 0 (at least 0.002 is expected): there is no target network to speak of",
-        ),
-        ({"clock": 8.0}, "target: S is 8 (limit 2): the networks disagree"),
-        ({"gap": 7.0}, "target: the median G is 7 (limit 6): everything is worse held out"),
-    ],
-)
-def test_the_evidence_names_the_figure_and_its_limit(
-    tmp_path: Path, symptoms: dict[str, Any], line: str
-) -> None:
-    found = diagnose([make_run(tmp_path / "r", **symptoms)])
-    assert found.cause == "TARGET"
-    assert line in found.evidence
 
 
 @pytest.mark.parametrize(
