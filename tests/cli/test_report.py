@@ -563,7 +563,7 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
     for ended_on, failed in (("hall.toml", 18), ("default", 0)):
-        section = floor_section(_on_floors(run, tmp_path / ended_on, str(hall), ended_on))
+        section = floor_section(_on_floors(run, tmp_path / f"on {ended_on}", str(hall), ended_on))
         assert section is not None
         assert 'rect width="800" height="200"' in section.figures[0].widest
         assert f"{failed} failed clean episodes there" in str(section.figures[1].caption)
