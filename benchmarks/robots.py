@@ -1,6 +1,6 @@
 """Shared robots, kind by kind: one profile, one store, the robot in the twin, a policy, judged.
 
-    python benchmarks/robots.py --bags FOLDER --out DIR [--only TEXT] [--definitions DIR] [--json]
+    python benchmarks/robots.py --bags FOLDER --out DIR [--only TEXT] [--definitions PATH] [--json]
 
 Recordings are grouped into kinds of robots by what they say themselves (command, odometry's frames,
 lidar, description), never by their names. Each kind goes through `restock start` as a stranger's
@@ -34,7 +34,6 @@ from strangers import recordings_of
 from restock.cli import main as restock
 from restock.files import read_json, write_text
 from restock.ingest import open_recording
-from restock.ingest.containers.open_recording import with_definitions
 from restock.ingest.propose.drives import robot_kinds, robot_traits
 from restock.replay import Store
 from restock.stats import interval_text
@@ -57,7 +56,7 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="paths that hold this text")
     parser.add_argument("--minutes", type=float, default=3.0, help="of `restock start`, each kind")
     parser.add_argument("--twin", choices=("yes", "auto"), default="yes", help="as of start")
-    parser.add_argument("--definitions", type=Path, metavar="DIR", help="of the robots' own types")
+    parser.add_argument("--definitions", metavar="PATH", help="of the robots' own types")
     parser.add_argument("--kept", action="store_true", help="only what earlier calls left in DIR")
     options = parser.parse_args()
     paths = [path for path, _ in recordings_of(options.bags) if options.only in path.as_posix()]
@@ -130,7 +129,7 @@ def said(command: Sequence[str]) -> str:
 
 
 def measured(
-    kind: Kind, folder: Path, tags: Mapping[str, Mapping[str, str]], definitions: Path | None
+    kind: Kind, folder: Path, tags: Mapping[str, Mapping[str, str]], definitions: str | None
 ) -> dict[str, Any]:
     """Return the figures of one kind, from what `restock start` left."""
     stages = read_json(folder / "start" / "stages.json")
@@ -246,11 +245,11 @@ def policy_of(stages: Documents, documents: Documents) -> dict[str, Any]:
     }
 
 
-def contacts_against_labels(kind: Kind, store: Path, definitions: Path | None) -> dict[str, Any]:
+def contacts_against_labels(kind: Kind, store: Path, definitions: str | None) -> dict[str, Any]:
     """Return how labels made without the bumper fare against it; empty where there is none."""
     contacts = {}
     for path in kind.paths:
-        with open_recording(path, typestore=with_definitions(None, definitions)) as recording:
+        with open_recording(path, definitions=definitions) as recording:
             if (found := contacts_of(recording)) is not None:
                 contacts[path] = found
     if not contacts:

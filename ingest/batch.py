@@ -56,7 +56,7 @@ class IngestJob:
     store: str | Path | None
     force: bool = False
     salvage: bool = False
-    typestore: str | None = None
+    definitions: str | None = None
     repeated: OnRepeat = "keep"  # a recording that is in the store under another id
     tags: Mapping[str, str] = field(default_factory=dict)  # of every recording
 
@@ -71,7 +71,7 @@ class IngestJob:
         from restock.ingest.store.writer import StoreWriter
 
         try:
-            how = Reading(self.force, self.salvage, self.typestore, self.repeated, self.tags)
+            how = Reading(self.force, self.salvage, self.definitions, self.repeated, self.tags)
             store = StoreWriter(self.store) if self.store is not None else None
             return prepare(path, self.profile, how, store=store, watch=watch, settle=settle)
         except RestockError as error:

@@ -57,7 +57,7 @@ def ingest(
     store: StoreWriter | None,
     force: bool = False,
     salvage: bool = False,
-    typestore: str | None = None,
+    definitions: str | None = None,
     repeated: OnRepeat = "keep",
     tags: Mapping[str, str] | None = None,
     watch: Watch | None = None,
@@ -79,7 +79,7 @@ def ingest(
         StoreError: the store cannot be written.
         ConfigError: an argument that is of another kind, or no rule for `repeated`.
     """
-    how = Reading(force, salvage, typestore, repeated, tags or {})
+    how = Reading(force, salvage, definitions, repeated, tags or {})
     prepared = prepare(path, profile, how, store=store, watch=watch)
     if store is None:
         return prepared.result
@@ -95,7 +95,7 @@ class Reading:
 
     force: bool = False
     salvage: bool = False
-    typestore: str | None = None
+    definitions: str | None = None
     repeated: OnRepeat = "keep"
     tags: Mapping[str, str] = field(default_factory=dict)
 
@@ -130,7 +130,7 @@ def prepare(
     if store is not None:
         expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
     with open_recording(
-        path, typestore=how.typestore, salvage=how.salvage, watch=watch
+        path, definitions=how.definitions, salvage=how.salvage, watch=watch
     ) as recording:
         renamed = renamed_inputs(profile, recording.topics)
         profile = as_recorded(profile, recording.topics)

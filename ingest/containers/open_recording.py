@@ -40,7 +40,7 @@ from restock.ingest.containers.storage import (
     unwatched,
 )
 from restock.ingest.decoding.decoders import READABLE
-from restock.ingest.decoding.definitions import DEFAULT_DISTRO, refuse_unknown
+from restock.ingest.decoding.definitions import DEFAULT_DISTRO, choose_definitions
 
 CONTAINERS: tuple[Container, ...] = (
     mcap_file.CONTAINER,
@@ -360,7 +360,7 @@ def container_of(path: Path) -> Container | None:
 def open_recording(
     path: Path | str,
     *,
-    typestore: str | None = None,
+    definitions: str | None = None,
     salvage: bool = False,
     watch: Watch | None = None,
 ) -> Recording:
@@ -368,9 +368,9 @@ def open_recording(
 
     Args:
         path: the file or folder.
-        typestore: the distribution ("humble", "jazzy", …) whose message definitions are used
-            where a recording carries none, as older sqlite3 bags do; `humble+/a/folder` has those
-            of the folder's .msg and .idl files on top.
+        definitions: where message definitions come from if a recording carries none, as older
+            sqlite3 bags do: a distribution ("humble", "jazzy", …), or a folder or file of .msg and
+            .idl definitions, which is used on top of Humble's; "jazzy+a/folder" names both.
         salvage: read what can still be read of a file that is cut short or damaged, instead of
             refusing it; what is missing is in the recording's `lost_messages`.
         watch: is told how far a long opening, and later a long read, is: what is being done, how
@@ -381,8 +381,7 @@ def open_recording(
             `salvage`), or in a serialisation that is not CDR.
     """
     path = recording_path(path)
-    distro = typestore or DEFAULT_DISTRO
-    refuse_unknown(distro)  # before anything is opened
+    distro = choose_definitions(definitions)  # before anything is opened
     return _Opening(path, distro, salvage, watch or unwatched).open()
 
 
@@ -395,19 +394,6 @@ def refuse_no_recording(path: Path) -> None:
     opening = _Opening(path, DEFAULT_DISTRO, False, unwatched)
     for file in opening.files():
         container_of(file)
-
-
-def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
-    """Name a type store with a folder's .msg and .idl files on top: `humble+/the/folder`.
-
-    Raises:
-        RecordingError: no such distribution or folder, or no definition in it that can be read.
-    """
-    if folder is None:
-        return typestore
-    name = f"{typestore or DEFAULT_DISTRO}+{folder.absolute()}"
-    refuse_unknown(name)
-    return name
 
 
 class _Opening:

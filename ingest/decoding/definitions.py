@@ -1,7 +1,7 @@
 """ROS message definitions: from the text in a recording, a named distribution, or a folder.
 
 rosbag2 keeps the text of files: with `#include` lines, comments, and the line ends of the editor.
-Bags of sqlite3 before 2023 carry no definitions: `--definitions DIR` reads those of a robot's own
+Bags of sqlite3 before 2023 carry no definitions: `--definitions PATH` reads those of a robot's own
 packages from their sources: `DIR/**/PACKAGE/msg/NAME.msg` (or `PACKAGE/NAME.msg`) and `.idl`.
 """
 
@@ -124,16 +124,15 @@ def ackermann_types() -> Typesdict:
 
 @cache
 def folder_types(folder: str) -> Typesdict:
-    """Return every type that the `.msg` and `.idl` files of a folder define.
+    """Return every type that a `.msg` or `.idl` file defines, or all of them in a folder.
 
     Raises:
-        RecordingError: no such folder, no definition in it or too many, or one that cannot be read;
-            names it.
+        RecordingError: no definition in it or too many, or one that cannot be read; names it.
     """
     root = Path(folder)
-    if not root.is_dir():
-        raise _refused(folder, "no such folder of definitions")
     files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])
+    if root.is_file():
+        root, files = root.parent, [root]
     if len(files) > MAX_FILES:
         raise _refused(folder, f"it holds {len(files):,} definitions, more than {MAX_FILES:,}")
     types: Typesdict = {}
@@ -157,7 +156,7 @@ def folder_types(folder: str) -> Typesdict:
 
 
 def _refused(folder: str, why: str) -> RecordingError:
-    remedy = "--definitions needs a folder that contains PACKAGE/msg/NAME.msg (or .idl)"
+    remedy = "give a folder that contains PACKAGE/msg/NAME.msg (or .idl)"
     return RecordingError(why, where=folder, remedy=remedy)
 
 
@@ -215,25 +214,33 @@ def distro_types(distro: str) -> Typesdict:
     return {**ackermann_types(), **_distro_store(name).fielddefs, **hand}
 
 
-def refuse_unknown(distro: str) -> None:
-    """Check a distribution's name, without loading its definitions; and the folder after a `+`.
+def choose_definitions(definitions: str | None) -> str:
+    """Name a distribution, and after a `+` the folder or file whose definitions are on top.
+
+    `definitions` is a distribution, a folder or file, both with a `+` between them, or None. The
+    distribution's definitions are not loaded.
 
     Raises:
-        RecordingError: no distribution of that name, or no definitions in that folder.
+        RecordingError: neither a distribution nor a place, or a place without definitions.
     """
-    distro, _, folder = distro.partition("+")
-    if folder:
-        folder_types(folder)
+    distro, _, place = (definitions or DEFAULT_DISTRO).partition("+")
     if distro not in _STORES:
+        distro, place = DEFAULT_DISTRO, str(definitions)
+    if not place:
+        return distro
+    path = Path(place).absolute()
+    if not path.exists():
         raise RecordingError(
-            f"no type store named {distro!r}",
-            remedy=f"choose one of {', '.join(sorted(_STORES.keys() - {'empty', 'latest'}))}",
+            f"no ROS distribution, folder or file of definitions named {place!r}",
+            remedy=f"choose one of {', '.join(sorted(_STORES.keys() - {'empty', 'latest'}))};"
+            " or a folder that contains PACKAGE/msg/NAME.msg",
         )
+    folder_types(str(path))
+    return f"{distro}+{path}"
 
 
 @cache
 def _distro_store(distro: str) -> Typestore:
-    refuse_unknown(distro)
     return get_typestore(_STORES[distro])
 
 
@@ -259,7 +266,7 @@ def message_type(channel: Channel, distro: str) -> RosType:
     if name not in types:
         raise CannotDecode(
             f"unknown type {channel.type or '(unnamed)'}: not defined in the recording"
-            f" nor in {distro!r} (--definitions DIR reads .msg and .idl files)"
+            f" nor in {distro!r} (--definitions PATH reads .msg and .idl files)"
         )
     return _from_distro(name, distro)
 

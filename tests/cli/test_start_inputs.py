@@ -158,7 +158,7 @@ def test_a_robots_own_types_are_read_by_their_definitions(tmp_path: Path) -> Non
     message.parent.mkdir(parents=True)
     message.write_text(BUMP + "uint8 right_side\n")
     bag = SHARED / "fleet-neato" / "2024-danpark" / "drive_square"
-    to = Settings((str(bag),), tmp_path / "out", definitions=message.parents[2])
+    to = Settings((str(bag),), tmp_path / "out", definitions=str(message.parents[2]))
     work = Work(to.out, cli.main, lambda line: None)
     (recording,) = work.do(stages.info(to)).document["recordings"]
     assert recording["topics"]["/bump"]["skipped"] is None
@@ -332,12 +332,11 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
     [
         ("--mixture", "coverag", "one of coverage, uniform"),
         ("--profile", "no_such.toml", "no such profile"),
-        ("--typestore", "humbel", "no type store named 'humbel'"),
+        ("--definitions", "humbel", "no ROS distribution, folder or file"),
         ("--footprint", "wide", "--footprint"),
         ("--minutes", "nan", "--minutes"),
         ("--out", "a_file", "give a folder with --out"),
         ("--tag", "north", "'north' is not KEY=VALUE"),
-        ("--definitions", "nowhere", "no such folder of definitions"),
         ("--map", "no_map.yaml", "no_map.yaml: cannot be read: No such file"),
         ("--urdf", "box.urdf", "'box' has no wheels"),
     ],

@@ -11,8 +11,8 @@ from support.paths import SHARED
 
 from restock.cli import main
 from restock.errors import RecordingError
-from restock.ingest.containers.open_recording import open_recording, with_definitions
-from restock.ingest.decoding.definitions import folder_types
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.definitions import choose_definitions, folder_types
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import steps_of
@@ -52,15 +52,26 @@ def test_more_definitions_than_are_read_are_refused_and_not_cut(tmp_path, monkey
         folder_types(str(package(tmp_path)))
 
 
+def test_definitions_are_a_distribution_a_folder_or_a_file(tmp_path):
+    folder = package(tmp_path)
+    assert choose_definitions(None) == "humble"
+    assert choose_definitions("jazzy") == "jazzy"
+    assert choose_definitions(str(folder)) == f"humble+{folder}"
+    assert choose_definitions(f"jazzy+{folder}") == f"jazzy+{folder}"
+    (file,) = folder.rglob("*.msg")
+    assert choose_definitions(str(file)) == f"humble+{file}"
+    assert folder_types(str(file)).keys() == {"neato2_interfaces/msg/Bump"}
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 def test_a_type_that_nobody_knows_is_read_by_its_definition(tmp_path, capsys):
     with open_recording(NEATO) as recording:
         assert "--definitions" in str(recording.topics["/bump"].skipped)
-    with open_recording(NEATO, typestore=with_definitions(None, package(tmp_path))) as recording:
+    with open_recording(NEATO, definitions=str(package(tmp_path))) as recording:
         bump = recording.topics["/bump"]
         assert (bump.skipped, bump.expected) == (None, 142)
     assert main(["info", str(NEATO), "--definitions", str(tmp_path / "none")]) != 0
-    assert "no such folder of definitions" in capsys.readouterr().err
+    assert "no ROS distribution, folder or file" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

@@ -304,11 +304,11 @@ def test_a_sqlite_file_that_is_no_bag(tmp_path: Path) -> None:
         open_recording(tmp_path / "other.db3")
 
 
-def test_a_missing_file_topic_field_and_type_store(mcap: Path, tmp_path: Path) -> None:
+def test_a_missing_file_topic_field_and_distribution(mcap: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no such file"):
         open_recording(tmp_path / "none.mcap")
-    with pytest.raises(RecordingError, match="no type store named 'hamble'"):
-        open_recording(mcap, typestore="hamble")
+    with pytest.raises(RecordingError, match="definitions named 'hamble'"):
+        open_recording(mcap, definitions="hamble")
     with open_recording(mcap) as recording:
         with pytest.raises(RecordingError, match="no topic named '/odm'"):
             recording.read({"/odm": ["x"]})

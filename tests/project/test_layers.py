@@ -101,7 +101,7 @@ MAY_IMPORT = {
     "report/fleet": "look replay/fleet replay/store",
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
     "cli/data": (
-        "cli ingest ingest/containers ingest/profile ingest/propose"
+        "cli ingest ingest/containers ingest/decoding ingest/profile ingest/propose"
         " ingest/steps ingest/store ingest/task replay replay/export"
         " replay/fleet replay/mixture replay/panel replay/plan replay/store train/evaluation"
     ),
@@ -122,7 +122,7 @@ MAY_IMPORT = {
         " train/twin/floors train/twin/missions"
     ),
     "cli/twin": (
-        "cli report report/run ingest/containers ingest/profile ingest/propose"
+        "cli report report/run ingest/profile ingest/propose"
         " ingest/store ingest/task replay/fleet replay/store train/evaluation"
         " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
         " train/twin/physics train/twin/recording train/twin/survey"

@@ -232,7 +232,7 @@ def gather(
     with_map: bool,
     with_scans: bool,
     profile: Profile | None,
-    typestore: str | None,
+    definitions: str | None,
 ) -> Evidence:
     """Read what a floor can be made from, out of a recording or one recording of a store.
 
@@ -255,7 +255,7 @@ def gather(
             size = _of_profile(profile)
             return Evidence(stored.poses, known, size, notes=notes, others=stored.others)
         file = stored.recording
-    with open_recording(file, typestore=typestore, salvage=True) as recording:
+    with open_recording(file, definitions=definitions, salvage=True) as recording:
         known = _map(recording, map_yaml, notes, needed=with_map)
         free_on = _free_on(known)
         poses = own = choose_poses(candidate_poses(recording, profile), free_on)

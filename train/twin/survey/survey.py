@@ -105,7 +105,7 @@ def survey(
     by: Source | None = None,
     profile: Profile | None = None,
     footprint: Footprint | None = None,
-    typestore: str | None = None,
+    definitions: str | None = None,
 ) -> Surveyed:
     """Build the floor that a recording, or one recording of a store, shows.
 
@@ -117,7 +117,7 @@ def survey(
         profile: says which topics are the pose and the scan, and how large the robot is; of a
             store, the one that it was ingested by if this is None.
         footprint: how large the robot is, before anything else that says it.
-        typestore: as `open_recording` takes it.
+        definitions: as `open_recording` takes it.
 
     Raises:
         RecordingError: it cannot be read, or holds nothing that a floor can be made from.
@@ -136,7 +136,7 @@ def survey(
         with_map=by in (None, "map"),
         with_scans=by in (None, "scans"),
         profile=profile,
-        typestore=typestore,
+        definitions=definitions,
     )
     body, notes = footprint or evidence.footprint, list(evidence.notes)
     poses = evidence.poses

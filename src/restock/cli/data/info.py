@@ -50,12 +50,9 @@ class InfoCommand:
 
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")] = ()
     """Recordings, folders of recordings, globs, or stores."""
-    typestore: str | None = None
-    """ROS 2 distribution whose message definitions are used for recordings without their own.
-    Default: humble."""
-    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
-    recordings that do not contain the definitions."""
+    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    """Message definitions for recordings without their own: a ROS distribution (default: humble),
+    or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     salvage: bool = False
     """Also read what is intact in damaged or truncated files (exit code 3)."""
     clocks: bool = False
@@ -96,9 +93,10 @@ class InfoCommand:
     def _describe(self, paths: Sequence[str]) -> tuple[ExitCode, list[dict[str, Any]]]:
         """Describe each recording; return the exit code of the worst, and the descriptions."""
         from restock.cli import output
-        from restock.ingest.containers.open_recording import recordings_in, with_definitions
+        from restock.ingest.containers.open_recording import recordings_in
+        from restock.ingest.decoding.definitions import choose_definitions
 
-        typestore = with_definitions(self.typestore, self.definitions)
+        choose_definitions(self.definitions)
         entries: list[dict[str, Any]] = []
         code = ExitCode.OK
         for name in paths:
@@ -113,7 +111,7 @@ class InfoCommand:
                     with output.progress(f"info {path.name}", None) as advance:
                         entry = describe_recording(
                             path,
-                            typestore=typestore,
+                            definitions=self.definitions,
                             salvage=self.salvage,
                             clocks=self.clocks,
                             watch=advance.part,
@@ -133,7 +131,7 @@ class InfoCommand:
 def describe_recording(
     path: Path | str,
     *,
-    typestore: str | None = None,
+    definitions: str | None = None,
     salvage: bool = False,
     clocks: bool = False,
     watch: Watch | None = None,
@@ -150,7 +148,7 @@ def describe_recording(
     from restock.ingest.containers.open_recording import open_recording
     from restock.ingest.containers.topic_reading import LATEST_NS
 
-    with open_recording(path, typestore=typestore, salvage=salvage, watch=watch) as recording:
+    with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)

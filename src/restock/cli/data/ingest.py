@@ -54,12 +54,9 @@ class IngestCommand:
     ] = ()
     """A tag for the recordings: robot, site, firmware, map, shift, or any other name. It overrides
     tags from the recording or its path; KEY= removes a tag. May be given several times."""
-    typestore: str | None = None
-    """ROS 2 distribution whose message definitions are used for recordings without their own.
-    Default: humble."""
-    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
-    recordings that do not contain the definitions."""
+    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    """Message definitions for recordings without their own: a ROS distribution (default: humble),
+    or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     workers: int = 1
     """How many processes read recordings at the same time."""
     engine: Literal["processes", "ray"] = "processes"
@@ -88,7 +85,7 @@ class IngestCommand:
 
         from restock.cli import output
         from restock.ingest.batch import IngestJob, ingest_all
-        from restock.ingest.containers.open_recording import with_definitions
+        from restock.ingest.decoding.definitions import choose_definitions
         from restock.ingest.store.compaction import fold_if_many
         from restock.ingest.store.writer import StoreWriter
 
@@ -96,8 +93,8 @@ class IngestCommand:
         if store is not None:
             StoreWriter(store).expect_folder()  # or say now why not, and not once a recording
             StoreWriter(store).reach()
-        typestore = with_definitions(self.typestore, self.definitions)
-        job = IngestJob(*(profile, store, self.force, self.salvage, typestore, self.repeated, tags))
+        chosen = choose_definitions(self.definitions)
+        job = IngestJob(*(profile, store, self.force, self.salvage, chosen, self.repeated, tags))
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False

@@ -70,12 +70,9 @@ class ProfileCommand:
     mostly stood. Rows without a goal are then left out. See docs/task.md."""
     out: Path | None = None
     """Where `new` writes the profile. An existing file is not overwritten."""
-    typestore: str | None = None
-    """ROS 2 distribution whose message definitions are used for recordings without their own.
-    Default: humble."""
-    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
-    recordings that do not contain the definitions."""
+    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    """Message definitions for recordings without their own: a ROS distribution (default: humble),
+    or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     salvage: bool = False
     """Also read what is intact in damaged or truncated files."""
     json: bool = False
@@ -83,12 +80,6 @@ class ProfileCommand:
     "problems", "advice", "commands", "kinds", "wheeled", "read" (first the one it
     was proposed from), "unread", "unreadable", "losses"}; `check`: {"inputs", "problems", "advice",
     "inside_outline", "outcome", …}."""
-
-    @property
-    def _typestore(self) -> str | None:
-        from restock.ingest.containers.open_recording import with_definitions
-
-        return with_definitions(self.typestore, self.definitions)
 
     def run(self) -> int:
         """Do one of the two."""
@@ -223,7 +214,7 @@ class ProfileCommand:
 
         with output.progress(f"opening {Path(path).name}", None) as advance:
             recording = open_recording(
-                path, typestore=self._typestore, salvage=self.salvage, watch=advance.part
+                path, definitions=self.definitions, salvage=self.salvage, watch=advance.part
             )
         recording.watch = unwatched  # the bar is over
         if self.robot is not None:
@@ -259,7 +250,7 @@ class ProfileCommand:
                     outcome = ingest(
                         *(self.paths[1], profile),
                         store=None,
-                        typestore=self._typestore,
+                        definitions=self.definitions,
                         salvage=self.salvage,
                         watch=advance.part,
                     )

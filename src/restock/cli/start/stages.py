@@ -67,8 +67,7 @@ class Settings:
     kinds: tuple[str, ...] = ()  # kinds of missions; none: all that the floor has room for
     device: str = "cpu"
     mixture: str = "coverage"
-    typestore: str | None = None
-    definitions: Path | None = None
+    definitions: str | None = None  # as `open_recording` takes them
     salvage: bool = False
     tags: tuple[str, ...] = ()  # each KEY=VALUE
     map: Path | None = None
@@ -132,9 +131,7 @@ class Settings:
     @property
     def with_definitions(self) -> list[str]:
         """Return the options that define message types which a recording does not define."""
-        distribution = [] if self.typestore is None else ["--typestore", self.typestore]
-        folder = [] if self.definitions is None else ["--definitions", str(self.definitions)]
-        return distribution + folder
+        return [] if self.definitions is None else ["--definitions", self.definitions]
 
     @property
     def reading(self) -> list[str]:
@@ -144,7 +141,10 @@ class Settings:
     @property
     def read(self) -> tuple[Path, ...]:
         """Return the user's files that every stage reads which reads a recording."""
-        return (*self.recordings, *([] if self.definitions is None else [self.definitions]))
+        from restock.ingest.decoding.definitions import choose_definitions
+
+        place = choose_definitions(self.definitions).partition("+")[2]
+        return (*self.recordings, *([Path(place)] if place else []))
 
     @property
     def profile_file(self) -> tuple[Path, ...]:

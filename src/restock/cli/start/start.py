@@ -74,7 +74,6 @@ class Way:
             episodes=max(round(4 * requested.minutes), 1),
             device=requested.device,
             mixture=requested.mixture,
-            typestore=requested.typestore,
             definitions=requested.definitions,
             salvage=requested.salvage,
             tags=requested.tag,
@@ -348,12 +347,9 @@ class StartCommand:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()
     """A tag for the recordings: robot, site, or any other name. May be given several times."""
-    typestore: str | None = None
-    """ROS 2 distribution whose message definitions are used for recordings without their own.
-    Default: humble."""
-    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
-    recordings that do not contain the definitions."""
+    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    """Message definitions for recordings without their own: a ROS distribution (default: humble),
+    or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     mixture: str = "coverage"
     """The mixture that the learner is fed: the name of a shipped one, or a TOML file."""
     minutes: float = 5.0
@@ -459,12 +455,10 @@ class StartCommand:
                 where=str(self.out),
                 remedy="give a folder with --out: it need not exist",
             )
-        from restock.ingest.containers.open_recording import with_definitions
-        from restock.ingest.decoding.definitions import refuse_unknown
+        from restock.ingest.decoding.definitions import choose_definitions
         from restock.replay.mixture.mixture import load_mixture
 
-        if (types := with_definitions(self.typestore, self.definitions)) is not None:
-            refuse_unknown(types)
+        choose_definitions(self.definitions)
         load_mixture(self.mixture)
         if self.profile is not None:
             from restock.ingest.profile.profile import load_profile

@@ -48,12 +48,9 @@ class LayoutCommand:
     scan, and the robot's size. Default: that of the store, else a proposal from the topics."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
     """With --from: the robot's length and width in metres. It overrides all other sources."""
-    typestore: str | None = None
-    """ROS 2 distribution whose message definitions are used for recordings without their own.
-    Default: humble."""
-    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
-    recordings that do not contain the definitions."""
+    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    """Message definitions for recordings without their own: a ROS distribution (default: humble),
+    or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     out: Path | None = None
     """Write the floor to this file: FILE.toml, or map.yaml (and map.pgm beside it). Existing files
     are not overwritten."""
@@ -142,7 +139,6 @@ class LayoutCommand:
         if self.floor is not None:
             self._refuse_without_from()
             return open_floor(self.floor), None
-        from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.propose.footprint import parse_footprint
         from restock.train.twin.survey.survey import survey
@@ -154,7 +150,7 @@ class LayoutCommand:
             by=self.by,
             profile=None if self.profile is None else load_profile(self.profile),
             footprint=None if self.footprint is None else parse_footprint(self.footprint),
-            typestore=with_definitions(self.typestore, self.definitions),
+            definitions=self.definitions,
         )
         return surveyed.floor, surveyed
 
@@ -165,7 +161,6 @@ class LayoutCommand:
             "by",
             "profile",
             "footprint",
-            "typestore",
             "definitions",
             "zones",
         ):
