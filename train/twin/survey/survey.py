@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from restock.errors import ConfigError, RecordingError
+from restock.ingest.decoding.definitions import choose_definitions
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint
 from restock.replay.store.store import is_store
@@ -129,6 +130,7 @@ def survey(
             "a recording is chosen of a store, and this is none", where=str(path),
             remedy="leave it out, or give the store",
         )  # fmt: skip
+    choose_definitions(definitions)  # once, not for each recording of a folder
     evidence = gather(
         path,
         stored_recording=recording,
