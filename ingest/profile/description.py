@@ -106,7 +106,7 @@ def read_description(text: str) -> Description | str:
         roots = [name for name in links if name not in placed]
         if len(roots) != 1:
             return _no_base(roots)
-        base = _moving(roots[0], links, joints)
+        base = roots[0]
     return Description(str(robot.get("name") or "robot"), links, joints, base, robot)
 
 
@@ -115,13 +115,6 @@ def _of_xacro(element: ET.Element) -> bool:
     values = element.attrib.values()
     in_namespace = element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]
     return in_namespace or any("${" in value or "$(" in value for value in values)
-
-
-def _moving(root: str, links: dict[str, ET.Element], joints: list[Joint]) -> str:
-    """Return the root, or the robot that moves in it if it is a world without parts of its own."""
-    under = [joint for joint in joints if joint.parent == root]
-    free = len(under) == 1 and under[0].kind in ("floating", "planar")
-    return under[0].child if free and not len(links[root]) and under[0].child in links else root
 
 
 def _no_base(roots: list[str]) -> str:

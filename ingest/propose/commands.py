@@ -29,9 +29,7 @@ from restock.ingest.profile.inputs import is_motion
 from restock.ingest.propose.clock_choice import Gaps
 from restock.ingest.propose.robot_choice import (
     DriveEvidence,
-    RobotProposal,
     drive_evidence,
-    shown_wheelbase_m,
 )
 from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.motion import PoseSeries
@@ -381,22 +379,17 @@ def read_commands(
 
 
 def commanded(
-    recording: Recording,
-    fit: tuple[TopicInfo, Kind],
-    wheelbase_m: float | None,
-    *,
-    angles: bool = False,
+    recording: Recording, fit: tuple[TopicInfo, Kind], wheelbase_m: float | None
 ) -> tuple[TopicColumns, Ints, F64, F64]:
     """Read the commands of a topic.
 
     Returns them, with log time (N,), m/s (N,) and rad/s (N,), without those that are not finite.
-    With `angles`, steering angles stay in rad.
     """
     topic, kind = fit
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
     speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
-    if "steering_rad" in kind.fields and not angles:
+    if "steering_rad" in kind.fields:
         turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
     sane = np.isfinite(speed) & np.isfinite(turn)
     return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
@@ -468,34 +461,8 @@ def how_it_turned(
         return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
     if is_motion(topic.type) or poses is None or len(poses) < 2:
         return DriveEvidence(), None
-    return drive_evidence(*_since(recording, roles, poses)), None
-
-
-def wheelbase_of(
-    recording: Recording, roles: Roles, poses: PoseSeries | None, robot: RobotProposal
-) -> RobotProposal:
-    """Add the wheelbase by which steering angles explain how the robot turned.
-
-    The robot is as given if they do not explain it, or a description has its wheelbase.
-    """
-    angled = bool(roles["command"]) and "steering_rad" in roles["command"][0][1].fields
-    if robot.described or not angled or poses is None or len(poses) < 2:
-        return robot
-    command_s, _, command_rad, since = _since(recording, roles, poses, angles=True)
-    wheelbase_m = shown_wheelbase_m(
-        command_s, command_rad, since, robot.values.get("max_steering_rad")
-    )
-    return robot if wheelbase_m is None else robot.with_wheelbase(wheelbase_m)
-
-
-def _since(
-    recording: Recording, roles: Roles, poses: PoseSeries, *, angles: bool = False
-) -> tuple[F64, F64, F64, PoseSeries]:
-    """Read the commands in order (N,), and the poses, in seconds since the first pose.
-
-    Commands are m/s and rad/s; with `angles`, steering angles stay in rad.
-    """
-    _, times, speed, turn = commanded(recording, roles["command"][0], None, angles=angles)
+    _, times, speed, turn = commanded(recording, (topic, kind), None)
     order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
     since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
-    return (times[order] - zero) * 1e-9, speed[order], turn[order], since
+    seconds = (times[order] - zero) * 1e-9
+    return drive_evidence(seconds, speed[order], turn[order], since), None

@@ -97,7 +97,7 @@ def described_robot(
     wheels = _wheels(description, places)
     driven = _driven(wheels)
     if not driven:
-        return DescribedRobot(problem=_no_wheels(description, places, wheels))
+        return DescribedRobot(problem=_no_wheels(description, wheels))
     notes: list[str] = []
     if description.base.split("/")[-1] not in BASE_FRAMES:
         notes.append(_other_base(description.base))
@@ -319,8 +319,8 @@ def _meshes(description: Description, boxes: dict[str, tuple[F64, F64]]) -> int:
     )
 
 
-def _no_wheels(description: Description, places: dict[str, Place], wheels: list[_Wheel]) -> str:
-    """Say in one sentence why it does not roll, and what it looks like."""
+def _no_wheels(description: Description, wheels: list[_Wheel]) -> str:
+    """Say in one sentence why it does not roll."""
     kinds = Counter(joint.kind for joint in description.joints)
     has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
     if wheels:
@@ -329,20 +329,8 @@ def _no_wheels(description: Description, places: dict[str, Place], wheels: list[
             "pair on both sides with a known radius (a mesh has none): give wheel_radius_m and "
             "track_m in [robot]"
         )
-    rotors = [
-        joint
-        for joint in description.joints
-        if joint.kind == "continuous"
-        and joint.child in places
-        and abs(_axis(joint, places[joint.child])[2]) > 0.7
-    ]
-    looks = ""
-    if len(rotors) >= 3:
-        looks = ", it looks like a drone"
-    elif kinds["revolute"] >= 4:
-        looks = ", it looks like an arm or a legged robot"
     return (
-        f"{description.name!r} has no wheels{looks}: none of its joints ({has}) turns without end"
+        f"{description.name!r} has no wheels: none of its joints ({has}) turns without end"
         " about an axis across the robot"
     )
 

@@ -33,7 +33,6 @@ from restock.ingest.propose.commands import (
     how_it_turned,
     leaves_the_floor,
     read_commands,
-    wheelbase_of,
 )
 from restock.ingest.propose.footprint import (
     GUESS,
@@ -242,11 +241,10 @@ def gather(
     )
     turned, command_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
-    robot = wheelbase_of(recording, roles, poses, robot)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
-    if wheelbase_m is not None and robot.wheelbase_from:
-        commands = replace(commands, wheelbase_from=robot.wheelbase_from)
+    if wheelbase_m is not None and robot.described:
+        commands = replace(commands, wheelbase_from="of [robot]")
     paces = _paces(recording, roles)
     recorded_s = _recorded_s(recording, roles)
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces, roles, poses))

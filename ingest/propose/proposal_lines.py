@@ -450,7 +450,6 @@ def task_lines(seen: Evidence, trial: Trial) -> list[str]:
         *_bump_lines(seen.recording, roles),
         *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
-        *trial.comments("task.time_limit_steps"),
         *_time_limit_lines(seen, max(speed for speed, _ in actions)),
         *_range_lines(seen),
         *held_back,

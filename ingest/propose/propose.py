@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
@@ -31,14 +29,11 @@ from restock.ingest.propose.proposal_lines import (
     steered_by,
 )
 from restock.ingest.propose.roles import (
-    KINDS,
     REQUIRED,
     Kind,
     clouds_alone,
     robots_in,
     several_commands,
-    topics_for,
-    usable_topics,
 )
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
@@ -56,7 +51,6 @@ REMEDIES = {
 INSTEAD_OF_COMMANDS = (
     "; or, if the measured motion may be used as the command, add --odometry-as-command"
 )
-SELDOM = 2.5  # control periods between two poses
 
 
 @dataclass(frozen=True)
@@ -161,12 +155,12 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.command", steered))
     if seen.robot.guessed_steering and not seen.commands.steered:
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
-    advice += [*_seldom_poses(seen), *_odd_commands(seen)]
+    advice += _odd_commands(seen)
     advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
     if seen.origin_m is not None:
         why = f"poses are far from 0 (UTM coordinates?): positions are from {list(seen.origin_m)}"
         advice.append(Advice("origin_m", f"{why}, and so are zones and floors"))
-    if seen.commands.steered and not seen.robot.wheelbase_from:
+    if seen.commands.steered and not seen.robot.described:
         reported = "a guess, and with it every yaw rate that was commanded: measure it"
         advice.append(Advice("inputs.command.wheelbase_m", reported))
     if not seen.footprint.measured and seen.roles["scan"]:
@@ -185,23 +179,6 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         findings=trial.findings,
         wheeled=other is None,
     )
-
-
-def _seldom_poses(seen: Evidence) -> list[Advice]:
-    """Advise on poses that come seldom while transforms lead to the map all the time."""
-    if not seen.roles["pose"] or seen.poses_from_frames or seen.frames is None:
-        return []
-    topic = seen.roles["pose"][0][0].name
-    pace_s = seen.paces_s.get(topic, 0.0) * seen.clock.pace
-    if not seen.frames.localised or pace_s <= SELDOM * seen.clock.period_s:
-        return []
-    behind_m = pace_s * seen.commands.speed_mps
-    text = (
-        f"{topic} comes every {pace_s:.1f} s, so that poses are up to {behind_m:.1g} m behind; the "
-        "[frames] of the proposal, in place of [inputs.pose], follow the transforms (a policy on "
-        "the robot needs a topic)"
-    )
-    return [Advice("inputs.pose", text)]
 
 
 def _odd_commands(seen: Evidence) -> list[Advice]:
@@ -284,7 +261,6 @@ MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
 ARMS = ("trajectory_msgs/msg/JointTrajectory", "control_msgs/", "moveit_msgs/")
 CAMERAS = re.compile(r"sensor_msgs/msg/(Image|CompressedImage|CameraInfo|PointCloud2?)$")
 ALONGSIDE = re.compile(r"tf2_msgs/|rcl_interfaces/|rosgraph_msgs/|std_msgs/|diagnostic_msgs/")
-RISES_M = 0.5  # of a pose between its 5th and 95th percentile: no floor's
 ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its velocity commands"
 
 
@@ -302,13 +278,6 @@ def no_wheeled_robot(
     if not (command and located) and flying:
         reported = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
         return f"this looks like a drone's recording (it has {reported}): {ON_WHEELS}"
-    rises_m, lifted = _rises_m(recording), _lifted(recording, command)
-    if rises_m > RISES_M and (flying or lifted):
-        reported = "commands go up and down" if lifted else f"it has topics of {flying[0]}"
-        return (
-            f"this looks like a drone's recording (it rises by {rises_m:.1f} m, {reported}): "
-            f"{ON_WHEELS}"
-        )
     if command:
         off, requested = off_the_floor(recording, command[0])
         if 2 * off <= requested:
@@ -329,26 +298,3 @@ def no_wheeled_robot(
             "velocity command and no odometry): also record the command and a pose"
         )
     return None
-
-
-def _rises_m(recording: Recording) -> float:
-    """Return how far the poses of a recording go up and down; 0 if there are none."""
-    rises = [0.0]
-    for topic, kind in topics_for(recording, usable_topics(recording), KINDS["pose"]):
-        path = kind.fields.get("x_m", "").removesuffix("x") + "z"
-        if path in recording.leaves(topic.name):
-            heights = np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])
-            heights = heights[np.isfinite(heights)]
-            rises.append(float(np.ptp(np.percentile(heights, [5, 95]))) if len(heights) else 0.0)
-    return max(rises)
-
-
-def _lifted(recording: Recording, command: Sequence[tuple[TopicInfo, Kind]]) -> bool:
-    """Return whether the driving command asks for speed upward."""
-    if not command:
-        return False
-    topic, kind = command[0]
-    path = kind.fields["speed_mps"].removesuffix("x") + "z"
-    if not path.endswith("linear.z"):
-        return False
-    return bool(np.any(np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])))

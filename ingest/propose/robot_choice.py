@@ -38,7 +38,6 @@ from restock.toml import toml_value
 
 TICK_NS = 100_000_000  # between two looks at the motion
 KNOWN_S, UNKNOWN_NS = 1.0, 2_000_000_000  # after a pose: its motion is; it is surely not any more
-DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # from a command to the motion
 SETTLED_S = 1.0  # a command is no older
 ANSWERED_S = 0.5  # after its end in which a turn still answers it
 SPOT_M = 0.1  # the circle of a turn on the spot, at most: no car is so small
@@ -48,9 +47,6 @@ STANDS_MPS, MUCH = 0.02, 0.3  # of a command to turn on the spot; of the sharpes
 MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
 MIN_HALF_RAD = 1.0  # … of which following half is turning on the spot
 MIN_DRIVEN_M = 0.05  # else it may not have been able to move
-MIN_TURNS = 20  # moments of driving in a turn
-WHEELBASES_M = (0.05, 10.0)  # of what drives
-UNEXPLAINED = 0.5  # of the squared yaw rates, at most
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,6 @@ class DriveEvidence:
     spells: int = 0  # of such commands
     followed_rad: float = 0.0  # of what they asked for
     curved_rad: float = 0.0  # turned while it drove
-    tightest_m: float | None = None  # the circle of its tightest turn
 
     @property
     def pivots(self) -> bool:
@@ -100,8 +95,6 @@ class DriveEvidence:
     @staticmethod
     def joined(drives: Sequence[DriveEvidence]) -> DriveEvidence:
         """Join the evidence of several drives of one robot."""
-
-        circles = [one.tightest_m for one in drives if one.tightest_m is not None]
         return DriveEvidence(
             driven_m=sum(one.driven_m for one in drives),
             pivoted_rad=sum(one.pivoted_rad for one in drives),
@@ -109,7 +102,6 @@ class DriveEvidence:
             spells=sum(one.spells for one in drives),
             followed_rad=sum(one.followed_rad for one in drives),
             curved_rad=sum(one.curved_rad for one in drives),
-            tightest_m=min(circles, default=None),
         )
 
 
@@ -142,7 +134,6 @@ def drive_evidence(
     drives = (way >= max(0.05, 0.2 * fast)) & (np.abs(speed) >= 0.9 * way)
     moves = (way >= STANDS_MPS) & ~spot
     curves = drives & (np.abs(turn) >= TURNS_RADPS)
-    circles = np.abs(speed[curves] / turn[curves])
     return DriveEvidence(
         driven_m=float(way[moves].sum() * tick_s),
         pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
@@ -150,7 +141,6 @@ def drive_evidence(
         spells=spells,
         followed_rad=followed,
         curved_rad=float(np.abs(turn[curves]).sum() * tick_s),
-        tightest_m=float(np.percentile(circles, 5)) if len(circles) >= MIN_TURNS else None,
     )
 
 
@@ -201,44 +191,6 @@ def _on_the_spot(
     return requested, spells, followed
 
 
-def shown_wheelbase_m(
-    command_s: F64, command_rad: F64, poses: PoseSeries, steering_rad: float | None
-) -> float | None:
-    """Fit the wheelbase by which steering angles (N,) explain how the robot turned.
-
-    None if they do not explain it.
-
-    Args:
-        command_s, command_rad: time and angle of the commands, in order, on the clock of `poses`.
-        poses: of the robot, from the same 0.
-        steering_rad: the largest angle; None: the usual one.
-    """
-    most = steering_rad or USUAL_STEERING_RAD
-    ticks = _looks(poses.stamp_ns)
-    window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
-    motion = motion_at(poses, ticks, window_s, KNOWN_S)
-    middle_s = ticks * 1e-9 - window_s / 2
-    best_m, least = None, UNEXPLAINED
-    for delay_s in DELAYS_S:
-        index = np.searchsorted(command_s, middle_s - delay_s, "right") - 1
-        row = np.maximum(index, 0)
-        used = (index >= 0) & (motion.problem == "") & (np.abs(motion.forward_mps) > 0.05)
-        used &= (middle_s - command_s[row] < SETTLED_S) & (np.abs(command_rad[row]) > 0.03)
-        turned = motion.yaw_rate_radps[used]
-        if used.sum() < MIN_TURNS or not turned.any():
-            continue
-        # The yaw rate times the wheelbase, by the angle.
-        by_angle = motion.forward_mps[used] * np.tan(np.clip(command_rad[row[used]], -most, most))
-        base_m = float((by_angle**2).sum() / (turned @ by_angle))
-        if not WHEELBASES_M[0] <= base_m <= WHEELBASES_M[1]:
-            continue
-        left = float(((turned - by_angle / base_m) ** 2).sum() / (turned**2).sum())
-        if left < least:
-            best_m, least = base_m, left
-    return best_m
-
-
-BY_TURNS = "by which its steering angles explain best how it turned: MEASURE IT"
 WHEELBASE_PART = 0.6  # of the outline's length, if nothing shows it
 _OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
 MAX_BEAMS = 361  # in the twin, as each costs time: every k-th beam of a finer lidar
@@ -290,24 +242,10 @@ class RobotProposal:
             sharpest = max(sharpest, command_rad)
         else:
             why = f"CONFIRM THAT IT STEERS LIKE A CAR: {shown.why}"
-            if shown.tightest_m is not None:
-                sharpest = math.atan(wheelbase_m / shown.tightest_m)
         if sharpest != USUAL_STEERING_RAD:
             values["max_steering_rad"] = round(min(max(sharpest, 0.05), 1.3), 3)
             origin["max_steering_rad"] = "logs"
         return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
-
-    def with_wheelbase(self, wheelbase_m: float) -> RobotProposal:
-        """Add the wheelbase that its logs show."""
-        values = self.values | {"wheelbase_m": round(wheelbase_m, 3)}
-        return replace(self, values=values, origin=self.origin | {"wheelbase_m": "logs"})
-
-    @property
-    def wheelbase_from(self) -> str:
-        """Say where its wheelbase is from; "" if it is a guess."""
-        if self.described:
-            return "of [robot]"
-        return BY_TURNS if self.origin.get("wheelbase_m") == "logs" else ""
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
         """Replace the limits of a description by those that its logs show."""
@@ -331,8 +269,7 @@ class RobotProposal:
         own = {key: value for key, value in values.items() if "." not in key}
         lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
         drive, reported = own.pop("drive", None), self.described
-        guess = self.wheelbase_from or "A GUESS from the outline: MEASURE IT"
-        guesses = {} if reported else {"wheelbase_m": f"  # {guess}"}
+        guesses = {} if reported else {"wheelbase_m": "  # A GUESS from the outline: MEASURE IT"}
         lines = [
             "[robot]  # what the twin builds; missing values follow from the size of the outline",
             *(f"# {note}" for note in notes),

@@ -84,7 +84,6 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     advice = [
         *requested.ages(),
         *requested.outline(),
-        *requested.limit(),
     ]
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     problem = "" if episodes.transitions else f"no transition: {why}"
@@ -150,7 +149,6 @@ class _Advisor:
     ) -> None:
         self.profile, self.topics, self.steps = profile, topics, steps
         self.dropped, self.now = episodes.dropped, episodes.transitions
-        self.cuts = Counter(episode.ended_by for episode in episodes.episodes)
 
     def ages(self) -> list[Advice]:
         """Say how old each input is that is often stale, and what another age gives."""
@@ -179,28 +177,6 @@ class _Advisor:
                 text += " (correct only if the robot continues with its last command)"
             found.append(Advice(f"inputs.{name}.max_age_s", text))
         return found
-
-    def limit(self) -> list[Advice]:
-        """Say whether logged missions take longer than the time limit.
-
-        Cut there, they have failed.
-        """
-        task, cut = self.profile.task, self.cuts["time limit"]
-        if task.goal != "route" or self.profile.goal.source != "logged" or not cut:
-            return []
-        for times in (2, 4):
-            longer = times * task.time_limit_steps
-            changed = msgspec.structs.replace(task, time_limit_steps=longer)
-            found = split(changed, self.steps).episodes
-            left = sum(episode.ended_by == "time limit" for episode in found)
-            if left <= cut / 2:
-                text = (
-                    f"{task.time_limit_steps:,} steps end {cut:,} of {self.cuts.total():,} "
-                    f"episodes on their way to a logged goal, which then count as failed; "
-                    f"{longer:,} end {left or 'none'}"
-                )
-                return [Advice("task.time_limit_steps", text)]
-        return []
 
     def outline(self) -> list[Advice]:
         """Say whether the lidar sees things inside the robot's outline, or almost touching it."""

@@ -14,7 +14,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import parse_profile
 
 SECONDS = np.arange(0, 8, 0.1)
-RISING = np.clip(SECONDS, 0, 3)
+RISING = np.clip(SECONDS, 0, 6)
 
 
 def flight(command: str | None) -> dict[str, tuple[str, TopicColumns]]:
@@ -67,7 +67,7 @@ def cameras() -> dict[str, tuple[str, TopicColumns]]:
 @pytest.mark.parametrize(
     ("topics", "said"),
     [
-        (flight("/mavros/setpoint_velocity/cmd_vel"), "a drone's recording (it rises by 2.6 m"),
+        (flight("/mavros/setpoint_velocity/cmd_vel"), "a robot arm's or a drone's recording ("),
         (flight(None), "a drone's recording (it has trajectory_msgs/msg/MultiDOF"),
         (arm(), "a robot arm's recording (it has trajectory_msgs/msg/JointTrajectory"),
         (

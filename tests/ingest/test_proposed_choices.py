@@ -307,14 +307,3 @@ def test_a_slow_robot_gets_time_to_arrive(tmp_path, capsys):
 def test_a_fast_robot_keeps_the_default_time_limit(tmp_path, capsys):
     _, said, _ = propose(Commanded(30.0, times_s=tuple(0.5 * np.arange(60))), tmp_path, capsys)
     assert "time_limit_steps" not in said["toml"]
-
-
-def test_advice_on_missions_longer_than_the_time_limit(tmp_path, capsys):
-    """Cut there they have failed, though the robot arrived."""
-    drive = Drive(60.0, goals=[(0.0, 28.0, 1.0)])
-    _, said, file = propose(drive, tmp_path, capsys)
-    advice = {one["key"]: one["text"] for one in said["advice"]}
-    steps = load_profile(file).task.time_limit_steps
-    text = f"{steps} steps end 1 of 2 episodes on their way to a logged goal, which then count as"
-    assert text in advice["task.time_limit_steps"]
-    assert f"# {text}" in said["toml"]

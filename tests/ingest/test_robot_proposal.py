@@ -106,16 +106,6 @@ def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
     ("text", "message"),
     [
         (robot(), "'test' has no wheels: none of its joints (none)"),
-        (
-            robot(
-                *(link(f"a{i}") + joint(f"a{i}", "0 0 1", "0 0 1", "revolute") for i in range(6))
-            ),
-            "looks like an arm",
-        ),
-        (
-            robot(*(link(rotor) + joint(rotor, "1 0 0", "0 0 1") for rotor in "abcd")),
-            "looks like a drone",
-        ),
         (robot(wheels((0, 0.2), (0.1, 0.2))), "no driven pair on both sides"),
     ],
 )
@@ -183,15 +173,6 @@ def test_a_base_of_another_name_is_the_link_that_no_joint_places(base: str) -> N
     above = of(usual.replace("base_link", base).replace("</robot>", under + "</robot>"))
     assert above.values == found.values
     assert "'foot' is taken for the base" in above.notes[0]
-
-
-def test_a_robot_that_moves_in_a_world_is_not_that_world() -> None:
-    world = link("world") + joint("chassis", "1 2 0", kind="floating", parent="world")
-    text = robot(wheels((0, 0.2), (0, -0.2)), world).replace("base_link", "chassis")
-    assert of(text).values["track_m"] == 0.4
-    description = read_description(text)
-    assert isinstance(description, Description)
-    assert description.base == "chassis"
 
 
 DRIVEN = robot(wheels((0.2, 0.2), (0.2, -0.2)))

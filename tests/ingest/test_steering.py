@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +71,6 @@ def test_drives_of_the_twin_tell_a_robot_that_steers(name: str, seed: int) -> No
     assert (found.steers, found.pivots) == (name == "ackermann", name != "ackermann")
     if found.steers:
         assert "commanded to turn on the spot, by" in found.why
-        tightest_m = CAR.wheelbase_m / math.tan(CAR.max_steering_rad)
-        assert found.tightest_m == pytest.approx(tightest_m, rel=0.15)
 
 
 @pytest.mark.parametrize("seed", one_in(2, range(2)))
@@ -105,10 +102,9 @@ def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
 
 
 def test_drives_of_one_robot_are_judged_together() -> None:
-    one = DriveEvidence(driven_m=2.0, requested_rad=1.2, spells=1, tightest_m=0.5)
+    one = DriveEvidence(driven_m=2.0, requested_rad=1.2, spells=1)
     assert not one.steers
     assert DriveEvidence.joined([one, one]).steers
-    assert DriveEvidence.joined([one, one]).tightest_m == 0.5
     turned = DriveEvidence(pivoted_rad=3.0)
     assert DriveEvidence.joined([one, one, turned]).pivots
 
@@ -169,56 +165,6 @@ def test_a_proposal_says_that_a_robot_turned_on_the_spot(tmp_path: Path) -> None
     assert main(["profile", "new", str(bag(tmp_path / "a", pivots=True)), "--out", str(file)]) == 0
     assert "rad in all\ndrive =" in file.read_text()
     assert load_profile(file).robot.drive == "differential"  # type: ignore[union-attr]
-
-
-WHEELBASE_M, SPEED_MPS = 0.4, 0.8
-
-
-def car_bag(folder: Path, mirrored: bool) -> Path:
-    """Write 20 s of a car that steers by angles; `mirrored`, they do not explain how it turns."""
-    time_s = np.arange(0, 20, 0.05)
-    angle = 0.3 * np.sin(time_s)
-    late = np.interp(time_s - 0.15, time_s, angle)
-    rate = -late if mirrored else SPEED_MPS * np.tan(late) / WHEELBASE_M
-    yaw = np.cumsum(rate) * 0.05
-    at = {
-        "pose.pose.position.x": np.cumsum(SPEED_MPS * np.cos(yaw)) * 0.05,
-        "pose.pose.position.y": np.cumsum(SPEED_MPS * np.sin(yaw)) * 0.05,
-        "pose.pose.orientation.z": np.sin(yaw / 2),
-        "pose.pose.orientation.w": np.cos(yaw / 2),
-        "twist.twist.linear.x": np.full(len(time_s), SPEED_MPS),
-        "twist.twist.angular.z": rate,
-    }
-    command = {"speed": np.full(len(time_s), SPEED_MPS), "steering_angle": angle}
-    return write_topics(
-        {
-            "/odom": ("nav_msgs/msg/Odometry", columns(time_s, at)),
-            "/drive": (
-                "ackermann_msgs/msg/AckermannDrive",
-                columns(time_s, command, stamped=False),
-            ),
-        },
-        folder,
-    )
-
-
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_steering_angles_show_the_wheelbase(
-    mirrored: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Guessed from an outline that is guessed, yaw rates of cars were three times what they are."""
-    source, file = car_bag(tmp_path / "bag", mirrored), tmp_path / "car.toml"
-    assert main(["profile", "new", str(source), "--out", str(file), "--json"]) == 0
-    advice = {one["key"]: one["text"] for one in json.loads(capsys.readouterr().out)["advice"]}
-    profile = load_profile(file)
-    assert profile.robot is not None
-    assert profile.robot.wheelbase_m == profile.inputs.command.wheelbase_m
-    if mirrored:
-        assert profile.robot.origin_of("wheelbase_m") == "default"
-        assert "a guess" in advice["inputs.command.wheelbase_m"]
-    else:
-        assert profile.robot.wheelbase_m == pytest.approx(WHEELBASE_M, rel=0.03)
-        assert "inputs.command.wheelbase_m" not in advice
 
 
 REAL = {
