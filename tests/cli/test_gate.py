@@ -10,7 +10,7 @@ import pytest
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
-from restock.cli.data.findings import Part, markdown, of_regression
+from restock.cli.data.audit import Part, markdown, of_regression
 from restock.train.evaluation.regression import Evaluated, regression
 
 ONLY = "-- severity: error\n-- advice: Record more.\n-- doc: Stores of few rows.\n"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from restock.cli import main
-from restock.cli.data import machine
+from restock.cli.data import info
 from restock.errors import ConfigError
 from restock.imports import import_extra, install_command
 
@@ -42,7 +42,7 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(
         *("duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"),
         "of-another-machine>=1; platform_machine == 'pdp11'",
     ]
-    monkeypatch.setattr(machine, "requires", lambda _: wanted)
+    monkeypatch.setattr(info, "requires", lambda _: wanted)
     code, found = reported(capsys)
     assert code == 2
     assert found["duckdb"]["state"] == "wrong"
@@ -77,7 +77,7 @@ def test_an_extra_is_added_to_the_restock_that_is_installed(
 def test_a_machine_that_cannot_draw_still_does_the_rest(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(machine, "DRAWS", "raise SystemExit('no EGL here')")
+    monkeypatch.setattr(info, "DRAWS", "raise SystemExit('no EGL here')")
     code, found = reported(capsys)
     assert code == 0
     assert (found["pictures"]["state"], found["pictures"]["what"]) == ("missing", "no EGL here")

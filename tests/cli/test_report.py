@@ -28,8 +28,8 @@ from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.store.store import Store
 from restock.report import build_report
-from restock.report.look.queries import ask, statements
-from restock.report.look.theme import DARK
+from restock.report.look.blocks import ask, statements
+from restock.report.look.write import DARK
 from restock.report.run import fed
 from restock.report.run.facts import Facts, evaluation_bias, gather, mean_success
 from restock.report.run.floor import floor_section

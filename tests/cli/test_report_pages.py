@@ -20,7 +20,7 @@ from restock.replay.store.store import Store
 from restock.report import write_study_page
 from restock.report.fleet.coverage import coverage_facts, coverage_page
 from restock.report.look import charts
-from restock.report.look.live import Charts
+from restock.report.look.write import Charts
 
 HOSTILE = "</script><script>alert(1)</script><!--"
 

@@ -106,8 +106,8 @@ MAY_IMPORT = {
         " replay/fleet replay/mixture replay/panel replay/plan replay/store train/evaluation"
     ),
     "cli/fleet": (
-        "cli report ingest/store replay replay/fleet replay/mixture replay/panel replay/store"
-        " train/judge train/twin/missions"
+        "cli report ingest ingest/profile ingest/store ingest/task replay replay/fleet"
+        " replay/mixture replay/panel replay/store train/judge train/twin/missions"
     ),
     "cli/learning": (
         "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace"
@@ -127,7 +127,6 @@ MAY_IMPORT = {
         " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
         " train/twin/physics train/twin/recording train/twin/survey"
     ),
-    "cli/upkeep": "cli ingest ingest/profile ingest/store ingest/task replay replay/store",
 }
 
 

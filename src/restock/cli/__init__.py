@@ -1,6 +1,6 @@
 """The front door: `restock VERB …`. One module a verb; each is imported only when it is called.
 
-A verb's module holds one dataclass, `IngestCommand` for `restock ingest`: its docstring is the
+A verb or job is a dataclass, `IngestCommand` for `restock ingest`: its docstring is the
 help, its fields are the flags, and `run()` does the work and returns an exit code. stdout is data,
 stderr is progress and messages.
 """
@@ -65,8 +65,10 @@ JOBS = {
 # folder -> the verbs and jobs whose modules it holds
 FOLDERS = {
     "data": ("info", "profile", "ingest", "sql", "audit", "mix", "export"),
-    "fleet": ("coverage", *(f"coverage {job}" for job in JOBS["coverage"])),
-    "upkeep": tuple(f"store {job}" for job in JOBS["store"]),
+    "fleet": (
+        *("coverage", *(f"coverage {job}" for job in JOBS["coverage"])),
+        *(f"store {job}" for job in JOBS["store"]),
+    ),
     "learning": (
         *("train", "study", "eval", "compare", "diagnose", "trace", "report"),
         "profile schema",
@@ -75,7 +77,12 @@ FOLDERS = {
     "start": ("start", "demo"),
 }
 # folders of verbs that multiply no large matrices
-ONE_THREAD_OF_BLAS = ("data", "fleet", "upkeep")
+ONE_THREAD_OF_BLAS = ("data", "fleet")
+# jobs that are in the module of their verb; the others have their own
+WITH_THEIR_VERB = {
+    *("coverage gaps", "coverage drift"),
+    *("store compact", "store remove", "store verify"),
+}
 PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # goes on working if nobody reads it
 FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
 COMPLETION = "--tyro-write-completion"
@@ -236,9 +243,11 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
 
 def command_of(name: str) -> type[Any]:
     """Return the dataclass that is the command line of a verb or a job, such as `store label`."""
-    last = name.split()[-1]
+    words = name.split()
+    verb, last = words[0], words[-1]
     folder = f"{FOLDER_OF[name]}." if name in FOLDER_OF else ""
-    module = importlib.import_module(f"restock.cli.{folder}{last}")
+    file = verb if name in WITH_THEIR_VERB else last
+    module = importlib.import_module(f"restock.cli.{folder}{file}")
     command: type[Any] = getattr(module, f"{last.capitalize()}Command")
     return command
 

@@ -1,1 +1,1 @@
-"""Verbs whose answer is a page: the report of a run, the coverage of a store."""
+"""Verbs about a whole store: its coverage, what differs, its labels, and keeping it in order."""

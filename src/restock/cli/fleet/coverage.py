@@ -1,13 +1,21 @@
-"""`restock coverage`: what a store holds of each condition, and what is missing, on one page."""
+"""`restock coverage`: what a store holds, what is missing, and which robots changed."""
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+from restock.errors import ExitCode, visible
+from restock.words import figure, plural
+
+if TYPE_CHECKING:
+    from restock.replay.fleet.drift import Drift
 
 
 @dataclass
@@ -76,7 +84,7 @@ class CoverageCommand:
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import ConfigError, RestockError
-        from restock.replay.fleet.drift import Drift, measure_drift
+        from restock.replay.fleet.drift import measure_drift
         from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.shopping_list import document, shopping_list
         from restock.replay.mixture.mixture import load_mixture
@@ -124,3 +132,306 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
         "who drove": ", ".join(str(name) for name in row["behaviour_policies"] or () if name),
         "by priority": row["primary_rows"],
     }
+
+
+_MEANING = {
+    "hours": "hours: of driving as logged so far, until one gap is closed: median (95 %); as in"
+    " `restock mix`",
+    "missions": "missions: of the kind that is best, until one gap is closed: median (95 %)."
+    " `restock mix` counts hours of driving as logged, nothing chosen: --unit hours",
+}
+SHOWN = 15  # lines of a table on a terminal; --json has all
+
+
+@dataclass
+class GapsCommand:
+    """Find what is missing from a store, and how many missions of which kind would fill the gaps.
+
+        restock coverage gaps store/
+        restock coverage gaps store/ --mixture my.toml --missions-out next.toml
+        restock coverage gaps store/ --min-rows 20 --by condition,zone
+
+    A gap is something that a mixture or an audit of coverage asks for and that the store lacks:
+    rows of a stratum, rows or episodes of a condition, cells of condition x action; with --min-rows
+    also cells of condition x zone x action (x robot). Each gap is printed with the rate seen so
+    far, and the number of missions (or hours of driving) needed at that rate, with its 95 %
+    interval. The plan is the least number of missions that fills all gaps. It can be written as a
+    file for `restock twin record --missions`, and for training (env.missions).
+    """
+
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store."""
+    mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
+    """The mixture whose planned draws say how much is needed of each stratum. See
+    docs/mixture.md."""
+    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A TOML file with thresholds of audits that replace the shipped ones, as for `restock
+    audit`."""
+    no_audits: bool = False
+    """Use only the needs of the mixture, not those of the audits."""
+    min_rows: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Also ask for at least this many rows of every cell."""
+    by: str = "condition,zone,action,robot"
+    """The columns that define a cell for --min-rows."""
+    unit: Literal["missions", "hours"] | None = None
+    """Count in missions or in hours of driving. Default: missions if a simulator made the
+    recordings, hours if robots did."""
+    confidence: float = 0.8
+    """The probability with which the planned missions close each gap."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
+    missions_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the plan as a missions file, which must not exist yet."""
+    force: bool = False
+    """Replace an existing missions file."""
+    json: bool = False
+    """Print one JSON document."""
+
+    def run(self) -> None:
+        """Find the gaps, plan what fills them, and print both."""
+        from restock.cli import output
+        from restock.cli.command_line import refuse
+        from restock.errors import ConfigError
+        from restock.files import expect_file_place
+        from restock.ingest.store.version import given_version
+        from restock.replay.fleet.gaps import find_gaps
+        from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
+        from restock.replay.fleet.shopping_list import document, shopping_list
+        from restock.replay.mixture.mixture import load_mixture
+        from restock.replay.store.audit import load_thresholds
+        from restock.replay.store.store import Store
+        from restock.train.twin.missions import KINDS
+
+        if self.min_rows < 0:
+            raise ConfigError(f"must be 0 or more, got {self.min_rows}", where="--min-rows")
+        if self.min_rows == 0:
+            refuse(self, ("by",), "has no effect without --min-rows", remedy="give --min-rows, too")
+        mixture = load_mixture(self.mixture)
+        thresholds = None if self.no_audits else load_thresholds(self.thresholds)
+        if self.missions_out is not None and not self.force:
+            refuse_existing(self.missions_out)
+        expect_file_place(self.missions_out, "--missions-out")
+        with Store(self.store, version=given_version(self.version)) as store:
+            yields, gaps = find_gaps(
+                store,
+                mixture,
+                name=self.mixture,
+                folder=Path(self.mixture).parent,
+                kinds=KINDS,
+                thresholds=thresholds,
+                min_rows=self.min_rows,
+                by=[name.strip() for name in self.by.split(",") if name.strip()],
+            )
+            place, version = str(store.path), store.version
+        found = shopping_list(yields, gaps, unit=self.unit, confidence=self.confidence)
+        answer = {
+            "store": place,
+            "store_version": version,
+            "mixture": self.mixture,
+            "episodes": len(yields),
+            **document(found),
+        }
+        if self.missions_out is not None:
+            plan = of_list(found, store=place, store_version=version, mixture=self.mixture)
+            write_missions(self.missions_out, plan)
+            answer["missions_file"] = str(self.missions_out)
+        if self.json:
+            output.print_json(answer)
+        else:
+            _print_gaps(answer)
+
+
+def _print_gaps(answer: dict[str, Any]) -> None:
+    from restock.cli import output
+
+    unit = answer["unit"]
+    name = f"{answer['store']} version {answer['store_version']}"
+    if answer["closed"]:
+        output.stdout().print(f"{name}: no gaps; it has all that {answer['mixture']} asks for")
+        return
+    known = [gap for gap in answer["gaps"] if gap["best"]]
+    unknown = [gap for gap in answer["gaps"] if not gap["best"]]
+    if known:
+        _table(
+            f"{name}: what is missing, at the rates of its {answer['episodes']:,} episodes",
+            [_gap_line(gap, unit) for gap in known],
+            note=_MEANING[unit],
+        )
+    if unknown:
+        _table("never seen: no rate is known", _unknown(unknown, unit))
+    plan = answer["plan"]
+    if plan["orders"]:
+        with_ = {n: any(order[n] for order in plan["orders"]) for n in ("zone", "robot")}
+        _table("what to log next", [_order(order, unit, with_) for order in plan["orders"]])
+        output.stdout().print(
+            f"{figure(plan['total'])} {unit} in all (95 %: {figure(plan['total_low'])} to"
+            f" {figure(plan['total_high'])})"
+            + (f", {figure(plan['hours'])} hours" if unit == "missions" else "")
+            + f": each gap is then closed with a probability of {answer['confidence']:.0%} or more,"
+            " not with that of 50% as by the table above"
+        )
+    if "missions_file" in answer:
+        output.stdout().print(f"-> {answer['missions_file']}", markup=False)
+
+
+def _table(title: str, rows: list[dict[str, Any]], note: str = "") -> None:
+    from restock.cli import output
+
+    shown = rows[:SHOWN] if sys.stdout.isatty() else rows
+    output.print_table(shown, title=title)
+    if len(shown) < len(rows):
+        output.stdout().print(f"… {len(rows) - len(shown):,} more: --json has all")
+    if note:
+        output.stdout().print(note, markup=False, soft_wrap=not sys.stdout.isatty())
+    output.stdout().print()
+
+
+def _gap_line(gap: dict[str, Any], unit: str) -> dict[str, Any]:
+    each = "mission" if unit == "missions" else "hour"
+    line = {
+        "gap": gap["cell"],
+        "asked by": gap["asked_by"],
+        "of": gap["counted"],
+        "needed": gap["needed"],
+        "there": gap["there"],
+        "missing": gap["missing"],
+        "best": gap["best"],
+        f"per {each}": _interval(gap, "rate"),
+        unit: _interval(gap, "amount"),
+        "thinnest in": ", ".join(gap["thinnest_zones"][:2]),
+    }
+    if gap["closes_with"] is not None:
+        line["the plan closes it"] = f"{gap['closes_with']:.0%}"
+    return line
+
+
+def _interval(gap: dict[str, Any], name: str) -> str:
+    value, low, high = (figure(gap[key]) for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{value} ({low} to {high})"
+
+
+def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:
+    """Name in one line the actions that nobody ever took in a condition."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for gap in gaps:
+        key = (gap["stratum"] or gap["condition"], gap["zone"], gap["robot"], gap["asked_by"])
+        groups.setdefault(key, []).append(gap)
+    lines = []
+    for (condition, zone, robot, asked_by), members in groups.items():
+        actions = [
+            gap["action_name"] or f"action {gap['action']}"
+            for gap in members
+            if gap["action"] is not None
+        ]
+        least = min(members, key=lambda gap: gap["at_least"])
+        lines.append(
+            {
+                "gap": ", ".join(str(part) for part in (condition, zone, robot) if part),
+                "actions": ", ".join(actions),
+                "asked by": asked_by,
+                "to see one, with 95 %": f"at least {least['at_least']:,} more"
+                f" {plural(least['at_least'], 'episode')} of"
+                f" {least['never_seen_in']}",
+            }
+        )
+    return lines
+
+
+def _order(order: dict[str, Any], unit: str, with_: dict[str, bool]) -> dict[str, Any]:
+    return {
+        "kind": order["kind"] or "logging",
+        **{name: order[name] or "" for name in ("zone", "robot") if with_[name]},
+        **({"missions": order["missions"]} if unit == "missions" else {}),
+        "hours": round(order["hours"], 2),
+        "fills": "; ".join(dict.fromkeys(order["fills"])),
+    }
+
+
+@dataclass
+class DriftCommand:
+    """Find out which robot's wheels, lidar or floor have changed.
+
+    Compares each robot's weeks with its own first weeks and with the other robots of its site. Each
+    signal (odometry scale, lidar noise, gyroscope bias, …) and the rate at which each condition
+    begins gets a two-sample test over recordings or episodes, with an effect size and a p-value
+    corrected over all tests. A change that all robots of a site share is reported for the site.
+    Robots and sites are tags of recordings (`restock ingest --tag robot=amr-1`). See
+    docs/coverage.md.
+
+        restock coverage drift store/
+        restock coverage drift store/ --out drift.html
+        restock sql store/ "FROM drift WHERE robot = 'amr-2'"       # every comparison
+    """
+
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store."""
+    every: str = "week"
+    """The length of a period: day, week, month, year or decade."""
+    reference: int = 2
+    """How many first periods of a robot are the reference for its later ones."""
+    least_episodes: int = 5
+    """The least number of episodes on each side; with fewer there is no verdict."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write an HTML page that opens without a network. Replaces an existing file."""
+    exit_code: bool = False
+    """Exit 1 if a robot, a site or a condition has changed. Changes in how a robot was driven do
+    not count."""
+    json: bool = False
+    """Print one JSON document: {"findings", "notes", "tests", …}."""
+
+    def run(self) -> int:
+        """Measure, print, and write the page."""
+        from restock.cli import output
+        from restock.files import expect_file_place
+        from restock.ingest.store.version import given_version
+        from restock.replay.fleet.drift import measure_drift
+        from restock.replay.store.store import Store
+
+        expect_file_place(self.out, "--out")
+        with Store(self.store, version=given_version(self.version)) as store:
+            output.say_unverified(store)
+            drift = measure_drift(
+                store,
+                every=self.every,
+                reference=self.reference,
+                least_episodes=self.least_episodes,
+            )
+        if self.out is not None:
+            from restock.report import write_drift_page
+
+            output.say(f"wrote {write_drift_page(drift, self.out)}")
+        if self.json:
+            output.print_json(drift.document())
+        else:
+            _print_drift(drift)
+        changed = any(row["part"] != "driving" for row in drift.findings)
+        return int(ExitCode.FAILED if self.exit_code and changed else ExitCode.OK)
+
+
+def _print_drift(drift: Drift) -> None:
+    from restock.cli import output
+
+    out = output.stdout()
+    verdicts: dict[tuple[str, str], Counter[str]] = {}
+    for row in drift.tests:
+        verdicts.setdefault((row["robot"], row["against"]), Counter())[row["verdict"]] += 1
+    names = sorted({name for counts in verdicts.values() for name in counts})
+    output.print_table(
+        [
+            {"robot": robot, "against": against, **{name: counts[name] for name in names}}
+            for (robot, against), counts in sorted(verdicts.items())
+        ],
+        ["robot", "against", *names],
+        title=f"comparisons by {drift.every}",
+    )
+    for note in drift.notes:
+        out.print(visible(f"- {note}"), markup=False, soft_wrap=True)
+    out.print()
+    for row in drift.findings:
+        out.print(visible(row["finding"]), markup=False, soft_wrap=True)
+    if not drift.findings:
+        out.print(drift.without_findings(), markup=False, soft_wrap=True)

@@ -14,8 +14,7 @@ from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import Stratum
 from restock.replay.store.store import Store
-from restock.report.look.blocks import Rows, words
-from restock.report.look.queries import ask, rows_of, statements
+from restock.report.look.blocks import Rows, ask, rows_of, statements, words
 from restock.train.run.kept_evaluations import (
     CloneQuality,
     measures,
