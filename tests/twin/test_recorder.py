@@ -127,7 +127,6 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["--policy", "random", "--epsilon", ".1"], "random already takes every action"),
         (["--epsilon", "2"], "must be in [0, 1], got 2.0"),
         (["--perturbation", "fog"], "there is no perturbation 'fog'"),
-        (["--perturbation", "friction", "--exact"], "cannot be combined"),
         (["--layouts", "moon"], "moon"),
     ],
 )
@@ -147,9 +146,8 @@ def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
 ) -> None:
     words = ["twin", "record", "--out", str(tmp_path / "drive.txt"), "--minutes", "0.01"]
     assert cli.main(words) == ExitCode.USAGE
-    assert "ends in .mcap, or a folder for rosbag2" in capsys.readouterr().err
+    assert "ends in .mcap" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-    assert cli.main([*words, "--format", "rosbag2", "--dry-run"]) == ExitCode.OK
     dated = str(tmp_path / "drive.2026-10-05")  # a folder's
     assert cli.main(["twin", "record", "--out", dated, "--dry-run"]) == ExitCode.OK
 

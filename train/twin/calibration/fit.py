@@ -11,19 +11,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from restock.arrays import F64
 from restock.errors import ConfigError, StoreError
 from restock.ingest.task.robot import Robot
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
-from restock.toml import Checked
 from restock.train.twin.calibration.fit_solver import (
     CHANNELS,
     DEFAULT,
@@ -70,38 +68,41 @@ COARSE_SEGMENTS = 16
 HELD_OUT_HORIZONS_S = (1.0, 3.0, 6.0)
 
 
-class FitConfig(Checked, frozen=True):
-    """Settings of a fit. The same values give the same result.
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of a fit. The same values give the same result. Raises ConfigError if invalid.
 
     `base` holds the parameters that are not fitted, and is the twin "before" the fit.
     """
 
     parameters: tuple[str, ...] = DEFAULT
-    base: Perturbation = Perturbation()
+    base: Perturbation = field(default_factory=Perturbation)
     recordings: tuple[str, ...] = ()  # of the store; none: all
     task_hash: str | None = None  # whose rows, where the store has several tasks
     robot: Robot | None = None  # whose logs they are; None: that of the store's own profile
-    timestep_s: Annotated[float, Meta(gt=0)] | None = None  # None: the base's
-    horizon_s: Annotated[float, Meta(gt=0)] = 3.0  # of the segments that are fitted
-    held_out: Annotated[float, Meta(ge=0, lt=1)] = 0.25  # share of the log, to measure the gap on
-    search_points: Annotated[int, Meta(ge=0)] = 64  # of the coarse search
-    max_segments: Annotated[int, Meta(ge=1)] = 200  # of more than these, as many are drawn
-    seed: Annotated[int, Meta(ge=0)] = 0
-    nthread: Annotated[int, Meta(ge=1)] = 1
+    horizon_s: float = 3.0  # of the segments that are fitted
+    held_out: float = 0.25  # share of the log, to measure the gap on
+    search_points: int = 64  # of the coarse search
+    max_segments: int = 200  # of more than these, as many are drawn
+    seed: int = 0
+    nthread: int = 1  # 0: every core
     name: str = "fitted"
 
-    def check(self) -> None:
-        """Raise ValueError if a parameter cannot be fitted."""
-        if not self.parameters:
-            raise ValueError(f"no parameter is given: choose from {', '.join(PARAMETERS)}")
-        for name in self.parameters:
+    def __post_init__(self) -> None:
+        for name in self.parameters or ("",):
             if name not in PARAMETERS:
-                raise ValueError(f"{name!r} cannot be fitted: choose from {', '.join(PARAMETERS)}")
-
-    @property
-    def step_s(self) -> float:
-        """Return the physics timestep of the fit, in seconds."""
-        return self.base.timestep_s if self.timestep_s is None else self.timestep_s
+                raise ConfigError(
+                    f"{name!r} cannot be fitted",
+                    where="fit of the twin",
+                    remedy=f"choose from {', '.join(PARAMETERS)}",
+                )
+        if self.horizon_s <= 0 or self.max_segments < 1 or not 0 <= self.held_out < 1:
+            raise ConfigError(
+                f"got a horizon of {self.horizon_s:g} s, {self.max_segments} segments and a share"
+                f" of {self.held_out:g} held out",
+                where="fit of the twin",
+                remedy="give a horizon above 0, at least one segment and a share in [0, 1)",
+            )
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,9 @@ def fit(
     data = _fit_data(store, config, rng)
     few = data.segments.take(rng.permutation(len(data.segments))[:COARSE_SEGMENTS])
     coarse, fine = (
-        ReplayResiduals(segments, scope.channels, timestep_s=config.step_s, nthread=config.nthread)
+        ReplayResiduals(
+            segments, scope.channels, timestep_s=config.base.timestep_s, nthread=config.nthread
+        )
         for segments in (few, data.segments)
     )
     coordinates = Coordinates(scope.names, config.base, task)
@@ -142,12 +145,14 @@ def fit(
     refused = [as_in_base(name, config.base, reason) for name, reason in scope.refused.items()]
     kept = [*refused, *dropped]
     perturbation = msgspec.structs.replace(
-        solution.coordinates.perturbation(solution.z), name=config.name, timestep_s=config.step_s
+        solution.coordinates.perturbation(solution.z),
+        name=config.name,
+        timestep_s=config.base.timestep_s,
     )
     return FittedTwin(
         perturbation=perturbation,
         base=config.base,
-        timestep_s=config.step_s,
+        timestep_s=config.base.timestep_s,
         recordings=data.recordings,
         estimates=tuple(
             sorted(
@@ -274,7 +279,10 @@ def _held_out_gaps(
         if not len(held_out):
             continue
         replayed = replay_segments(
-            held_out, [config.base, fitted], timestep_s=config.step_s, nthread=config.nthread
+            held_out,
+            [config.base, fitted],
+            timestep_s=config.base.timestep_s,
+            nthread=config.nthread,
         )
         before, after = position_gap_m(held_out, replayed)[:, :, -1]
         rng = np.random.Generator(np.random.PCG64(config.seed))

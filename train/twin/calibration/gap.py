@@ -351,7 +351,7 @@ def measure_gap(
         "judged": judged,
         "twins": {name: msgspec.to_builtins(twin) for name, twin in twins.items()},
         "noise": asdict(noise),
-        "limits": msgspec.structs.asdict(config.limits),
+        "limits": asdict(config.limits),
         "robot": "the twin's stand-in" if steps.robot is None else "the profile's own",
         "floor": warehouse.name,
         "floor_difference": difference,

@@ -13,16 +13,14 @@ import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec import Meta
 
-from restock.errors import RunError
+from restock.errors import ConfigError, RunError
 from restock.files import write_table, write_text
 from restock.stats import ConfidenceInterval
-from restock.toml import Checked
 from restock.words import quoted
 
 Rows = list[dict[str, Any]]
@@ -55,32 +53,37 @@ TABLES: dict[str, pa.Schema] = {
 }
 
 
-class TrustLimits(Checked, frozen=True):
+@dataclass(frozen=True)
+class TrustLimits:
     """Limits that a twin must keep to be trusted in a condition."""
 
-    horizon_s: Annotated[float, Meta(gt=0)] = 3.0
-    position_m: Annotated[float, Meta(ge=0)] = 0.2  # nine in ten segments of that horizon end here
-    reward_ratio: Annotated[float, Meta(ge=0)] = 1.0  # one-step reward gap over the reward's spread
-    segments: Annotated[int, Meta(ge=0)] = 20  # fewer say nothing
-    episodes: Annotated[int, Meta(ge=0)] = 5
+    horizon_s: float = 3.0
+    position_m: float = 0.2  # nine in ten segments of that horizon end within it
+    reward_ratio: float = 1.0  # one-step reward gap over the reward's spread
+    segments: int = 20  # fewer say nothing
+    episodes: int = 5
 
 
-class GapConfig(Checked, frozen=True):
-    """Settings of a gap measurement."""
+@dataclass(frozen=True)
+class GapConfig:
+    """Settings of a gap measurement. Raises ConfigError if nothing could be judged by them."""
 
-    horizons_s: tuple[Annotated[float, Meta(gt=0)], ...] = (1.0, 3.0, 6.0)
-    max_segments: Annotated[int, Meta(ge=1)] = 400  # a condition and horizon; steps: 5 times that
+    horizons_s: tuple[float, ...] = (1.0, 3.0, 6.0)  # among them that of the limits
+    max_segments: int = 400  # a condition and horizon; steps: 5 times that
     limits: TrustLimits = TrustLimits()
-    seed: Annotated[int, Meta(ge=0)] = 0
-    timestep_s: Annotated[float, Meta(gt=0)] = 0.01
-    nthread: Annotated[int, Meta(ge=1)] = 1
+    seed: int = 0
+    timestep_s: float = 0.01
+    nthread: int = 1  # 0: every core
 
-    def check(self) -> None:
-        """Raise ValueError if trust is judged at a horizon that is not driven."""
-        if self.limits.horizon_s not in self.horizons_s:
-            raise ValueError(
-                f"the horizon of the verdict, {self.limits.horizon_s:g} s, is not driven: add it "
-                "to the horizons"
+    def __post_init__(self) -> None:
+        where, limits = "gap of the twin", self.limits
+        if limits.horizon_s not in self.horizons_s or min(self.horizons_s) <= 0:
+            raise ConfigError(f"a horizon of {limits.horizon_s:g} s is not driven", where=where)
+        if self.max_segments < 1 or limits.position_m < 0:
+            raise ConfigError(
+                f"got {self.max_segments} segments and a limit of {limits.position_m:g} m",
+                where=where,
+                remedy="give at least one segment, and a limit of at least 0",
             )
 
 

@@ -315,7 +315,7 @@ def _floor(to: Settings, made: Path, title: str, why: str, given: Sequence[str])
 
 def fit(to: Settings, horizon_s: float) -> Stage:
     """Fit the twin's robot to what the robot did; by few segments, as minutes matter."""
-    few = ["--search", "32", "--segments", "80", "--horizon-s", f"{horizon_s:g}"]
+    few = ["--segments", "80", "--horizon-s", f"{horizon_s:g}"]
     return Stage(
         "fit",
         "The twin's robot, fitted to these logs",
@@ -329,13 +329,13 @@ def fit(to: Settings, horizon_s: float) -> Stage:
 
 def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
     calibrated = ["--perturbation", str(to.fitted)] if fitted else []
-    horizons = ["--horizons", f"{horizon_s:g}", "--trust-horizon-s", f"{horizon_s:g}"]
+    few = ["--segments", "100", "--horizon-s", f"{horizon_s:g}"]
     folder = to.store / "gap"
     return Stage(
         "gap",
         "Can the twin be trusted?",
         "How far from the log the twin ends when it drives the logged commands.",
-        ["twin", "gap", str(to.store), *calibrated, "--out", str(folder), *horizons, "--most=100"],
+        ["twin", "gap", str(to.store), *calibrated, "--out", str(folder), *few],
         writes=(folder,),
         outcome=outcomes.gap,
     )

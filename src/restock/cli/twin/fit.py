@@ -32,7 +32,7 @@ class FitCommand:
     """The store."""
     out: Path | None = None
     """The TOML file to write: a perturbation, or with --per-recording a schedule over the robots.
-    An existing file is not overwritten."""
+    Default: print the fit alone. An existing file is not overwritten."""
     parameters: str | None = None
     """The parameters to fit, e.g. latency_s,gain. Default: all except left_friction_scale."""
     recording: tuple[str, ...] = ()
@@ -40,24 +40,12 @@ class FitCommand:
     per_recording: bool = False
     """Fit each recording separately, for robots that differ."""
     base: Path | None = None
-    """A perturbation (TOML) with the values that are not fitted; also the reference. Default:
-    nominal."""
-    timestep_s: float | None = None
-    """Physics timestep for the fit. Fitted values hold for this timestep, so use the one of
-    training. Default: that of --base, else 0.01."""
+    """A perturbation (TOML) with the values that are not fitted; also the reference. Fitted values
+    hold for its timestep, so use the one of training. Default: nominal."""
     horizon_s: float = 3.0
     """Length in seconds of the segments that are driven again."""
-    held_out: float = 0.25
-    """Share of the log that is held out: whole recordings if there are at least four, else the end
-    of each one."""
-    search: int = 64
-    """Number of points of the coarse search, a power of two."""
     segments: int = 200
     """The largest number of segments."""
-    seed: int = 0
-    """Seed of the search, of the sample of segments and of the bootstrap."""
-    threads: int = 1
-    """Number of threads for the physics. The result does not depend on it."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
     """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
     newest."""
@@ -65,8 +53,6 @@ class FitCommand:
     """Hash of the task whose rows are used, if the store has several tasks."""
     profile: str | None = None
     """The profile whose [robot] is driven. Default: the one stored with the rows."""
-    dry_run: bool = False
-    """Fit and print; write nothing."""
     json: bool = False
     """Print one JSON document: {"fits": [{"estimates", "warnings", "held_out", …}], "out"}."""
 
@@ -94,46 +80,36 @@ class FitCommand:
             if self.per_recording:
                 groups = [(name,) for name in recordings_of(store, self.recording, self.task)]
             fits = [self._fit(store, group) for group in groups]
-        out = None if self.dry_run else self.out
-        if out is not None:
-            write_fit(out, fits)
+        if self.out is not None:
+            write_fit(self.out, fits)
         if self.json:
-            output.print_json({"fits": [item.describe() for item in fits], "out": out})
+            output.print_json({"fits": [item.describe() for item in fits], "out": self.out})
         else:
             for item in fits:
                 _show(item)
-        if out is not None:
-            output.say(f"wrote {out}")
+        if self.out is not None:
+            output.say(f"wrote {self.out}")
         return ExitCode.OK
 
     def _fit(self, store: Any, recordings: tuple[str, ...]) -> FittedTwin:
-        import msgspec
-
         from restock.cli import output
-        from restock.toml import typed
         from restock.train.twin.calibration.fit import FitConfig, fit
-        from restock.train.twin.physics.perturbation import load_perturbation
+        from restock.train.twin.calibration.fit_solver import DEFAULT
+        from restock.train.twin.physics.perturbation import Perturbation, load_perturbation
 
         name = "fitted" if self.out is None else self.out.stem
-        values: dict[str, Any] = {
-            "recordings": recordings,
-            "task_hash": self.task,
-            "timestep_s": self.timestep_s,
-            "horizon_s": self.horizon_s,
-            "held_out": self.held_out,
-            "search_points": self.search,
-            "max_segments": self.segments,
-            "seed": self.seed,
-            "nthread": self.threads,
-            "name": f"{name} {recordings[0]}" if self.per_recording else name,
-        }
-        if self.parameters is not None:
-            names = [name.strip() for name in self.parameters.split(",")]
-            values["parameters"] = list(dict.fromkeys(filter(None, names)))
-        if self.base is not None:
-            values["base"] = load_perturbation(self.base)
-        config = typed(values, FitConfig, where="restock twin fit")
-        config = msgspec.structs.replace(config, robot=robot_given(self.profile))
+        names = [name.strip() for name in (self.parameters or "").split(",")]
+        config = FitConfig(
+            parameters=DEFAULT if self.parameters is None else tuple(dict.fromkeys(names)),
+            base=Perturbation() if self.base is None else load_perturbation(self.base),
+            recordings=recordings,
+            task_hash=self.task,
+            robot=robot_given(self.profile),
+            horizon_s=self.horizon_s,
+            max_segments=self.segments,
+            nthread=0,
+            name=f"{name} {recordings[0]}" if self.per_recording else name,
+        )
         return fit(store, config, on_progress=output.say)
 
 

@@ -10,7 +10,6 @@ import tyro
 
 if TYPE_CHECKING:
     from restock.train.twin.calibration.twin_gap import TwinGap
-    from restock.train.twin.physics.perturbation import Perturbation
 
 _IN_SAMPLE = (
     "The twin was calibrated on most of these logs. `restock twin fit` shows the remaining gap on "
@@ -42,30 +41,15 @@ class GapCommand:
     out: Path | None = None
     """A folder for gap.json, Parquet tables and a page (index.html). `restock report` shows a gap
     in RUN/gap or STORE/gap. An earlier gap in the folder is replaced."""
-    horizons: str = "1,3,6"
-    """The horizons, in seconds, to drive open loop."""
-    trust_horizon_s: float = 3.0
-    """The horizon, in seconds, that decides the verdict."""
+    horizon_s: float | None = None
+    """Drive open loop for this many seconds, and judge by it. Default: 1, 3 and 6 s, judged at 3 s.
+    """
     trust_position_m: float = 0.2
     """A condition is trusted if nine in ten segments end within this distance (m) of the log."""
-    trust_reward: float = 1.0
-    """A condition is trusted if the error of the one-step reward is less than this many times the
-    reward's standard deviation."""
-    min_segments: int = 20
-    """With fewer segments, the verdict on a condition is unknown."""
-    min_episodes: int = 5
-    """With fewer episodes, the verdict on a condition is unknown."""
-    most: int = 400
+    segments: int = 400
     """The largest number of segments per condition and horizon, spread evenly; for single steps,
     five times as many.
     """
-    seed: int = 0
-    """Seed of the noise in the localisation floor and of the bootstrap, and of the sample of
-    segments."""
-    timestep_s: float | None = None
-    """Physics timestep. Default: that of the perturbation, else 0.01."""
-    threads: int = 1
-    """Number of threads for the physics. The result does not depend on it."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
     """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
     newest."""
@@ -87,31 +71,30 @@ class GapCommand:
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
         from restock.report import write_gap_page
-        from restock.toml import typed
         from restock.train.twin.calibration.gap import measure_gap
-        from restock.train.twin.calibration.twin_gap import GapConfig, check_place, write_gap
+        from restock.train.twin.calibration.twin_gap import (
+            GapConfig,
+            TrustLimits,
+            check_place,
+            write_gap,
+        )
         from restock.train.twin.physics.perturbation import load_perturbation
 
         if self.fit and self.perturbation is not None:
             raise ConfigError("give --fit or --perturbation, one of them", where="restock twin gap")
         calibrated = None if self.perturbation is None else load_perturbation(self.perturbation)
         robot = robot_given(self.profile)
-        limits = {
-            "horizon_s": self.trust_horizon_s,
-            "position_m": self.trust_position_m,
-            "reward_ratio": self.trust_reward,
-            "segments": self.min_segments,
-            "episodes": self.min_episodes,
-        }
-        values = {
-            "horizons_s": _seconds(self.horizons),
-            "max_segments": self.most,
-            "limits": limits,
-            "seed": self.seed,
-            "timestep_s": self._timestep_s(calibrated),
-            "nthread": self.threads,
-        }
-        config = typed(values, GapConfig, where="restock twin gap")
+        limits = TrustLimits(
+            horizon_s=3.0 if self.horizon_s is None else self.horizon_s,
+            position_m=self.trust_position_m,
+        )
+        config = GapConfig(
+            horizons_s=(1.0, 3.0, 6.0) if self.horizon_s is None else (self.horizon_s,),
+            max_segments=self.segments,
+            limits=limits,
+            timestep_s=0.01 if calibrated is None else calibrated.timestep_s,
+            nthread=0,
+        )
         if self.out is not None:
             check_place(self.out)
         with Store(self.store, version=given_version(self.version)) as store:
@@ -119,13 +102,7 @@ class GapCommand:
             if self.fit:
                 from restock.train.twin.calibration.fit import FitConfig, fit
 
-                fit_config = FitConfig(
-                    task_hash=self.task,
-                    robot=robot,
-                    timestep_s=self.timestep_s,
-                    seed=self.seed,
-                    nthread=self.threads,
-                )
+                fit_config = FitConfig(task_hash=self.task, robot=robot, nthread=0)
                 fitted = fit(store, fit_config, on_progress=output.say)
                 calibrated, notes = fitted.perturbation, (_IN_SAMPLE, *fitted.warnings)
             gap = measure_gap(
@@ -143,22 +120,6 @@ class GapCommand:
         else:
             _show(gap)
         return int(ExitCode.FAILED if self.check and gap.untrusted else ExitCode.OK)
-
-    def _timestep_s(self, calibrated: Perturbation | None) -> float:
-        if self.timestep_s is not None:
-            return self.timestep_s
-        return 0.01 if calibrated is None else calibrated.timestep_s
-
-
-def _seconds(text: str) -> tuple[float, ...]:
-    from restock.errors import ConfigError
-
-    try:
-        return tuple(sorted({float(part) for part in text.split(",") if part.strip()}))
-    except ValueError:
-        raise ConfigError(
-            f"{text!r} is not a list of seconds", where="--horizons", remedy="write them like 1,3,6"
-        ) from None
 
 
 def _show(gap: TwinGap) -> None:

@@ -37,10 +37,8 @@ class RecordCommand:
     """
 
     out: Path
-    """The recording to write: FILE.mcap, or a folder for rosbag2."""
-    format: Literal["mcap", "rosbag2"] | None = None
-    """mcap (zstd) or rosbag2 (sqlite3). Default: mcap if --out ends in .mcap, rosbag2 if it has no
-    ending."""
+    """The recording to write: FILE.mcap (zstd), or a folder without an ending (rosbag2 with
+    sqlite3)."""
     minutes: float | None = None
     """Stop after the mission in which this much driving is recorded (default 5)."""
     missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
@@ -68,14 +66,12 @@ class RecordCommand:
     perturbation: str | None = None
     """Effective parameters that replace the default ones: nominal, friction, latency, payload,
     wheels, sensors, or a TOML file with a perturbation, or with a schedule that draws one for every
-    mission."""
+    mission; or exact, the nominal twin without sensor noise, to check a pipeline."""
     layouts: str = "default"
     """The floors, as for `restock train`: default, generated:train, FILE.toml, map.yaml, … The
     floor of each mission is drawn by its seed."""
     rates: str | None = None
     """Rates of topics in Hz, e.g. odom=20,scan=5."""
-    exact: bool = False
-    """Record the nominal twin without sensor noise, to check a pipeline."""
     dry_run: bool = False
     """Print what would be driven and written; write nothing."""
     json: bool = False
@@ -107,9 +103,7 @@ class RecordCommand:
 
         if self.minutes is not None and self.missions is not None:
             raise RestockError("--minutes and --missions cannot be combined", remedy="give one")
-        if self.exact and self.perturbation is not None:
-            raise RestockError("--exact and --perturbation cannot be combined", remedy="give one")
-        hardware = NOISELESS if self.exact else HARDWARE
+        known = {None: HARDWARE, "exact": NOISELESS}
         plan = RecordingPlan(
             format=self._format(),
             minutes=5.0 if self.minutes is None and self.missions is None else self.minutes,
@@ -123,9 +117,8 @@ class RecordCommand:
             start_ns=FIRST_NS if self.start is None else parse_start(self.start),
             tags=parse_tags(self.tag),
             hardware=(
-                hardware
-                if self.perturbation is None
-                else find_perturbation(self.perturbation, where="--perturbation")
+                known.get(self.perturbation)
+                or find_perturbation(str(self.perturbation), where="--perturbation")
             ),
         )
         policy = load_policy(plan.policy)
@@ -161,14 +154,13 @@ class RecordCommand:
 
     def _format(self) -> Literal["mcap", "rosbag2"]:
         ending = self.out.suffix[1:]  # drive.2026-10-05 is the name of a folder
-        if self.format is None and ending != "mcap" and ending.isalnum() and not ending.isdigit():
+        if ending != "mcap" and ending.isalnum() and not ending.isdigit():
             raise ConfigError(
                 f"{self.out} is not the name of a recording",
                 where="--out",
-                remedy="name a file that ends in .mcap, or a folder for rosbag2: without an ending,"
-                " or with --format rosbag2",
+                remedy="name a file that ends in .mcap, or a folder without an ending for rosbag2",
             )
-        return self.format or ("mcap" if ending == "mcap" else "rosbag2")
+        return "mcap" if ending == "mcap" else "rosbag2"
 
 
 def _missions(text: str | None) -> int | MissionsFile | None:
