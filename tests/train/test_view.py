@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 from mcap.reader import make_reader
@@ -28,9 +27,7 @@ from restock.replay.trace.moment import find_moment, seen_between
 from restock.replay.trace.trace import Trace, TracePlaces, trace_row
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
 from restock.train.run import checkpoint
-from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.run.run import Run
 from restock.train.session import Progress
 from restock.train.view.mcap_view import critic_along
@@ -212,49 +209,6 @@ def test_a_store_alone_shows_what_it_has(event: Event, tmp_path: Path) -> None:
     assert made["topics"].keys().isdisjoint({"/scan", "/restock/scan", "/restock/critic/value"})
     assert made["topics"]["/restock/seen"] == len(event.steps) == made["steps"]
     assert any("--recording" in note for note in made["notes"])
-
-
-@pytest.mark.long
-def test_an_episode_of_the_evaluation_stands_beside_it(event: Event, tmp_path: Path) -> None:
-    plan = plan_evaluation(event.run, policies=("agent",), episodes="wheel_slip=1")
-    drive_evaluation(plan)
-    (recorded,) = read_evaluations(event.run).to_pylist()
-    beside = {"beside": f"wheel_slip/{recorded['episode_seed']}", "beside_run": event.run}
-    path = tmp_path / "both.mcap"
-    made = write_view(event.trace, path, options(event, recording=None, **beside))
-    assert made["beside"]["episode_seed"] == recorded["episode_seed"]
-    decoded: dict[str, list[Any]] = {}
-    with AnyReader([path]) as reader:
-        for connection, log_ns, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
-            decoded.setdefault(connection.topic, []).append((log_ns, message))
-
-    def of(topic: str) -> list[Any]:
-        return [message for _, message in decoded[f"/restock/evaluation/{topic}"]]
-
-    assert len(of("pose")) == round(recorded["time_s"] / 0.2)
-    begins_ns = decoded["/restock/evaluation/pose"][0][0]
-    assert abs(begins_ns - (event.row["stamp_ns"] - 2 * 10**9)) < 10**7  # with the moment
-    assert {pose.header.frame_id for pose in of("pose")} == {"evaluation_map"}
-    assert sum(reward.data for reward in of("reward")) == pytest.approx(recorded["return"], 1e-4)
-    assert len(of("critic/td_error")) == len(of("pose"))
-    assert of("racks")[0].markers
-    reported = json.loads(of("moment")[0].data)
-    assert (reported["condition"], reported["success"]) == ("wheel_slip", recorded["success"])
-    assert len(decoded["/restock/pose"]) == len(event.steps)  # the logged one, as without it
-    layout = json.loads(layout_of(path).read_text())["configById"]
-    assert layout["3D!evaluation"]["fixedFrame"] == "evaluation_map"
-    assert "/restock/evaluation/others" in layout["3D!evaluation"]["topics"]
-
-    unknown = options(event, **(beside | {"beside": "wheel_slip/3"}))
-    with pytest.raises(ConfigError, match="is not an episode that policy run@7 drove"):
-        write_view(event.trace, tmp_path / "a.mcap", unknown)
-    table = read_evaluations(event.run)
-    other = [{**recorded, "time_s": recorded["time_s"] + 1}]
-    pq.write_table(table.from_pylist(other, schema=table.schema), event.run / FILE)
-    with pytest.raises(RunError, match="driven again has another time_s than recorded"):
-        write_view(event.trace, tmp_path / "a.mcap", options(event, **beside))
-    assert not (tmp_path / "a.mcap").exists()
 
 
 def test_what_cannot_be_shown_is_said_and_leaves_nothing(event: Event, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 Restock's are ROS 2 messages under `/restock/`, in frames of their own (`map` > `restock_base` >
 `restock_laser`, `restock_sectors`), so that they are drawn whatever transforms the robot publishes.
-An episode of an evaluation is under `/restock/evaluation/` and on a map of its own.
 If a run is named, its critic is shown along the steps: what it expects of the action taken, and how
 wrong it was.
 """
@@ -12,11 +11,10 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -33,9 +31,6 @@ from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.recording.bag_writer import build, serialise, stamp, typestore
-
-if TYPE_CHECKING:
-    from restock.train.view.evaluated import Beside, Evaluated
 
 
 @dataclass(frozen=True)
@@ -133,40 +128,17 @@ def _critic(
     )
 
 
-_BOX, _CYLINDER, _ADD, _DELETE_ALL = 1, 3, 0, 3
+_BOX, _ADD = 1, 0
 
 
-@dataclass(frozen=True)
-class _Side:
-    """The topics and frames of an episode."""
-
-    topics: str
-    map: str
-    robot: str
-
-    @property
-    def base(self) -> str:
-        return f"{self.robot}_base"
-
-    @property
-    def laser(self) -> str:
-        return f"{self.robot}_laser"
-
-    @property
-    def sectors(self) -> str:
-        return f"{self.robot}_sectors"
-
-
-_LOGGED = _Side("/restock", "map", "restock")
-_EVALUATED = _Side("/restock/evaluation", "evaluation_map", "evaluation")
 # One message: log time, topic, type, content.
 _Shown = tuple[int, str, str, Any]
 
 
 def write_mcap(
-    stream: BinaryIO, moment: Moment, critic: Critic | None, beside: Beside | None = None
+    stream: BinaryIO, moment: Moment, critic: Critic | None
 ) -> dict[str, tuple[str, int]]:
-    """Write the moment, and an episode of an evaluation beside it.
+    """Write the moment.
 
     Returns the type and the number of messages of each topic.
     """
@@ -193,8 +165,7 @@ def write_mcap(
         counts[message.channel.topic] += 1
         types[message.channel.topic] = message.channel.type
     numbers: dict[str, int] = {}
-    shown = _shown(moment, critic, _LOGGED, about(moment, critic))
-    for log_ns, topic, kind, content in chain(shown, () if beside is None else _beside(beside)):
+    for log_ns, topic, kind, content in _shown(moment, critic):
         if topic not in numbers:
             definition = typestore().generate_msgdef(kind, ros_version=2)[0].encode()
             schema = _schema(writer, kind, "ros2msg", definition, schemas)
@@ -230,34 +201,34 @@ def _schema(
     return known[kind, definition]
 
 
-def _shown(moment: Moment, critic: Critic | None, side: _Side, reported: str) -> Iterator[_Shown]:
-    """Restock's messages of every step, then of every tick of the recording; `told` of the row."""
+def _shown(moment: Moment, critic: Critic | None) -> Iterator[_Shown]:
+    """Restock's messages of every step, then of every tick of the recording."""
     sectors = moment.sector_scans()
     for index, (step, log_ns) in enumerate(zip(moment.steps, moment.log_ns, strict=True)):
         yield (
             log_ns,
-            f"{side.topics}/tf",
+            "/restock/tf",
             "tf2_msgs/msg/TFMessage",
-            _transforms(moment, step, log_ns, side),
+            _transforms(moment, step, log_ns),
         )
         pose = _pose(step["pose_x_m"], step["pose_y_m"], step["pose_yaw_rad"])
         yield (
-            *(log_ns, f"{side.topics}/pose", "geometry_msgs/msg/PoseStamped"),
+            *(log_ns, "/restock/pose", "geometry_msgs/msg/PoseStamped"),
             build(
                 "geometry_msgs/msg/PoseStamped",
-                header={"frame_id": side.map, "stamp": stamp(log_ns)},
+                header={"frame_id": "map", "stamp": stamp(log_ns)},
                 pose=pose,
             ),
         )
-        body = _body(moment, log_ns, side)
-        yield log_ns, f"{side.topics}/body", "visualization_msgs/msg/Marker", body
+        body = _body(moment, log_ns)
+        yield log_ns, "/restock/body", "visualization_msgs/msg/Marker", body
         if sectors:
-            scan = _scan(side.sectors, sectors[index], log_ns)
-            yield log_ns, f"{side.topics}/seen", "sensor_msgs/msg/LaserScan", scan
+            scan = _scan("restock_sectors", sectors[index], log_ns)
+            yield log_ns, "/restock/seen", "sensor_msgs/msg/LaserScan", scan
         yield (
-            *(log_ns, f"{side.topics}/waypoints", "nav_msgs/msg/Path"),
+            *(log_ns, "/restock/waypoints", "nav_msgs/msg/Path"),
             _path(
-                side.base,
+                "restock_base",
                 log_ns,
                 [
                     (0.0, 0.0),
@@ -271,21 +242,21 @@ def _shown(moment: Moment, critic: Critic | None, side: _Side, reported: str) ->
             linear={"x": float(step["command_speed_mps"])},
             angular={"z": float(step["command_yaw_rate_radps"])},
         )
-        yield log_ns, f"{side.topics}/command", "geometry_msgs/msg/Twist", command
+        yield log_ns, "/restock/command", "geometry_msgs/msg/Twist", command
         for name, text in texts_of(moment, critic, index).items():
             content = build("std_msgs/msg/String", data=text)
-            yield log_ns, f"{side.topics}/{name}", "std_msgs/msg/String", content
+            yield log_ns, f"/restock/{name}", "std_msgs/msg/String", content
         for name, number in numbers_of(moment, critic, index).items():
             if math.isfinite(number):
                 content = build("std_msgs/msg/Float64", data=number)
-                yield log_ns, f"{side.topics}/{name}", "std_msgs/msg/Float64", content
+                yield log_ns, f"/restock/{name}", "std_msgs/msg/Float64", content
         if step["transition_id"] == moment.at["transition_id"]:
-            content = build("std_msgs/msg/String", data=reported)
-            yield log_ns, f"{side.topics}/moment", "std_msgs/msg/String", content
-    yield from _recorded(moment, side)
+            content = build("std_msgs/msg/String", data=about(moment, critic))
+            yield log_ns, "/restock/moment", "std_msgs/msg/String", content
+    yield from _recorded(moment)
 
 
-def _recorded(moment: Moment, side: _Side) -> Iterator[_Shown]:
+def _recorded(moment: Moment) -> Iterator[_Shown]:
     """Yield the scan, plan and goal that the profile read, whenever they are new."""
     if moment.seen is None:
         return
@@ -297,91 +268,36 @@ def _recorded(moment: Moment, side: _Side) -> Iterator[_Shown]:
         if scan is not None and scan.stamp_ns != drawn:
             drawn = scan.stamp_ns
             kind = "sensor_msgs/msg/LaserScan"
-            yield log_ns, f"{side.topics}/scan", kind, _scan(side.laser, scan, log_ns)
+            yield log_ns, "/restock/scan", kind, _scan("restock_laser", scan, log_ns)
         if plan is not None and plan is not before:
             before = plan
             points = [(float(x), float(y)) for x, y in plan]
             yield (
                 log_ns,
-                f"{side.topics}/plan",
+                "/restock/plan",
                 "nav_msgs/msg/Path",
-                _path(side.map, log_ns, points),
+                _path("map", log_ns, points),
             )
         if goal is not None and goal != ordered:
             ordered = goal
-            header = {"frame_id": side.map, "stamp": stamp(log_ns)}
+            header = {"frame_id": "map", "stamp": stamp(log_ns)}
             kind = "geometry_msgs/msg/PoseStamped"
             yield (
                 log_ns,
-                f"{side.topics}/goal",
+                "/restock/goal",
                 kind,
                 build(kind, header=header, pose=_pose(*goal, 0.0)),
             )
 
 
-def _beside(beside: Beside) -> Iterator[_Shown]:
-    """Yield the evaluation's episode: what the logged one has, and what only a twin knows."""
-    evaluated, side = beside.evaluated, _EVALUATED
-    moment = evaluated.moment
-    reported = about_evaluated(evaluated, beside.critic)
-    kind = "visualization_msgs/msg/MarkerArray"
-    racks = [
-        _marker(side, 0, number, _BOX, ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), (x1 - x0, y1 - y0, 1.0))
-        for number, (x0, y0, x1, y1) in enumerate(evaluated.racks_m)
-    ]
-    yield moment.log_ns[0], f"{side.topics}/racks", kind, build(kind, markers=racks)
-    for log_ns, others in zip(moment.log_ns, evaluated.others, strict=True):
-        markers = [
-            _marker(side, log_ns, number, shape, place, size, colour)
-            for number, (shape, place, size, colour) in enumerate(_others(others))
-        ]
-        gone = {"action": _DELETE_ALL, "header": {"frame_id": side.map}}
-        content = build(kind, markers=[build("visualization_msgs/msg/Marker", **gone), *markers])
-        yield log_ns, f"{side.topics}/others", kind, content
-    yield from _shown(moment, beside.critic, side, reported)
-
-
-def _others(found: dict[str, Any]) -> Iterator[tuple[int, Any, tuple[float, float, float], Any]]:
-    for shape, name, size, colour in (
-        (_CYLINDER, "people", (0.44, 0.44, 1.7), (0.0, 0.45, 0.7)),
-        (_BOX, "forklifts", (1.6, 0.8, 1.8), (0.9, 0.62, 0.0)),
-        (_BOX, "pallets", (1.2, 0.8, 0.8), (0.52, 0.39, 0.26)),
-    ):
-        for place in found[name]:
-            yield shape, place, size, colour
-
-
-def _marker(
-    side: _Side,
-    log_ns: int,
-    number: int,
-    shape: int,
-    place: Sequence[float],
-    size: tuple[float, float, float],
-    colour: tuple[float, float, float] = (0.6, 0.65, 0.7),
-) -> Any:
-    pose = _pose(place[0], place[1], place[2])
-    pose["position"]["z"] = size[2] / 2
-    return build(
-        "visualization_msgs/msg/Marker",
-        header={"frame_id": side.map, "stamp": stamp(log_ns)},
-        id=number,
-        type=shape,
-        action=_ADD,
-        pose=pose,
-        scale=dict(zip("xyz", size, strict=True)),
-        color={**dict(zip("rgb", colour, strict=True)), "a": 1.0},
-    )
-
-
-def _transforms(moment: Moment, step: dict[str, Any], log_ns: int, side: _Side) -> Any:
+def _transforms(moment: Moment, step: dict[str, Any], log_ns: int) -> Any:
     body = moment.task.body
     frames = (
-        (side.map, side.base, step["pose_x_m"], step["pose_y_m"], step["pose_yaw_rad"]),
-        (side.base, side.laser, body.lidar_x_m, 0.0, body.lidar_yaw_rad),
+        ("map", "restock_base", step["pose_x_m"], step["pose_y_m"], step["pose_yaw_rad"]),
+        ("restock_base", "restock_laser", body.lidar_x_m, 0.0, body.lidar_yaw_rad),
         (
-            side.base,
-            side.sectors,
+            "restock_base",
+            "restock_sectors",
             body.lidar_x_m,
             0.0,
             0.0,
@@ -427,12 +343,12 @@ def _path(frame: str, log_ns: int, points: list[tuple[float, float]]) -> Any:
     return build("nav_msgs/msg/Path", header=header, poses=poses)
 
 
-def _body(moment: Moment, log_ns: int, side: _Side) -> Any:
+def _body(moment: Moment, log_ns: int) -> Any:
     body = moment.task.body
     near = {"position": {"z": 0.1}}
     return build(
         "visualization_msgs/msg/Marker",
-        header={"frame_id": side.base, "stamp": stamp(log_ns)},
+        header={"frame_id": "restock_base", "stamp": stamp(log_ns)},
         ns="restock",
         type=_BOX,
         action=_ADD,
@@ -498,15 +414,6 @@ def about(moment: Moment, critic: Critic | None) -> str:
     """Return as JSON which transition the moment is about."""
     keys = ("transition_id", "episode_id", "step_index", "stamp_ns", "condition", "zone")
     reported = {key: moment.at[key] for key in (*keys, "behaviour_policy", "reward", "source_file")}
-    if critic is not None:
-        reported["critic"] = f"{critic.run}: {critic.weights}"
-    return json.dumps(reported)
-
-
-def about_evaluated(evaluated: Evaluated, critic: Critic | None) -> str:
-    """Return as JSON which episode of an evaluation it is, and how it went."""
-    keys = ("condition", "block", "episode_seed", "layout", "version", "success", "failure")
-    reported = {key: evaluated.outcome[key] for key in (*keys, "bumps", "time_s", "return")}
     if critic is not None:
         reported["critic"] = f"{critic.run}: {critic.weights}"
     return json.dumps(reported)

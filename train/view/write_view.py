@@ -6,16 +6,13 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from restock.errors import ConfigError, StoreError
 from restock.files import temporary_name, write_text
 from restock.replay.trace.moment import Moment, find_moment
 from restock.replay.trace.trace import Trace
 from restock.train.view.mcap_view import Critic, critic_along, write_mcap
-
-if TYPE_CHECKING:  # it needs the twin and its physics
-    from restock.train.view.evaluated import Beside
 
 
 @dataclass(frozen=True)
@@ -27,8 +24,6 @@ class ViewOptions:
     recording: Path | str | None = None  # scans, plans and all other topics are in it
     profile: str | None = None
     critic: str | None = None  # a run
-    beside: str | None = None  # CONDITION/SEED of an episode of the evaluation of `beside_run`
-    beside_run: Path | str | None = None
 
 
 def write_view(
@@ -41,9 +36,7 @@ def write_view(
         path: a new file, `.mcap`; a layout for Foxglove is put beside it.
 
     Raises:
-        ConfigError: another ending, there is a file already, or the evaluation has no such
-            episode.
-        RunError: driven again that episode is not the recorded one.
+        ConfigError: another ending, or there is a file already.
         StoreError: the row is of the twin: no store has what was before and after it.
     """
     options, path = options or ViewOptions(), Path(path)
@@ -62,11 +55,10 @@ def write_view(
         profile=options.profile,
     )
     critic = critic_along(options.critic, moment) if options.critic is not None else None
-    beside = _beside(options, moment)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_name(path).with_suffix(path.suffix)
     try:
-        counts, layout = _write(temporary, moment, critic, beside)
+        counts, layout = _write(temporary, moment, critic)
         write_text(layout_of(path), json.dumps(layout, indent=1) + "\n")
         temporary.replace(path)
     finally:
@@ -77,7 +69,6 @@ def write_view(
         "steps": len(moment.steps),
         "seconds": (moment.window_ns[1] - moment.window_ns[0]) / 1e9,
         "critic": None if critic is None else f"{critic.run}: {critic.weights}",
-        "beside": None if beside is None else beside.evaluated.outcome,
         "topics": counts,
         "notes": moment.notes,
     }
@@ -102,44 +93,18 @@ def layout_of(path: Path) -> Path:
     return path.with_suffix(".foxglove.json")
 
 
-def _beside(options: ViewOptions, moment: Moment) -> Beside | None:
-    """Drive the requested episode of the evaluation, from the moment's beginning on."""
-    if options.beside is None:
-        return None
-    if options.beside_run is None:
-        raise ConfigError(
-            "is an episode of an evaluation, so its run is needed",
-            where="--beside",
-            remedy="give the run with --critic RUN",
-        )
-    from restock.train.view.evaluated import Beside, evaluated_moment
-
-    run = Path(options.beside_run)
-    evaluated = evaluated_moment(run, options.beside, begins_ns=moment.window_ns[0])
-    along = None if options.critic is None else critic_along(options.critic, evaluated.moment)
-    return Beside(evaluated, along)
-
-
 def _write(
-    path: Path, moment: Moment, critic: Critic | None, beside: Beside | None
+    path: Path, moment: Moment, critic: Critic | None
 ) -> tuple[dict[str, int], dict[str, Any]]:
     with path.open("wb") as stream:
-        written = write_mcap(stream, moment, critic, beside)
+        written = write_mcap(stream, moment, critic)
     middle = float(moment.at["pose_x_m"]), float(moment.at["pose_y_m"])
     types = {topic: kind for topic, (kind, _) in written.items()}
     counts = {topic: count for topic, (_, count) in written.items()}
-    floors = {"moment": ("map", middle)}
-    if beside is not None:
-        first = beside.evaluated.moment.at
-        floors["evaluation"] = (
-            "evaluation_map",
-            (float(first["pose_x_m"]), float(first["pose_y_m"])),
-        )
-    return counts, foxglove_layout(types, floors)
+    return counts, foxglove_layout(types, middle)
 
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_EVALUATION = "/restock/evaluation/"  # an episode of an evaluation, with topics of the same names
 # What is drawn of Restock's topics, and how.
 _DRAWN: dict[str, dict[str, Any]] = {
     "/restock/scan": {"pointSize": 4, "colorMode": "flat", "flatColor": "#d0312dff"},
@@ -152,28 +117,20 @@ _DRAWN: dict[str, dict[str, Any]] = {
 }
 
 
-def foxglove_layout(
-    topics: Mapping[str, str], floors: Mapping[str, tuple[str, tuple[float, float]]]
-) -> dict[str, Any]:
+def foxglove_layout(topics: Mapping[str, str], middle_m: tuple[float, float]) -> dict[str, Any]:
     """Make a layout to import in Foxglove.
 
     Args:
         topics: those of the file -> their types; what is not among them is not shown.
-        floors: one view each, by name: the frame of its map, and what the camera looks at there,
-            in metres.
+        middle_m: what the camera looks at on the map.
     """
-    drawn = {
-        place: {"visible": True, **how}
-        for name, how in _DRAWN.items()
-        for place in _both(name)
-        if place in topics
-    }
+    drawn = {name: {"visible": True, **how} for name, how in _DRAWN.items() if name in topics}
     maps = [name for name, kind in topics.items() if kind == "nav_msgs/msg/OccupancyGrid"]
     drawn |= {name: {"visible": True, "colorMode": "map", "drawBehind": True} for name in maps}
     markers = [n for n, k in topics.items() if k == "visualization_msgs/msg/MarkerArray"]
     drawn |= {name: {"visible": True} for name in markers}
     panels: dict[str, Any] = {
-        **{f"3D!{name}": _floor(drawn, *floor) for name, floor in floors.items()},
+        "3D!moment": _floor(drawn, middle_m),
         "Plot!speed": _plot(topics, "/restock/speed/command_mps", "/restock/speed/wheels_mps"),
         "Plot!critic": _plot(
             topics, "/restock/critic/value", "/restock/critic/best_value", "/restock/reward"
@@ -182,8 +139,8 @@ def foxglove_layout(
         "StateTransitions!labels": {
             "paths": [
                 {
-                    "value": f"{place}.data",
-                    "label": f"evaluation: {label}" if place != name else label,
+                    "value": f"{name}.data",
+                    "label": label,
                     "timestampMethod": "receiveTime",
                 }
                 for name, label in (
@@ -193,8 +150,7 @@ def foxglove_layout(
                     ("/restock/action", "action"),
                     ("/restock/critic/greedy_action", "the critic's best"),
                 )
-                for place in _both(name)
-                if place in topics
+                if name in topics
             ],
             "isSynced": True,
         },
@@ -216,23 +172,18 @@ def foxglove_layout(
         "layout": {
             "direction": "row",
             "splitPercentage": 55,
-            "first": _column([f"3D!{name}" for name in floors]),
+            "first": "3D!moment",
             "second": _column(right),
         },
     }
 
 
-def _both(topic: str) -> tuple[str, str]:
-    """Return the topic of the logged episode, and that of the evaluation's."""
-    return topic, topic.replace("/restock/", _EVALUATION)
-
-
-def _floor(drawn: dict[str, Any], frame: str, middle_m: tuple[float, float]) -> dict[str, Any]:
+def _floor(drawn: dict[str, Any], middle_m: tuple[float, float]) -> dict[str, Any]:
     return {
         "scene": {"transforms": {"showLabel": False, "axisSize": 0.3}},
         "topics": drawn,
-        "followTf": frame,
-        "fixedFrame": frame,
+        "followTf": "map",
+        "fixedFrame": "map",
         "followMode": "follow-none",
         "cameraState": {
             **{"distance": 9, "perspective": True, "phi": 30, "thetaOffset": 0},
@@ -245,13 +196,12 @@ def _plot(topics: Collection[str], *names: str) -> dict[str, Any]:
     paths = [
         {
             "enabled": True,
-            "label": place.removeprefix("/restock/"),
-            "value": f"{place}.data",
+            "label": name.removeprefix("/restock/"),
+            "value": f"{name}.data",
             "timestampMethod": "receiveTime",
         }
         for name in names
-        for place in _both(name)
-        if place in topics
+        if name in topics
     ]
     return {"paths": paths, "showLegend": True, "isSynced": True}
 

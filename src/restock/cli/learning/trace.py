@@ -62,9 +62,6 @@ class TraceCommand:
     """Seconds after the row that --view shows."""
     critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
     """The run whose critic --view shows, or none. Default for a row of a RUN: that run."""
-    beside: Annotated[str | None, tyro.conf.arg(metavar="CONDITION/SEED")] = None
-    """With --view: also drive this episode of that run's evaluation (`restock eval`) again, and
-    show it."""
     rows: int = 20
     """How many audited rows to list if no ROW is given."""
     json: bool = False
@@ -115,10 +112,6 @@ class TraceCommand:
         from restock.errors import ConfigError
 
         if self.view is None:
-            if self.beside is not None:
-                raise ConfigError(
-                    "needs a file to write to", where="--beside", remedy="give --view FILE"
-                )
             without = ("before", "after", "critic")
             refuse(self, without, "has no effect without --view", remedy="give --view FILE")
             return
@@ -144,17 +137,7 @@ class TraceCommand:
 
         own = self.place if trace.audit is not None else None  # of a run
         critic = None if self.critic == "none" else self.critic or own
-        run = critic or own
-        evaluated = None if run is None else Path(run)
-        options = ViewOptions(
-            self.before,
-            self.after,
-            self.recording,
-            self.profile,
-            critic,
-            self.beside,
-            evaluated,
-        )
+        options = ViewOptions(self.before, self.after, self.recording, self.profile, critic)
         return write_view(trace, self.view, options)
 
 

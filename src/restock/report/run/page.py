@@ -30,7 +30,7 @@ from restock.words import counted, policy_words
 def page(facts: Facts) -> dict[str, Any]:
     """Return everything that the page's template needs."""
     sections = [
-        success(facts) if facts.twin else headline.judged_section(facts),
+        success(facts) if facts.twin else judged_section(facts),
         ways_section(facts),
         films_section(facts),
         sampled(facts),
