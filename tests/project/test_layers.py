@@ -74,7 +74,7 @@ MAY_IMPORT = {
         " replay/sampling replay/store ingest/profile ingest/task"
     ),
     "train/study": "judge dqn evaluation libraries run replay/panel twin/missions",
-    "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
+    "train/view": "dqn evaluation run twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "ingest/task",
     "train/twin/missions": "twin/floors",

@@ -21,7 +21,7 @@ from restock.report.look.blocks import (
 from restock.report.run.facts import NO_GOAL, Facts
 from restock.report.run.fed import actions_section, capacity_section, practice_section, sampled
 from restock.report.run.floor import films_section, floor_section
-from restock.report.run.headline import headline, lead, losses, off_policy_table
+from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
 from restock.stats import interval_text, wilson
 from restock.words import counted, policy_words
