@@ -11,7 +11,6 @@ where it ended.
 from __future__ import annotations
 
 import itertools
-import math
 from bisect import bisect_right
 from datetime import UTC, datetime, timedelta
 from importlib.resources import files
@@ -44,27 +43,10 @@ class Linear(Checked, frozen=True, tag_field="schedule", tag="linear"):
         return self.start + (self.end - self.start) * _part(self, env_steps)
 
 
-class Cosine(Checked, frozen=True, tag_field="schedule", tag="cosine"):
-    """From `start` to `end` along half a cosine: slow at both ends."""
-
-    start: Fraction
-    end: Fraction
-    to_env_steps: EnvSteps
-    from_env_steps: EnvSteps = 0
-
-    def check(self) -> None:
-        _check_span(self)
-
-    def at(self, env_steps: float) -> float:
-        part = (1.0 - math.cos(math.pi * _part(self, env_steps))) / 2.0
-        return self.start + (self.end - self.start) * part
-
-
 class Piecewise(Checked, frozen=True, tag_field="schedule", tag="piecewise"):
-    """Through points `[env_steps, share]`, in order: joined by lines, or held until the next."""
+    """Through points `[env_steps, share]`, in order, joined by lines."""
 
     points: tuple[tuple[EnvSteps, Fraction], ...]
-    between: Literal["line", "hold"] = "line"
 
     def check(self) -> None:
         steps = [step for step, _ in self.points]
@@ -78,13 +60,13 @@ class Piecewise(Checked, frozen=True, tag_field="schedule", tag="piecewise"):
         if after == 0:
             return self.points[0][1]
         step, share = self.points[after - 1]
-        if after == len(self.points) or self.between == "hold":
+        if after == len(self.points):
             return share
         next_step, next_share = self.points[after]
         return share + (next_share - share) * (env_steps - step) / (next_step - step)
 
 
-Schedule = Linear | Cosine | Piecewise
+Schedule = Linear | Piecewise
 Portion = Fraction | Schedule
 
 
@@ -114,12 +96,12 @@ def mean_over(portion: Portion, begin: float, end: float) -> float:
     return total / (end - begin)
 
 
-def _part(ramp: Linear | Cosine, env_steps: float) -> float:
+def _part(ramp: Linear, env_steps: float) -> float:
     length = ramp.to_env_steps - ramp.from_env_steps
     return min(max((env_steps - ramp.from_env_steps) / length, 0.0), 1.0)
 
 
-def _check_span(ramp: Linear | Cosine) -> None:
+def _check_span(ramp: Linear) -> None:
     if ramp.from_env_steps >= ramp.to_env_steps:
         raise ValueError(
             f"to_env_steps must be above from_env_steps, which is {ramp.from_env_steps:,}, got"
@@ -136,11 +118,10 @@ FromOne = Annotated[float, Meta(ge=1)]
 Positive = Annotated[float, Meta(gt=0)]
 Timing = Literal["pre", "post"]
 Share = Fraction | Literal["natural", "equal"] | Schedule
-Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
+Correction = Literal["none", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
 Uncertain = Literal["drop", "keep", "nominal"]
-Prefer = Literal["rarest", "priority"]
 Within = Annotated[str, Meta(extra_json_schema={"enum": list(RULES)})]  # a rule of RULES
 Represents = Literal["natural", "archive"] | dict[str, Fraction]  # rates of rows, by stratum
 
@@ -169,7 +150,6 @@ class SourceShares(Checked, frozen=True):
     """Shares of an online batch by source, numbers or schedules; what is left is fresh."""
 
     logs: Portion = 0.5
-    fresh: Fraction | None = None  # None: the rest
     stores: tuple[OtherStore, ...] = ()
     represents: Represents | None = None  # rates of the main store, if its rows are a selection
 
@@ -183,23 +163,8 @@ class SourceShares(Checked, frozen=True):
         portions = [self.logs, *(store.share for store in self.stores)]
         names = [store.name for store in self.stores]
         _require(len(set(names)) == len(names), f"stores named twice: {sorted(names)}")
-        if self.fresh is not None:
-            fixed = [portion for portion in portions if isinstance(portion, int | float)]
-            _require(
-                len(fixed) == len(portions),
-                "sources: leave out `fresh` if there is a schedule: it gets the rest",
-            )
-            total = sum(fixed) + self.fresh
-            _require(
-                abs(total - 1) < 1e-6,
-                f"sources must sum to 1, got {total:g}",
-            )
         bends = sorted({0, *(step for portion in portions for step in knots(portion))})
-        # Between two bends a cosine can lie above the line that joins them.
-        fine = [a + (b - a) * i / 16 for a, b in itertools.pairwise(bends) for i in range(16)]
-        totals = [
-            sum(value_at(portion, step) for portion in portions) for step in [*fine, bends[-1]]
-        ]
+        totals = [sum(value_at(portion, step) for portion in portions) for step in bends]
         _require(max(totals) <= 1 + 1e-6, f"sources sum to {max(totals):g} at some step, above 1")
         _require(
             value_at(self.logs, 0) > 0,
@@ -244,13 +209,6 @@ def _check_within(name: str) -> None:
     _require(name in RULES, f"within is {name!r}: the rules are {', '.join(RULES)}")
 
 
-class PlannedUse(Checked, frozen=True):
-    """How much will be drawn, as far as `restock mix` can know; a run puts its own in its place."""
-
-    updates: AtLeastOne = 20_000
-    batch_size: AtLeastOne = 128
-
-
 class EvaluationSplit(Checked, frozen=True):
     """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`.
 
@@ -262,7 +220,6 @@ class EvaluationSplit(Checked, frozen=True):
         "episode"
     )
     share: Annotated[float, Meta(ge=0, lt=1)] = 0.1
-    gap_s: Annotated[float, Meta(ge=0)] = 2.0  # gap before the end of an episode that is left out
     robots: tuple[str, ...] = ()  # hold out these robots, instead of a share
 
     def check(self) -> None:
@@ -289,7 +246,6 @@ class CorrectionRule(Checked, frozen=True):
 
     pre: Correction = "none"  # chosen on the state: does not bias Q
     post: Correction = "density_ratio"  # chosen on the outcome: biases Q if uncorrected
-    beta: Fraction = 0.5  # exponent of the weights for the rule "beta"
     clip: FromOne = 4.0  # largest weight of "clipped" (and smallest inverse) and "density_ratio"
     # Of weights that take a stratum's share of the gradient below its share of the rows.
     below_natural: Literal["refuse", "allow"] = "refuse"
@@ -304,10 +260,6 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
     cap: Fraction = 1.0
     correction: Correction | None = None  # default: the mixture's rule for its timing
     within: Within | None = None  # default: the mixture's
-    min_rows: Count = 1
-    min_episodes: Count = 1
-    max_rows_per_episode: AtLeastOne | None = None  # default: the mixture's
-    max_rows_per_recording: AtLeastOne | None = None  # default: the mixture's
 
     def check(self) -> None:
         name = getattr(self, "name", "each_condition")
@@ -357,8 +309,7 @@ class Mixture(Checked, frozen=True):
     seed: int = 0
     # How rows are packed.
     discount: Fraction = 0.99  # discount (gamma) per step
-    n_step: AtLeastOne = 1  # steps of a logged row's return; ends with the episode
-    cut_at_off_policy: bool = True  # also ends where the behaviour policy or version changes
+    n_step: AtLeastOne = 1  # steps of a logged row's return; ends with the episode, or the policy
     return_to_go: bool = False  # pack each row's discounted return to the end of its episode
     sampling: Literal["memory", "chunked"] = "memory"  # chunked: for panels larger than memory
     evaluation_split: EvaluationSplit = EvaluationSplit()
@@ -377,10 +328,10 @@ class Mixture(Checked, frozen=True):
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
     # In which shares.
     sources: SourceShares = SourceShares()
-    planned: PlannedUse = PlannedUse()
+    # Rows that will be drawn, as far as `restock mix` can know; a run puts its own in its place.
+    planned_draws: AtLeastOne = 20_000 * 128
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
-    prefer: Prefer = "rarest"  # which stratum gets an episode; priority: the lowest
     max_replays_per_row: FromOne | None = None  # enforced by the run's learner
     shortfall: Shortfall = "redistribute"
     # And how, within a stratum.

@@ -1,6 +1,6 @@
 """The shares of a run: which part of a batch each stratum gets now, and what was drawn of each.
 
-A panel's shares are a plan for the mixture's `[planned]` draws. A run knows how much it will draw,
+A panel's shares are a plan for the mixture's `planned_draws`. A run knows how much it will draw,
 at which environment step, and where its TD errors are: the controller plans the mixture for that
 run, follows its schedules, and counts what is drawn, so that no stratum
 gives more than its rows may give under `max_replays_per_row`.

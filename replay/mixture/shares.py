@@ -25,7 +25,6 @@ from restock.replay.mixture.mixture import (
     Represents,
     Share,
     Shortfall,
-    StratumLimits,
     StratumRule,
     value_at,
 )
@@ -88,12 +87,8 @@ def represented_shares(
 
 def stands_for_others(mixture: Mixture, source: str) -> bool:
     """Return whether a source's rows in a panel may stand for other rates than their own."""
-    rules: list[Mixture | StratumLimits] = [mixture, *mixture.strata]
-    if mixture.each_condition is not None:
-        rules.append(mixture.each_condition)
-    return mixture.sources.chosen(source) or any(
-        rule.max_rows_per_episode or rule.max_rows_per_recording for rule in rules
-    )
+    capped = mixture.max_rows_per_episode or mixture.max_rows_per_recording
+    return mixture.sources.chosen(source) or capped is not None
 
 
 def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:
@@ -233,7 +228,7 @@ def plan_shares(
         MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
     """
     wanted = wanted_shares(rules, rows if natural is None else natural, env_steps)
-    limit = row_limits(mixture, rules, rows, episodes, draws)
+    limit = row_limits(mixture, rows, draws)
     untold, too_few = unknown or {}, lacking or {}
     caps = np.array([rule.cap for rule in rules])
 
@@ -371,46 +366,19 @@ def scaled_within(base: F64, low: F64, high: F64) -> F64:
     return np.asarray(shares / shares.sum(), np.float64)
 
 
-def row_limits(
-    mixture: Mixture,
-    rules: Sequence[StratumRule],
-    rows: Ints,
-    episodes: Ints,
-    draws: float,
-) -> F64:
+def row_limits(mixture: Mixture, rows: Ints, draws: float) -> F64:
     """Return the largest share of `draws` that each stratum's rows allow, (S,)."""
     limit = np.where(rows > 0, 1.0, 0.0)
     if mixture.most_draws is not None and draws > 0:
         limit = np.minimum(limit, mixture.most_draws * rows / draws)
-    return np.where(has_minimum(rules, rows, episodes), limit, 0.0)
+    return np.asarray(limit, np.float64)
 
 
-def has_minimum(rules: Sequence[StratumRule], rows: Ints, episodes: Ints) -> Bools:
-    """Return whether each stratum has the rows and episodes below which it gets nothing, (S,)."""
-    enough = (rows >= [rule.min_rows for rule in rules]) & (
-        episodes >= [rule.min_episodes for rule in rules]
-    )
-    return np.asarray(enough, np.bool_)
-
-
-def missing_rows(
-    mixture: Mixture,
-    rules: Sequence[StratumRule],
-    rows: Ints,
-    episodes: Ints,
-    wanted: F64,
-    draws: float,
-) -> Ints:
-    """Return how many rows more each stratum needs, to be drawn as often as it is wanted, (S,).
-
-    Rows of `min_episodes` are counted as of the episodes that there are.
-    """
+def missing_rows(mixture: Mixture, rows: Ints, wanted: F64, draws: float) -> Ints:
+    """Return how many rows more each stratum needs, to be drawn as often as it is wanted, (S,)."""
     needed = np.ones(len(rows))
     if mixture.most_draws is not None:
         needed = np.maximum(needed, wanted * draws / mixture.most_draws)
-    for index, rule in enumerate(rules):
-        an_episode = rows[index] / max(int(episodes[index]), 1)
-        needed[index] = max(needed[index], rule.min_rows, rule.min_episodes * an_episode)
     # Rounded down by a hair: what fits exactly misses nothing.
     missing = np.ceil(np.where(wanted > 0, needed - rows, 0.0) - 1e-6)
     return np.asarray(np.maximum(missing, 0), np.int64)

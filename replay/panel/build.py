@@ -255,7 +255,6 @@ def write_panel(
             scratch,
             plan.rows,
             random_probability=_random_probability(task_json),
-            cut_at_off_policy=plan.mixture.cut_at_off_policy,
         )
         packer = Packer(source.connection, plan, steps, scratch)
         size, record = _write_all(packer, partial, advance)

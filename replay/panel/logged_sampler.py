@@ -245,7 +245,7 @@ def sampler_for(
         batch_size: logged rows of a batch.
         seed: of the draws: an integer of at least 0, or several.
         planned: what will be drawn, which `max_replays_per_row` is shared out by; default: what the
-            mixture says under [planned].
+            mixture says by `planned_draws`.
         logs_share: of an online batch, in place of the mixture's.
         fresh: (S,) which strata rows of a ring beside the panel can be in; None: there is no ring.
 
@@ -330,8 +330,9 @@ def needs_td(panel: Panel) -> bool:
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
     """Return the draws that a mixture was planned for."""
-    online = float(mixture.planned.updates * mixture.planned.batch_size)
-    return PlannedDraws(online=online, end_env_steps=mixture.sources.last_bend)
+    return PlannedDraws(
+        online=float(mixture.planned_draws), end_env_steps=mixture.sources.last_bend
+    )
 
 
 def controller_for(

@@ -116,7 +116,6 @@ class SourceSteps:
         folder: where the files go.
         rows: META_COLUMNS of the plan's rows.
         random_probability: of an action chosen blindly; below it a policy explores. 0: unknown.
-        cut_at_off_policy: end returns before off-policy actions; see `n_step`.
     """
 
     def __init__(
@@ -125,10 +124,8 @@ class SourceSteps:
         rows: pa.Table,
         *,
         random_probability: float,
-        cut_at_off_policy: bool,
     ) -> None:
         self.rows = len(rows)
-        self._bit = ON_POLICY if cut_at_off_policy else CONTINUES
         self.ids: Ints = rows["transition_id"].to_numpy()
         self.reward: F32 = rows["reward"].to_numpy()
         self.flags: NDArray[np.uint8] = _on_disk(folder / "flags", np.uint8, self.rows)
@@ -140,7 +137,7 @@ class SourceSteps:
             self.flags[-1] = TERMINATED
 
     def _continues(self, begin: int, end: int) -> Bools:
-        return (self.flags[begin:end] & self._bit) > 0
+        return (self.flags[begin:end] & ON_POLICY) > 0
 
     def horizon(self, begin: int, end: int, n_step: int) -> Ints:
         """Return the number of steps in the return of each row of [begin, end)."""

@@ -17,7 +17,7 @@ from restock.arrays import Bools, Ints, splitmix64
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.plan.candidates import Places, bools, codes
-from restock.replay.plan.strata import NO_STRATUM, ResolvedStratum
+from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import GOLDEN
 from restock.replay.store.definitions import install_repeated_rows
 from restock.words import counted
@@ -27,6 +27,7 @@ DAY_NS = 86_400 * 10**9
 _GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
 # Times the share that is asked for: where a whole episode is more, the end of one is held out.
 _WHOLE_AT_MOST = 2.0
+GAP_S = 2.0  # left out before the held end of an episode
 _GAP_AT_MOST = 0.25  # of an episode, for its end to be held out
 _LEFT_AT_LEAST = 0.2  # of an episode, to learn from
 EPISODE_REPEATS = 3  # rows that an episode shares with the evaluation split, to be left out whole
@@ -155,7 +156,6 @@ def repeats_of(
 def leave_out_of_strata(
     table: pa.Table,
     mixture: Mixture,
-    strata: list[ResolvedStratum],
     stratum: NDArray[np.int16],
     out: LeftOut,
 ) -> Bools:
@@ -178,9 +178,9 @@ def leave_out_of_strata(
     out.add("in no stratum", unlisted)
     beyond_any = np.zeros(len(table), np.bool_)
     for column, name in (("episode_id", "episode"), ("recording_id", "recording")):
-        caps = np.array([_cap(s, mixture, f"max_rows_per_{name}") for s in strata], np.int64)
-        if (caps < len(table)).any():
-            beyond = beyond_cap(table, column, stratum, caps, out.gone, mixture.seed)
+        cap = getattr(mixture, f"max_rows_per_{name}")
+        if cap is not None:
+            beyond = beyond_cap(table, column, stratum, cap, out.gone, mixture.seed)
             beyond_any |= beyond
             out.add(
                 f"beyond the cap of rows an {name}"
@@ -191,17 +191,11 @@ def leave_out_of_strata(
     return beyond_any
 
 
-def _cap(stratum: ResolvedStratum, mixture: Mixture, name: str) -> int:
-    of_stratum, common = getattr(stratum.rule, name), getattr(mixture, name)
-    cap = of_stratum if of_stratum is not None else common
-    return np.iinfo(np.int64).max if cap is None else int(cap)
-
-
 def beyond_cap(
     table: pa.Table,
     column: str,
     stratum: NDArray[np.int16],
-    caps: Ints,
+    cap: int,
     gone: Bools,
     seed: int,
 ) -> Bools:
@@ -218,7 +212,7 @@ def beyond_cap(
     first = np.flatnonzero(np.append(True, sorted_group[1:] != sorted_group[:-1]))
     place = np.arange(len(rows)) - np.repeat(first, np.diff(np.append(first, len(rows))))
     beyond = np.zeros(len(table), np.bool_)
-    beyond[rows[order]] = place >= caps[stratum[rows[order]]]
+    beyond[rows[order]] = place >= cap
     return beyond
 
 
@@ -327,14 +321,14 @@ def _ends_of_episodes(
     np.maximum.at(last_ns, episode, stamp_ns)
     long_s = (last_ns - first_ns) * 1e-9
     # Of a shorter one little would be left.
-    split = (long_s * _GAP_AT_MOST >= rule.gap_s)[episode]
+    split = (long_s * _GAP_AT_MOST >= GAP_S)[episode]
     if only is not None:
         split &= episode == only
     begin_ns = last_ns - (share * (last_ns - first_ns)).astype(np.int64)
     held = split & (stamp_ns > begin_ns[episode])
     first_held = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(first_held, episode[held], step[held])
-    near = stamp_ns > begin_ns[episode] - round(rule.gap_s * 1e9)
+    near = stamp_ns > begin_ns[episode] - round(GAP_S * 1e9)
     near |= step >= first_held[episode] - n_step
     rows_of = np.maximum(np.bincount(episode, minlength=count), 1)
     left = np.bincount(episode[~near], minlength=count) / rows_of
@@ -347,7 +341,7 @@ def _ends_of_episodes(
     whole = "each episode" if rule.by == "within_episode" else "the one episode there is"
     if only is not None:
         whole = f"the longest of {len(np.unique(episode))} episodes"
-    note = f"the last {share:.0%} of {whole}, after a gap of {rule.gap_s:g} s"
+    note = f"the last {share:.0%} of {whole}, after a gap of {GAP_S:g} s"
     return EvaluationRows(held, split & near & ~held, "within_episode", note)
 
 

@@ -273,12 +273,11 @@ def plan_panel(
     for other in others:
         if other.repeated_rows:
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
-    if mixture.prefer == "rarest":
-        stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
+    stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
     warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
     taken = taken_by_others(table, strata, member, stratum, out.admitted)
     del member
-    beyond_cap = leave_out_of_strata(table, mixture, strata, stratum, out)
+    beyond_cap = leave_out_of_strata(table, mixture, stratum, out)
     if out.gone.all():
         reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in out.reasons.items())
         raise MixtureError(

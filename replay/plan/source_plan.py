@@ -13,7 +13,6 @@ mission that never yielded a row has no rate: only a bound.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,6 @@ from restock.ingest.task.conditions import NOMINAL
 from restock.replay.mixture.mixture import Mixture, StratumRule, knots
 from restock.replay.mixture.shares import (
     SharePlan,
-    has_minimum,
     missing_rows,
     plan_shares,
     wanted_shares,
@@ -52,17 +50,10 @@ _NEARLY_NONE = 0.1  # of what a stratum could have: it has less than that …
 _TAKEN = 0.5  # … because a condition holds in at least this much
 
 
-def too_few(rule: StratumRule, rows: int, episodes: int) -> str:
-    """Return why a stratum gets nothing, and what to change; "" if it has what it needs."""
-    if not rows:
-        other = "change its `where`" if rule.where is not None else "leave it out of the strata"
-        return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
-    needs = {"min_rows": (rule.min_rows, rows), "min_episodes": (rule.min_episodes, episodes)}
-    short = [f"{name} = {least:,}" for name, (least, has) in needs.items() if has < least]
-    if not short:
-        return ""
-    has = f"{counted(rows, 'row')} in {counted(episodes, 'episode')}"
-    return f"has {has}, too few for its {' and '.join(short)}: lower that, or record more"
+def no_rows(rule: StratumRule) -> str:
+    """Return what to change where a stratum has no row."""
+    other = "change its `where`" if rule.where is not None else "leave it out of the strata"
+    return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
 
 
 def taken_by_others(
@@ -334,17 +325,15 @@ def plan_source(
     of_each = (np.bincount(source.episode[source.code == i]) for i in range(size))
     per_episode = [counts[counts > 0] for counts in of_each]
     episodes = np.array([len(counts) for counts in per_episode], np.int64)
-    draws = mixture.planned.updates * mixture.planned.batch_size * source.part
+    draws = mixture.planned_draws * source.part
     rules = [stratum.rule for stratum in strata]
     untold = {
         rule.name: why
         for rule, count in zip(rules, rows, strict=True)
         if not count and rule.where is None and (why := (unknown or {}).get(rule.name))
     }
-    lacking = {
-        rule.name: too_few(rule, *has) for rule, *has in zip(rules, rows, episodes, strict=True)
-    }
-    lacking = {name: why for name, why in (lacking | dict(taken or {})).items() if why}
+    empty = [rule for rule, count in zip(rules, rows, strict=True) if not count]
+    lacking = {rule.name: no_rows(rule) for rule in empty} | dict(taken or {})
     shares = plan_shares(
         mixture,
         rules,
@@ -362,7 +351,7 @@ def plan_source(
     _refuse_later_shares(rules, rows if natural is None else natural)
     # A share with a schedule may begin at 0; others that are 0 are never drawn.
     scheduled = np.array([not isinstance(rule.share, int | float | str) for rule in rules])
-    drawn = (shares.got > 0) | (scheduled & has_minimum(rules, rows, episodes))
+    drawn = (shares.got > 0) | scheduled
     kept = np.asarray(drawn[source.code], np.bool_)
     code, state = source.code[kept], source.state_code[kept]
     outcome, fit = _outcomes(connection, mixture, strata, source, kept, natural)
@@ -370,7 +359,7 @@ def plan_source(
         code, state, strata, shares.got, mixture.correction, outcome, natural
     )
     after = effective_shares(code, weight, shares.got)
-    missing = missing_rows(mixture, rules, rows, episodes, shares.wanted, draws)
+    missing = missing_rows(mixture, rows, shares.wanted, draws)
     missing[[rule.name in untold for rule in rules]] = 0  # no drive of such robots brings any
     occurs = rows / max(rows.sum(), 1) if natural is None else natural
     found: dict[str, F64] = {}
@@ -420,9 +409,7 @@ def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> N
     """Raise MixtureError where schedules leave the other strata no way to share out the rest."""
     portions = [rule.share for rule in rules if not isinstance(rule.share, str)]
     bends = sorted({step for portion in portions for step in knots(portion)})
-    # Between two bends a cosine can lie above the line that joins them.
-    fine = [a + (b - a) * i / 16 for a, b in itertools.pairwise(bends) for i in range(16)]
-    for step in [*fine, *bends[-1:]]:
+    for step in bends:
         try:
             wanted_shares(rules, natural, step)
         except MixtureError as error:

@@ -116,9 +116,7 @@ class RowWeights:
             to = state_aim if stratum.timing == "post" else np.ones(len(state_aim))
             weight = to / boost[index]
             by_ratio = stratum.correction == "density_ratio" and stratum.timing == "pre"
-            if stratum.correction == "beta":
-                weight = weight**self.rule.beta
-            elif stratum.correction == "clipped" or by_ratio:
+            if stratum.correction == "clipped" or by_ratio:
                 weight = np.clip(weight, 1 / self.rule.clip, self.rule.clip)
             table[index] = weight
         return table, state_aim

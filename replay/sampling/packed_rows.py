@@ -26,7 +26,7 @@ from restock.arrays import F32, Ints
 from restock.errors import PanelError
 
 # Raised when packing changes, of a row or of what stands beside it; part of a panel's id.
-PACKING_VERSION = 4
+PACKING_VERSION = 5
 
 
 SCALARS = ("action", "reward", "discount")

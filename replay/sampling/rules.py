@@ -113,6 +113,8 @@ class InTurns(StratumDraws):
 
 
 CHUNK = 16  # rows whose priorities are summed first: a chunk is found, then the row in it
+BETA_BATCHES = 100_000  # batches after which the exponent of the weights is 1
+EPSILON = 1e-3  # added to |TD|
 MEAN_OF = 32_768  # priorities, at least, that give the mean weight of a stratum
 
 _Fraction = Annotated[float, Meta(ge=0, le=1)]
@@ -122,13 +124,11 @@ class Prioritised(Checked, frozen=True):
     """Numbers of `within = "per"` (arXiv:1511.05952)."""
 
     per_alpha: _Fraction = 0.6  # exponent of |TD|
-    per_beta: _Fraction = 0.4  # exponent of the importance weights at the start
-    per_beta_batches: Annotated[int, Meta(ge=1)] = 100_000  # batches after which per_beta is 1
-    per_epsilon: Annotated[float, Meta(gt=0)] = 1e-3  # added to |TD|
+    per_beta: _Fraction = 0.4  # exponent of the importance weights at the start; grows to 1
 
     def beta_after(self, batches: int) -> float:
         """Return the exponent of the weights after so many batches: it grows linearly to 1."""
-        return min(1.0, self.per_beta + (1.0 - self.per_beta) * batches / self.per_beta_batches)
+        return min(1.0, self.per_beta + (1.0 - self.per_beta) * batches / BETA_BATCHES)
 
 
 class Per(StratumDraws):
@@ -161,7 +161,7 @@ class Per(StratumDraws):
         return self._priority[: self.size]
 
     def _raised(self, td_abs: F32) -> F32:
-        raised: F32 = td_abs + np.float32(self.numbers.per_epsilon)
+        raised: F32 = td_abs + np.float32(EPSILON)
         raised **= np.float32(self.numbers.per_alpha)
         return raised
 

@@ -7,6 +7,8 @@ def _now(name: str) -> str:
     return f"it is now called {name}: rename it"
 
 
+_CAP = "it was removed: set it for the whole mixture"
+_LEAST = "it was removed: leave the stratum out, or give it a smaller share"
 _GONE = "it was removed, as it gained nothing (docs/evidence.md): leave it out"
 
 TRAINING_KEYS = {
@@ -41,6 +43,18 @@ MIXTURE_KEYS = {
     "adaptive": _GONE,
     "held_out": _now("`evaluation_split`"),
     "prioritised.lap_alpha": _GONE,
+    "prioritised.per_beta_batches": "it was removed: the exponent grows over 100,000 batches",
+    "prioritised.per_epsilon": "it was removed: it is 0.001",
+    "cut_at_off_policy": "it was removed: returns are always cut there",
+    "planned": "write planned_draws = UPDATES x BATCH_SIZE in its place",
+    "prefer": "it was removed: give the strata a `priority`, which decides",
+    "sources.fresh": "it was removed: fresh rows get what is left",
+    "evaluation_split.gap_s": "it was removed: the gap is 2 s",
+    "correction.beta": 'it was removed: use the rule "clipped"',
+    "each_condition.min_rows": _LEAST,
+    "each_condition.min_episodes": _LEAST,
+    "each_condition.max_rows_per_episode": _CAP,
+    "each_condition.max_rows_per_recording": _CAP,
 }
 MIXTURES = {
     "missions": _now("'coverage'"),

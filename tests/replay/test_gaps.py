@@ -44,7 +44,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 FEW = {"min_effective_episodes": 5}
 ASKING = """
 max_replays_per_row = 2
-planned = { updates = 100, batch_size = 10 }
+planned_draws = 1000
 evaluation_split = { by = "none" }
 [[strata]]
 name = "nominal"
@@ -209,9 +209,8 @@ ROBOT = f"recording_id = '{1:016x}'"
     [
         "",
         f'where = "{ROBOT}"\n',
-        "prefer = 'priority'\nevaluation_split = { by = 'time' }\n",
+        "evaluation_split = { by = 'time' }\n",
         "each_condition = { unit = 'episode', share = 'equal' }\n",
-        "each_condition = { share = 'equal', min_rows = 1_000 }\n",  # of which none is drawn
     ],
 )
 def test_mix_and_gaps_say_the_same_hours_for_the_same_rows(

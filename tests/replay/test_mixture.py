@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from support.panels import EVERY, NO_SPLIT, moment, panel_of, planned
+from support.panels import EVERY, NO_SPLIT, moment, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, EXPOSURES, TASK
 
@@ -20,14 +20,12 @@ from restock.errors import ConfigError, MixtureError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import (
     CorrectionRule,
-    Cosine,
     EachCondition,
     EvaluationSplit,
     Linear,
     Mixture,
     OtherStore,
     Piecewise,
-    PlannedUse,
     Prioritised,
     Safety,
     SourceShares,
@@ -254,7 +252,7 @@ def test_scaling_keeps_within_bounds_and_sums_to_one(data: st.DataObject) -> Non
 
 def test_replays_per_row_cap_a_small_stratum_and_the_surplus_goes_to_the_others() -> None:
     # 1,000 updates x 100 rows x 1/2 = 50,000 draws; 100 rows x 50 replays = 5,000: a share of 0.1.
-    text = "max_replays_per_row = 50\n[planned]\nupdates = 1000\nbatch_size = 100\n" + EVERY
+    text = "max_replays_per_row = 50\nplanned_draws = 100_000\n" + EVERY
     rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
     rows, episodes = np.array([10_000, 100]), np.array([100, 10])
     plan = plan_shares(parse_mixture(text), rules, rows, episodes, draws=50_000)
@@ -280,37 +278,12 @@ def test_replays_per_row_cap_a_small_stratum_and_the_surplus_goes_to_the_others(
 def test_part_of_a_draw_is_planned_for_no_row(transitions: pa.Table) -> None:
     # A run draws a row once where it may be drawn 1.5 times.
     text = (
-        "max_replays_per_row = {}\n[planned]\nupdates = 5\n[correction]\npost = 'none'\n"
+        "max_replays_per_row = {}\nplanned_draws = 640\n[correction]\npost = 'none'\n"
         "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\n" + EVERY
     )
     assert planned(transitions, text.format(1.5)).strata == (
         planned(transitions, text.format(1)).strata
     )
-
-
-def test_a_stratum_below_its_minimum_gets_nothing(transitions: pa.Table) -> None:
-    text = "[each_condition]\nshare = 'equal'\nmin_rows = 30\n[planned]\nupdates = 10\n"
-    text += "[correction]\npost = 'none'\n"
-    plan = planned(transitions, text)
-    assert shares(plan)["near_collision"] == 0
-    assert sum(shares(plan).values()) == pytest.approx(1)
-    assert plan.left_out["in a stratum of share 0"] > 0
-    with pytest.raises(MixtureError, match="no stratum has rows"):
-        planned(transitions, text.replace("30", "30000"))
-
-
-def test_a_scheduled_stratum_below_its_minimum_has_no_row_in_the_panel(
-    transitions: pa.Table, tmp_path: Path
-) -> None:
-    rule = (
-        "[[strata]]\nname = 'wheel_slip'\nmin_rows = 100000\nshare = {schedule = 'linear',"
-        " start = 0.3, end = 0.1, to_env_steps = 9}\n[correction]\npost = 'none'\n"
-    )
-    panel = panel_of(transitions, rule + EVERY, tmp_path / "panel", conditions=CONDITIONS)
-    [slip] = [number for number, line in enumerate(panel.strata) if line.name == "wheel_slip"]
-    assert panel.strata[slip].share == 0
-    assert panel.header.left_out["in a stratum of share 0"] == panel.strata[slip].rows > 0
-    assert slip not in panel.sampler(64, seed=0).draw().strata
 
 
 def test_rows_of_no_stratum_are_refused_unless_dropped(transitions: pa.Table) -> None:
@@ -369,10 +342,10 @@ def strata_of(*timings: str, correction: str = "full") -> list[ResolvedStratum]:
 
 def test_strata_take_timing_priority_and_correction_from_conditions() -> None:
     conditions = [Condition("slip", "post", "x", 30), Condition("blocked", "pre", "x", 40)]
-    mixture = parse_mixture("[correction]\npost = 'beta'\n" + EVERY)
+    mixture = parse_mixture("[correction]\npost = 'clipped'\n" + EVERY)
     found = {s.name: s for s in resolve_strata(mixture, conditions)}
     assert [s.name for s in found.values()] == ["nominal", "slip", "blocked"]
-    assert (found["slip"].timing, found["slip"].correction) == ("post", "beta")
+    assert (found["slip"].timing, found["slip"].correction) == ("post", "clipped")
     assert (found["blocked"].timing, found["blocked"].correction) == ("pre", "none")
     assert found["slip"].priority == 30
     where = parse_mixture("[[strata]]\nname = 'x'\nwhere = 'action = 1'\n")
@@ -439,7 +412,7 @@ def test_the_state_of_a_slip_is_nominal_where_nothing_was_known_before(
     )
 
 
-def test_beta_and_clip_stand_between_none_and_full() -> None:
+def test_clip_stands_between_none_and_full() -> None:
     code = np.repeat(np.array([0, 1], np.int16), [100, 9900])
     state = np.ones(10_000, np.int16)
     given = np.array([0.5, 0.5])
@@ -451,7 +424,6 @@ def test_beta_and_clip_stand_between_none_and_full() -> None:
 
     assert ratio("none") == pytest.approx(1)
     assert ratio("full") == pytest.approx(99)  # boosted 50 times, the others 50/99 times
-    assert ratio("beta", beta=0.5) == pytest.approx(99**0.5, rel=1e-3)
     assert ratio("clipped", clip=4.0) == pytest.approx(4)
 
 
@@ -469,14 +441,14 @@ def test_schedules_that_leave_no_room_later_are_refused_in_the_plan(
         '[[strata]]\nname = "wheel_slip"\n'
         'share = { schedule = "linear", start = 0.5, end = 0.3, to_env_steps = 1000 }\n'
     )
-    with pytest.raises(MixtureError, match=r"at environment step 5\d\d: .* caps to 0\.6"):
+    with pytest.raises(MixtureError, match=r"at environment step 1,000: .* caps to 0\.6"):
         planned(transitions, text)
 
 
 def test_the_plan_counts_replays(transitions: pa.Table) -> None:
     plan = planned(
         transitions,
-        "[planned]\nupdates = 100\nbatch_size = 64\n[sources]\nlogs = 0.25\nfresh = 0.75\n" + EVERY,
+        "planned_draws = 6400\n[sources]\nlogs = 0.25\n" + EVERY,
     )
     draws = sum(line.replays_per_row * line.rows for line in plan.strata)
     assert draws == pytest.approx(100 * 64 * 0.25)
@@ -510,15 +482,15 @@ def test_the_verb_says_what_replays_are_counted_over(
 ) -> None:
     assert cli.main(["mix", str(store_path), "--dry-run"]) == 0
     text = capsys.readouterr().out
-    assert "these numbers are for 20,000 updates of 128 rows, of logged rows alone" in text
+    assert "these numbers are for 2,560,000 logged rows drawn" in text
     assert "no row is drawn more than 400 times (max_replays_per_row)" in text
     # Few rows: at the default training budget they bear less.
     assert "warning: at the default training budget (51,500 updates of 128 rows)" in text
-    (tmp_path / "m.toml").write_text("[planned]\nupdates = 100\n[sources]\nlogs = 1\n" + EVERY)
+    (tmp_path / "m.toml").write_text("planned_draws = 12_800\n[sources]\nlogs = 1\n" + EVERY)
     requested = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
     assert cli.main(requested) == 0
     text = capsys.readouterr().out
-    assert "these numbers are for 100 updates of 128 rows" in text
+    assert "these numbers are for 12,800 logged rows" in text
     assert "max_replays_per_row" not in text
 
 
@@ -558,12 +530,11 @@ def test_the_page_explains_every_key() -> None:
             Mixture,
             StratumRule,
             EachCondition,
-            PlannedUse,
             EvaluationSplit,
             SourceShares,
             CorrectionRule,
         ),
-        *(OtherStore, Safety, Prioritised, Linear, Cosine, Piecewise),
+        *(OtherStore, Safety, Prioritised, Linear, Piecewise),
     )
     for struct in structs:
         for field in msgspec.structs.fields(struct):

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from support.panels import EVERY, NO_SPLIT, moment, panel_of, planned
+from support.panels import EVERY, NO_SPLIT, by_priority, moment, panel_of, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, recording_transitions, write_store
 
@@ -55,9 +55,7 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
 ) -> None:
     plan = planned(
         transitions,
-        "prefer = 'priority'\nuncertain = 'keep'\n"
-        + NO_SPLIT
-        + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
+        "uncertain = 'keep'\n" + NO_SPLIT + by_priority(CONDITIONS, f"min_steps = {min_steps}\n"),
     )
     assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
     rows = taken(plan)
@@ -133,13 +131,6 @@ def test_caps_an_episode_and_recording_hold_in_each_stratum(
     assert taken(again)["transition_id"].to_pylist() == rows["transition_id"].to_pylist()
     other = planned(transitions, "seed = 1\n" + text)
     assert taken(other)["transition_id"].to_pylist() != rows["transition_id"].to_pylist()
-    # A stratum's own cap stands before the mixture's.
-    own = planned(
-        transitions,
-        text + f"[[strata]]\nname = 'nominal'\nmax_rows_per_{name} = 2\n",
-    )
-    line = next(line for line in own.strata if line.name == "nominal")
-    assert line.rows == 2 * line.episodes if name == "episode" else line.rows == 6
 
 
 def test_rows_without_a_label_are_refused_dropped_or_taken_for_nominal(
@@ -277,10 +268,10 @@ def test_shipped_mixtures_are_valid_by_the_schema(name: str) -> None:
     ("text", "ok"),
     [
         (OTHERS + EVERY, True),
-        ("[sources]\nlogs = {schedule = 'cosine', start = 1, end = 0.5, to_env_steps = 9}\n", True),
+        ("[sources]\nlogs = {schedule = 'linear', start = 1, end = 0.5, to_env_steps = 9}\n", True),
         ("[[strata]]\nname = 'a'\nshare = 'equal'\nwithin = 'per'\n", True),
         ("[[strata]]\nname = 'a'\nshare = 'half'\n", False),
-        ("[sources]\nlogs = {schedule = 'cosine', begin = 1}\n", False),
+        ("[sources]\nlogs = {schedule = 'linear', begin = 1}\n", False),
         ("max_age = 3\n", False),
         ("where = 3\n", False),
     ],

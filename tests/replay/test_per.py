@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 
 from restock import native
 from restock.errors import MixtureError
-from restock.replay.sampling.rules import CHUNK, Per, Prioritised, StratumRows, find_places
+from restock.replay.sampling.rules import (
+    BETA_BATCHES,
+    CHUNK,
+    EPSILON,
+    Per,
+    Prioritised,
+    StratumRows,
+    find_places,
+)
 from restock.replay.sampling.sampler import QuotaSampler
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
@@ -52,14 +60,14 @@ def now(drawing: QuotaSampler) -> list[np.ndarray]:
 
 def test_priorities_are_those_of_the_paper() -> None:
     td = np.array([0.0, 0.5, 4.0], np.float32)
-    draws = priorities(3, per_alpha=0.5, per_epsilon=0.25)
+    draws = priorities(3, per_alpha=0.5)
     draws.update(np.arange(3), td)
-    np.testing.assert_allclose(draws.priority, (td + 0.25) ** 0.5)
+    np.testing.assert_allclose(draws.priority, (td + np.float32(EPSILON)) ** 0.5)
 
 
 @pytest.mark.parametrize("beta", [0.4, 0.8, 1.0])
 def test_weights_are_those_of_the_distribution_drawn_from(beta: float) -> None:
-    drawing = sampler(block=4, per_alpha=0.6, per_beta=beta, per_beta_batches=10**12)
+    drawing = sampler(block=4, per_alpha=0.6, per_beta=beta)
     td = errors()
     for rows in STRATA:
         drawing.update(rows, td[rows])
@@ -101,7 +109,7 @@ def test_weighted_draws_have_the_mean_of_uniform_ones() -> None:
 
 @pytest.mark.parametrize("beta", [0.4, 1.0])
 def test_weights_leave_each_stratum_its_share_of_the_gradient(beta: float) -> None:
-    drawing, td = sampler(block=64, per_beta=beta, per_beta_batches=10**12), errors()
+    drawing, td = sampler(block=64, per_beta=beta), errors()
     td[1::2] *= 50  # of the second stratum
     for rows in STRATA:
         drawing.update(rows, td[rows])
@@ -113,13 +121,13 @@ def test_weights_leave_each_stratum_its_share_of_the_gradient(beta: float) -> No
 
 
 def test_beta_grows_to_one() -> None:
-    numbers = Prioritised(per_beta=0.4, per_beta_batches=100)
-    grown = [numbers.beta_after(batches) for batches in (0, 50, 100, 1000)]
+    numbers = Prioritised(per_beta=0.4)
+    grown = [numbers.beta_after(part * BETA_BATCHES // 2) for part in (0, 1, 2, 9)]
     assert grown == pytest.approx([0.4, 0.7, 1.0, 1.0])
 
 
 def test_rows_not_drawn_yet_have_the_largest_priority() -> None:
-    draws = priorities(4, per_alpha=1.0, per_epsilon=1e-3)
+    draws = priorities(4, per_alpha=1.0)
     draws.update(np.array([0, 1]), np.array([7.0, 0.1], np.float32))
     draws.draw(1, np.random.default_rng(0), 0)
     np.testing.assert_allclose(draws.priority, [7.001, 0.101, 7.001, 7.001], rtol=1e-6)

@@ -28,7 +28,7 @@ from restock.train.libraries.mixed_feed import MixedFeed
 TASK = load_profile("warehouse_amr").task
 BATCH = 40
 EVERY = (
-    "[planned]\nupdates = 1\n[evaluation_split]\nby = 'none'\n[each_condition]\nshare = 'equal'\n"
+    "planned_draws = 128\n[evaluation_split]\nby = 'none'\n[each_condition]\nshare = 'equal'\n"
     "[correction]\npost = 'full'\nbelow_natural = 'allow'\n"
 )
 MIXTURES = {

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +9,6 @@ from hypothesis import strategies as st
 
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import (
-    Cosine,
     Linear,
     Piecewise,
     StratumRule,
@@ -119,15 +116,11 @@ def test_schedules_pass_through_their_points() -> None:
     assert [linear.at(step) for step in (0, 100, 200, 300, 900)] == pytest.approx(
         [0.8, 0.8, 0.5, 0.2, 0.2]
     )
-    cosine = Cosine(start=1.0, end=0.0, to_env_steps=400)
-    assert cosine.at(100) == pytest.approx((1 + math.cos(math.pi / 4)) / 2)
-    assert cosine.at(200) == pytest.approx(0.5)
     points = ((10, 0.5), (20, 1.0), (40, 0.0))
-    line, hold = Piecewise(points=points), Piecewise(points=points, between="hold")
+    line = Piecewise(points=points)
     assert [line.at(step) for step in (0, 10, 15, 20, 30, 50)] == pytest.approx(
         [0.5, 0.5, 0.75, 1.0, 0.5, 0.0]
     )
-    assert [hold.at(step) for step in (0, 15, 20, 39, 40)] == [0.5, 0.5, 1.0, 1.0, 0.0]
     assert value_at(0.3, 7) == 0.3
 
 
@@ -136,8 +129,7 @@ def test_schedules_pass_through_their_points() -> None:
     [
         0.25,
         Linear(start=0.9, end=0.1, from_env_steps=50, to_env_steps=150),
-        Cosine(start=0.1, end=0.9, to_env_steps=120),
-        Piecewise(points=((0, 0.2), (30, 0.8), (31, 0.1)), between="hold"),
+        Piecewise(points=((0, 0.2), (30, 0.8), (31, 0.1))),
     ],
 )
 def test_the_mean_of_a_schedule_is_the_mean_of_its_values(portion: object) -> None:

@@ -16,7 +16,7 @@ from support.stores import TASK, recording_transitions, write_store
 from restock import cli
 from restock.replay.mixture.mixture import parse_mixture, shipped_mixtures
 from restock.replay.panel.panel import Panel
-from restock.replay.plan.exclusions import split_for_evaluation
+from restock.replay.plan.exclusions import GAP_S, split_for_evaluation
 
 SEED = 3  # of an episode of 58 steps
 
@@ -79,13 +79,12 @@ def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, caps
 @given(
     lengths=st.lists(st.integers(1, 120), min_size=1, max_size=4),
     share=st.floats(0.05, 0.5),
-    gap_s=st.floats(0, 4),
     n_step=st.integers(1, 8),
 )
-def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, gap_s, n_step) -> None:
+def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, n_step) -> None:
     table = table_of(*lengths)
     step, names = table["step_index"].to_numpy(), table["episode_id"].to_pylist()
-    split = f'by = "within_episode", share = {share}, gap_s = {gap_s}'
+    split = f'by = "within_episode", share = {share}'
     text = (
         f"n_step = {n_step}\nevaluation_split = {{ {split} }}\n[each_condition]\nshare = 'natural'"
     )
@@ -98,7 +97,7 @@ def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, gap_
             first = step[rows.held & of].min()
             assert rows.held[of & (step >= first)].all()
             assert (step[learnt & of] + n_step < first).all()
-            assert (first - step[learnt & of]).min(initial=10**6) * 0.2 >= gap_s - 0.2
+            assert (first - step[learnt & of]).min(initial=10**6) * 0.2 >= GAP_S - 0.2
             assert learnt[of].mean() > 0.2
 
 

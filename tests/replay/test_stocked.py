@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.panels import EVERY, NO_SPLIT, panel_of, planned
+from support.panels import EVERY, NO_SPLIT, by_priority, panel_of, planned
+from support.stores import CONDITIONS
 
 from restock import cli
 from restock.errors import MixtureError
@@ -33,7 +34,7 @@ from restock.replay.store.audit import load_audits, load_thresholds, run_audits
 
 AUDITS = {audit.name: audit for audit in load_audits()}
 THRESHOLDS = load_thresholds()
-EQUAL = "[planned]\nupdates = 50\n[each_condition]\nshare = 'equal'\n"
+EQUAL = "planned_draws = 6400\n[each_condition]\nshare = 'equal'\n"
 
 
 def test_a_correction_that_takes_a_stratum_below_its_natural_share_is_refused(
@@ -41,8 +42,8 @@ def test_a_correction_that_takes_a_stratum_below_its_natural_share_is_refused(
 ) -> None:
     full = "[correction]\npost = 'full'\n"
     with pytest.raises(MixtureError) as refused:
-        planned(transitions, full + EQUAL)
-    allowed = planned(transitions, full + "below_natural = 'allow'\n" + EQUAL)
+        planned(transitions, EQUAL + full)
+    allowed = planned(transitions, EQUAL + full + "below_natural = 'allow'\n")
     below = [line for line in allowed.strata if below_natural(line)]
     assert below
     assert {line.timing for line in below} == {"post"}  # chosen on the outcome
@@ -60,7 +61,7 @@ def test_a_correction_that_takes_a_stratum_below_its_natural_share_is_refused(
     assert "a larger [correction] clip" in str(refused.value)
 
 
-@pytest.mark.parametrize("post", ["none", "beta", "full", "clipped", "density_ratio"])
+@pytest.mark.parametrize("post", ["none", "full", "clipped", "density_ratio"])
 def test_what_a_quota_takes_is_the_users_wish(transitions: pa.Table, post: str) -> None:
     """No boost and no refusal by rounding; and a cap below the natural share is no correction."""
     natural = planned(transitions, f"[correction]\npost = '{post}'\npre = 'full'\n" + EVERY)
@@ -133,11 +134,11 @@ def test_an_episode_counts_for_the_rarest_of_its_conditions() -> None:
     observed = [{0, 1}, {0, 1}, *({1} for _ in range(8)), set()]
     episode = np.repeat(np.arange(len(observed)), 10)
     member = np.array([[0 in one, 1 in one, True] for one in observed])[episode]
-    for by_priority in ([1, 0], [0, 1]):  # whichever comes first by priority
+    for order in ([1, 0], [0, 1]):  # whichever comes first by priority
         strata = strata_of_episodes(2)
         strata = [
             replace(stratum, priority=priority)
-            for stratum, priority in zip(strata, [*by_priority, 9], strict=True)
+            for stratum, priority in zip(strata, [*order, 9], strict=True)
         ]
         code = assign(member, strata)
         given = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
@@ -147,9 +148,8 @@ def test_an_episode_counts_for_the_rarest_of_its_conditions() -> None:
 def test_by_priority_and_a_priority_of_its_own(transitions: pa.Table) -> None:
     each = "[each_condition]\nunit = 'episode'\n" + NO_SPLIT
     rarest = {line.name: line.rows for line in planned(transitions, each).strata}
-    first = {
-        line.name: line.rows for line in planned(transitions, "prefer = 'priority'\n" + each).strata
-    }
+    listed = NO_SPLIT + by_priority(CONDITIONS)
+    first = {line.name: line.rows for line in planned(transitions, listed).strata}
     assert min(rows for name, rows in rarest.items() if name != "nominal") > min(
         rows for name, rows in first.items() if name != "nominal"
     )
@@ -175,21 +175,18 @@ def test_the_default_mixture_gives_every_condition_its_rows_and_corrects_nothing
 
 
 def test_what_a_stratum_misses_is_what_would_fill_it() -> None:
-    text = "max_replays_per_row = 50\n[planned]\nupdates = 1000\nbatch_size = 100\n" + EVERY
+    text = "max_replays_per_row = 50\nplanned_draws = 100_000\n" + EVERY
     mixture = parse_mixture(text)
     rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
     rows, episodes, draws = np.array([10_000, 93]), np.array([100, 10]), 50_000.0
     plan = plan_shares(mixture, rules, rows, episodes, draws=draws)
-    missing = missing_rows(mixture, rules, rows, episodes, plan.wanted, draws)
+    missing = missing_rows(mixture, rows, plan.wanted, draws)
     assert missing.tolist() == [0, 407]  # 25,000 draws at 50 a row are 500 rows
     filled = plan_shares(mixture, rules, rows + missing, episodes, draws=draws)
     np.testing.assert_allclose(filled.got, filled.wanted)
-    # Without a limit a row is enough; below a minimum, what reaches it.
-    least = [rules[0], StratumRule(name="rare", share=0.5, min_episodes=20)]
-    free = parse_mixture(EVERY)
-    assert missing_rows(free, least, rows, episodes, plan.wanted, draws).tolist() == [0, 93]
-    none = np.array([10_000, 0])
-    assert missing_rows(free, rules, none, episodes, plan.wanted, draws).tolist() == [0, 1]
+    # Without a limit a row is enough.
+    free, none = parse_mixture(EVERY), np.array([10_000, 0])
+    assert missing_rows(free, none, plan.wanted, draws).tolist() == [0, 1]
 
 
 def test_what_is_missing_counts_the_logging_that_a_mixture_is_of(transitions: pa.Table) -> None:

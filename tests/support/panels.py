@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
+from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.panel import Panel
@@ -17,6 +19,16 @@ from support.stores import CONDITIONS, TASK
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 NO_SPLIT = "[evaluation_split]\nby = 'none'\n"
+
+
+def by_priority(conditions: Sequence[Condition], more: str = "") -> str:
+    """Return strata of the episodes of each condition, and nominal, that go by priority alone."""
+    named = [*((c.name, c.priority) for c in conditions), ("nominal", 1000)]
+    return "".join(
+        f"[[strata]]\nname = '{name}'\npriority = {priority}\nshare = 'equal'\n"
+        f"unit = 'episode'\n{more if name != 'nominal' else ''}"
+        for name, priority in named
+    )
 
 
 def moment(stamp_ns: int) -> str:

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.panels import by_priority
 from support.stores import CONDITIONS, EXPOSURES, recording_transitions
 from support.toy_run import assert_same_run, config, run_to_end, session
 from support.toy_twin import CONDITIONS as TOY_CONDITIONS
@@ -34,10 +35,10 @@ from restock.train.resolve import planned_draws
 from restock.train.run.replay_audit import fed_shares, shortfalls
 
 TABLE = pa.concat_tables([recording_transitions(index) for index in (1, 2, 3)])
-OF_STEPS = "prefer = 'priority'\n[each_condition]\nshare = 'equal'\n"
-OF_EPISODES = "prefer = 'priority'\n[each_condition]\nshare = 'equal'\nunit = 'episode'\n"
-TWO_STEPS = OF_EPISODES + "min_steps = 2\n"
-SITUATIONS = OF_EPISODES + "kind = 'exposure'\n"
+OF_STEPS = "[each_condition]\nshare = 'equal'\n"
+OF_EPISODES = by_priority(CONDITIONS)
+TWO_STEPS = by_priority(CONDITIONS, "min_steps = 2\n")
+SITUATIONS = by_priority(EXPOSURES)
 
 
 @pytest.mark.parametrize("text", [OF_STEPS, OF_EPISODES, TWO_STEPS, SITUATIONS])

@@ -41,7 +41,7 @@ def controller(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -
 
 
 def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
-    text = "max_replays_per_row = 50\n[planned]\nupdates = 1\n" + HALVES
+    text = "max_replays_per_row = 50\nplanned_draws = 128\n" + HALVES
     # 100,000 online rows, half of them logs: 50,000; 100 rows x 50 are a tenth of that.
     plan = controller(text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.9, 0.1])
@@ -194,7 +194,7 @@ EVERYTHING = """
 max_replays_per_row = 40
 max_age_env_steps = 900
 [sources]
-logs = { schedule = "cosine", start = 0.75, end = 0.25, to_env_steps = 1200 }
+logs = { schedule = "linear", start = 0.75, end = 0.25, to_env_steps = 1200 }
 [correction]
 post = "density_ratio"
 [[strata]]

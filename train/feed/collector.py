@@ -437,7 +437,6 @@ class FreshStrata:
             ]
         )
         self.exposures = [c for c in of_kind(conditions, "exposure") if c.name in self.names]
-        self._by_rarity = mixture.prefer == "rarest"
         self._outcomes = [condition.name for condition in of_kind(conditions, "outcome")]
         self._strata = []
         for rule in rules:
@@ -473,9 +472,8 @@ class FreshStrata:
                 holds = np.full(steps, holds.sum() >= stratum.rule.min_steps)
             member[:, index] = holds
         code = assign(member, self._strata)
-        if self._by_rarity:
-            observed = [i for i, s in enumerate(self._strata) if s.dealt and steps and member[0, i]]
-            if observed:
-                fewest = min(observed, key=lambda i: (rows[i], self._strata[i].priority))
-                code[np.isin(code, observed)] = fewest
+        observed = [i for i, s in enumerate(self._strata) if s.dealt and steps and member[0, i]]
+        if observed:
+            fewest = min(observed, key=lambda i: (rows[i], self._strata[i].priority))
+            code[np.isin(code, observed)] = fewest
         return code

@@ -165,8 +165,7 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
             if plan.mixture.sources.chosen(name)
         },
         "warnings": list(plan.warnings),
-        "planned_draws": plan.mixture.planned.updates * plan.mixture.planned.batch_size,
-        "planned": msgspec.structs.asdict(plan.mixture.planned),
+        "planned_draws": plan.mixture.planned_draws,
         "max_replays_per_row": plan.mixture.max_replays_per_row,
         "schedules": {
             name: msgspec.to_builtins(part)
@@ -274,10 +273,9 @@ def _summary(document: dict[str, Any]) -> list[str]:
         for store in document["other_stores"]
     )
     left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
-    updates, batch_size = (document["planned"][key] for key in ("updates", "batch_size"))
     draws = [
-        f"these numbers are for {updates:,} updates of {batch_size:,} rows, of logged rows alone"
-        " ([planned]: set it to what you train); a run plans with its own"
+        f"these numbers are for {document['planned_draws']:,} logged rows drawn"
+        " (planned_draws: set it to what you train); a run plans with its own"
     ]
     if (most := document["max_replays_per_row"]) is not None:
         draws += _in_training(document, most)
