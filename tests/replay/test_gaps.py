@@ -81,7 +81,7 @@ def test_a_stratum_lacks_what_its_share_would_draw_too_often(store: Path) -> Non
 
 
 def test_a_store_that_has_what_is_asked_for_has_no_gaps(store: Path) -> None:
-    mixture = parse_mixture(ASKING.replace("updates = 100", "updates = 1"))
+    mixture = parse_mixture(ASKING.replace("1000", "10"))
     with Store(store) as opened:
         yields, gaps = find_gaps(opened, mixture, name="mine", kinds=KINDS)
     assert not gaps
@@ -89,7 +89,7 @@ def test_a_store_that_has_what_is_asked_for_has_no_gaps(store: Path) -> None:
 
 
 def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store: Path) -> None:
-    mixture = parse_mixture(ASKING.replace("updates = 100", "updates = 1"))
+    mixture = parse_mixture(ASKING.replace("1000", "10"))
     limits = {
         "rare_condition": {"min_rows": 60, "min_episodes": 5},
         "missing_cells": {"min_rows": 1},

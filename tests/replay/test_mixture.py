@@ -58,12 +58,6 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
     ("text", "message"),
     [
         (EVERY + "sahre = 1", "sahre"),
-        (EVERY + "[sources]\nlogs = 0.7\nfresh = 0.4", "sum to 1"),
-        (
-            EVERY + "[sources]\nfresh = 0.5\nlogs = {schedule = 'linear', start = 0.9, end = 0.1,"
-            " to_env_steps = 10}",
-            "leave out `fresh`",
-        ),
         (
             EVERY + "[sources]\nlogs = {schedule = 'linear', start = 0.2, end = 0.9,"
             " to_env_steps = 10}\n[[sources.stores]]\nname = 'b'\npath = 'b'\nshare = 0.5",

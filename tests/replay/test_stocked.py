@@ -225,7 +225,7 @@ def test_the_plan_shows_four_shares_side_by_side_and_what_is_missing(
 def test_an_audit_finds_a_panel_and_a_run_whose_weights_undo_a_quota(
     store_path: Path, tmp_path: Path
 ) -> None:
-    allow = "[correction]\npost = '{}'\nbelow_natural = 'allow'\n" + EQUAL
+    allow = EQUAL + "[correction]\npost = '{}'\nbelow_natural = 'allow'\n"
     for post, status in (("full", "fail"), ("none", "pass")):
         panel = panel_of(store_path, allow.format(post), tmp_path / post)
         name = "panel_effective_share"
