@@ -36,7 +36,7 @@ from harness import finish, markdown, once, option_parser, run_restock
 from restock.ingest.containers.open_recording import recordings_in
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps import steps as steps_module
+from restock.ingest.steps import episodes as steps_module
 from restock.ingest.steps.filling import Filling
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.signals import Signals

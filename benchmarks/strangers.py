@@ -37,9 +37,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import GoalRules, parse_profile
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.align import NS
-from restock.ingest.steps.episodes import Split, split
+from restock.ingest.steps.episodes import Split, Steps, split, steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import Steps, steps_of
 
 MIN_RECORDINGS, MIN_TIME = 0.9, 0.85
 STEP_S = 0.05  # of the loops over log time

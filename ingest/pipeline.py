@@ -18,7 +18,6 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, RecordingError, expect, visible
-from restock.ingest.camera.frames import OFF_CLOCK, KeptFrames, frame_rows, kept_frames
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
@@ -27,10 +26,10 @@ from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import RecordingTags, resolve_tags
-from restock.ingest.steps.episodes import split, why_none
+from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows, kept_frames
+from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
 from restock.ingest.steps.frames import FIELDS, frame_id_path, plain, transform_fields
 from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
-from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.store.corrections import correction_rows, corrections_in, lay_over, rules_of
 from restock.ingest.store.lineage import own_path
 from restock.ingest.store.manifest import (

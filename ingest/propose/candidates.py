@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from restock.ingest.camera.frames import image_bytes, image_fields, layouts
-from restock.ingest.camera.images import TYPES, ImageProblem
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.tables import CustomSignal, name_problem
+from restock.ingest.steps.cameras import TYPES, ImageProblem, image_bytes, image_fields, layouts
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
 MAX_A_TOPIC = 8

@@ -20,8 +20,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.consistency import Finding
-from restock.ingest.steps.episodes import Split, split, why_none
-from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.steps.episodes import Split, Steps, split, steps_of, why_none
 from restock.ingest.task.conditions import in_steps
 from restock.ingest.task.task import Task
 

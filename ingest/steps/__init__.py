@@ -1,1 +1,1 @@
-"""The control clock: causal holds, frames, routes and episodes."""
+"""The control clock: causal holds, frames, cameras, routes and episodes."""

@@ -13,7 +13,6 @@ import numpy as np
 
 from restock.arrays import Bools, Ints
 from restock.errors import RecordingError
-from restock.ingest.camera.frames import CameraFrames, usable_frames
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.inputs import (
     COMMAND_SOURCES,
@@ -33,6 +32,7 @@ from restock.ingest.steps.align import (
     refuse_still_log_time,
     ticks_of,
 )
+from restock.ingest.steps.cameras import CameraFrames, usable_frames
 from restock.ingest.steps.frames import Edges, Placement, Tree, plain
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.motion import PoseSeries, poses_along

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from restock.errors import RecordingError
-from restock.ingest.camera.frames import frame_reduction, other_field
-from restock.ingest.camera.images import TYPES
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
@@ -21,6 +19,7 @@ from restock.ingest.profile.signal_paths import element_of, offer, pressed_paths
 from restock.ingest.profile.tables import CustomSignal
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
+from restock.ingest.steps.cameras import TYPES, frame_reduction, other_field
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction

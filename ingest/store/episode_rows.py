@@ -11,8 +11,7 @@ import pyarrow as pa
 
 from restock.arrays import F32, Bools, Ints
 from restock.ingest.profile.profile import Profile
-from restock.ingest.steps.episodes import Split, changed_route, with_route
-from restock.ingest.steps.steps import Steps
+from restock.ingest.steps.episodes import Split, Steps, changed_route, with_route
 from restock.ingest.store.summary import ENDS
 from restock.ingest.task.conditions import label_with_probabilities, reported
 from restock.ingest.task.schema import signal_columns

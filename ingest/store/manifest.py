@@ -16,8 +16,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, profile_toml
 from restock.ingest.steps.aligned_inputs import fallbacks_used
-from restock.ingest.steps.episodes import Split
-from restock.ingest.steps.steps import Steps
+from restock.ingest.steps.episodes import Split, Steps
 from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.transitions import Provenance
 from restock.ingest.task.conditions import Condition, reported, unknown_rows, unseen

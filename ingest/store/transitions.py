@@ -14,8 +14,7 @@ from restock.arrays import F32, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import offsets_of
 from restock.ingest.profile.profile import Profile
-from restock.ingest.steps.episodes import Split
-from restock.ingest.steps.steps import Steps
+from restock.ingest.steps.episodes import Split, Steps
 from restock.ingest.store.episode_rows import EpisodeRows, episode_rows, groups, packed
 from restock.ingest.store.summary import ENDS, WIDE
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import StoreError
-from restock.ingest.camera.images import JPEG, PNG
+from restock.ingest.steps.cameras import JPEG, PNG
 from restock.replay.export.trajectory import Trajectory
 from restock.replay.store.frames import CameraFrame, camera_frames, cameras_of
 from restock.replay.store.store import Store

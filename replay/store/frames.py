@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import QueryError, StoreError
-from restock.ingest.camera.images import ImageLayout, ImageProblem, pixels
+from restock.ingest.steps.cameras import ImageLayout, ImageProblem, pixels
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 

@@ -19,8 +19,8 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.live.observer import LiveObserver, _columns
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.profile.signal_paths import pressed_in
+from restock.ingest.steps.episodes import steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import steps_of
 
 SECONDS = 6.0
 PRESSED = (2.0, 2.5)  # from, to before

@@ -31,7 +31,11 @@ from support.driven_robot import START_NS, Drive, typed_topics, write_topics
 
 from restock import cli
 from restock.errors import ConfigError, ExitCode, RecordingError, StoreError
-from restock.ingest.camera.images import (
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.pipeline import ingest
+from restock.ingest.prepared import IngestResult
+from restock.ingest.relabel import relabel_store
+from restock.ingest.steps.cameras import (
     COMPRESSED,
     ENCODINGS,
     ImageLayout,
@@ -40,10 +44,6 @@ from restock.ingest.camera.images import (
     pixels,
     raw_layout,
 )
-from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.pipeline import ingest
-from restock.ingest.prepared import IngestResult
-from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.store.writer import StoreWriter
 

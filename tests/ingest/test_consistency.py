@@ -25,8 +25,8 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.consistency import Finding
+from restock.ingest.steps.episodes import steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import steps_of
 
 NS = 10**9
 DURATION_S = 45.0

@@ -18,8 +18,8 @@ from restock.ingest.live.observer import LiveObserver
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.profile.signal_paths import CONVENTIONS, conventions_of
+from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import Steps, steps_of
 
 SECONDS, TURN_RADPS = 6.0, 0.4
 Topics = dict[str, tuple[str, TopicColumns]]

@@ -22,7 +22,7 @@ from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import refuse_other_signals
 from restock.ingest.steps.custom_columns import column_of
-from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.steps.episodes import Steps, steps_of
 
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 ROWS = sample_transitions("amr_tuesday")

@@ -11,8 +11,7 @@ from support.driven_robot import START_NS, Drive, columns, without
 
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.episodes import EpisodeSpan, Split, split
-from restock.ingest.steps.steps import steps_of
+from restock.ingest.steps.episodes import EpisodeSpan, Split, split, steps_of
 
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task

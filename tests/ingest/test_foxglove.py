@@ -28,8 +28,8 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.drives import robot_traits
+from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import Steps, steps_of
 
 ENCODINGS = pytest.mark.parametrize("encoding", ["json", "protobuf"])
 

@@ -24,8 +24,7 @@ from restock.ingest.decoding import columns as columns_module
 from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.episodes import split
-from restock.ingest.steps.steps import steps_of
+from restock.ingest.steps.episodes import split, steps_of
 from restock.ingest.store import episode_rows
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import Staged, StoreWriter

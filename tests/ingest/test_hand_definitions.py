@@ -14,8 +14,8 @@ from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.definitions import choose_definitions, folder_types
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.episodes import steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import steps_of
 
 NEATO = SHARED / "fleet-neato" / "2025-redhot" / "drive_square"
 RACECAR = SHARED / "robots" / "racecar-ackermann" / "BIGPATH.bag"

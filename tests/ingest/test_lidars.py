@@ -23,8 +23,8 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.task.scan import MovedMap, SectorMap, outline_reach, with_unseen
 from restock.replay.trace.moment import seen_between
 

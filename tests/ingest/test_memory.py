@@ -30,8 +30,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import align
 from restock.ingest.steps.clocks import STAMP, topic_clock
-from restock.ingest.steps.episodes import split
-from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.steps.episodes import Steps, split, steps_of
 from restock.ingest.store import episode_rows, summary
 from restock.ingest.store.commits import plain_lists
 from restock.ingest.store.transitions import Provenance, recording_table

@@ -17,9 +17,9 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.episodes import steps_of
 from restock.ingest.steps.motion import PoseSeries, motion_at
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.steps.steps import steps_of
 
 NS = 10**9
 

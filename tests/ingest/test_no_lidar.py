@@ -22,7 +22,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.prepared import IngestResult
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.relabel import relabel_store
-from restock.ingest.steps.steps import steps_of
+from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.commits import delta_columns, recording_columns
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.writer import StoreWriter

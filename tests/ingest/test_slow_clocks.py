@@ -19,7 +19,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, align
-from restock.ingest.steps.steps import steps_of
+from restock.ingest.steps.episodes import steps_of
 from restock.replay.store.store import Store
 
 PACES = [0.5, 0.9, 0.97, 1.0, 1.1]

@@ -19,9 +19,8 @@ from support.driven_robot import (
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
-from restock.ingest.steps.episodes import split, why_none
+from restock.ingest.steps.episodes import split, steps_of, why_none
 from restock.ingest.steps.filling import parse_policy
-from restock.ingest.steps.steps import steps_of
 
 PROFILE = load_profile("warehouse_amr")
 

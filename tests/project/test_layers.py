@@ -23,18 +23,17 @@ SHARED = {
     *("renamed", "state", "stats", "toml", "words"),
 }
 MAY_IMPORT = {
-    "ingest": "camera containers decoding profile steps store task",
+    "ingest": "containers decoding profile steps store task",
     "ingest/decoding": "",
     "ingest/containers": "decoding",
-    "ingest/camera": "containers decoding profile task",
     "ingest/task": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": "camera containers decoding live profile steps task",
+    "ingest/propose": "containers decoding live profile steps task",
     "ingest/live": "decoding profile steps task",
-    "ingest/steps": "camera containers decoding profile task",
+    "ingest/steps": "containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
     "replay": "fleet panel store ingest/store ingest",
-    "replay/store": "ingest/camera ingest/store ingest/task",
+    "replay/store": "ingest/steps ingest/store ingest/task",
     "replay/sampling": "",
     "replay/mixture": "sampling",
     "replay/plan": "mixture store ingest/task sampling",
@@ -45,7 +44,7 @@ MAY_IMPORT = {
         " ingest/store ingest/task"
     ),
     "replay/export": (
-        "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task"
+        "replay panel plan store ingest/steps ingest/store ingest/profile ingest/task"
     ),
     "train": (
         "dqn evaluation feed run twin/missions twin/env twin/floors twin/physics"

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from restock.ingest.camera.images import COMPRESSED, RAW
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.steps.cameras import COMPRESSED, RAW
 from support.driven_robot import Drive, columns, typed_topics, write_topics
 from support.profile_texts import WAREHOUSE
 

@@ -16,7 +16,7 @@ from support.stores import one, recording_transitions
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.steps import steps_of
+from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.perturbation_columns import Perturbed, parse_perturbation
 from restock.replay.mixture.mixture import load_mixture

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.routing import Routing
+from restock.ingest.steps.filling import Routing
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task, clearance_ahead, observe, reward_parts

@@ -329,7 +329,7 @@ def _inside_outline(profile: Profile, topics: Mapping[str, Any]) -> float | None
 
     None if there is no lidar.
     """
-    from restock.ingest.steps.steps import steps_of
+    from restock.ingest.steps.episodes import steps_of
 
     scan = profile.inputs.scan
     if scan is None or scan.topic not in topics:

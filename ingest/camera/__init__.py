@@ -1,1 +1,0 @@
-"""Frames of a robot's cameras: what their messages hold, and those in force at steps."""
