@@ -353,7 +353,7 @@ def _packed() -> str:
 
 @cache
 def _script() -> str:
-    return (files("restock.report.look") / "js").read_text(encoding="utf-8")
+    return (files("restock.report.look") / "live.js").read_text(encoding="utf-8")
 
 
 def _hash(script: str) -> str:
