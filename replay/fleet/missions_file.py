@@ -102,7 +102,7 @@ def refuse_existing(path: Path) -> None:
     """Raise ConfigError where there is something already."""
     if path.exists():
         raise ConfigError(
-            "already there", where=str(path), remedy="choose another name, or give --force"
+            "already there", where=str(path), remedy="choose another name, or remove it"
         )
 
 

@@ -131,7 +131,7 @@ def shopping_list(
         has = ", ".join(get_args(Unit))
         raise ConfigError(f"no unit {unit!r}", where="shopping list", remedy=f"give {has}")
     if not 0 < confidence < 1:
-        raise ConfigError(f"must be between 0 and 1, got {confidence:g}", where="--confidence")
+        raise ConfigError(f"must be between 0 and 1, got {confidence:g}", where="confidence")
     rng = np.random.default_rng(seed)
     kinds: list[str | None] = [None] if unit == "hours" else [*sorted(set(yields.kind))]
     supplies = list(dict.fromkeys(s for gap in gaps for s in _supplies(gap, kinds)))

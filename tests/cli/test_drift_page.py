@@ -6,12 +6,16 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.fleets import SyntheticRobot, fleet_store
 from support.page_scripts import charts_of
 
 from restock import cli
+from restock.errors import ConfigError
+from restock.replay.fleet.drift import measure_drift
+from restock.replay.store.store import Store
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -123,15 +127,8 @@ def test_no_change_is_said_with_its_number_of_tests(
 
 
 @pytest.mark.parametrize(
-    ("flags", "said"),
-    [
-        (["--every", "fortnight"], "no period 'fortnight'"),
-        (["--reference", "0"], "reference must be at least 1"),
-        (["--least-episodes", "1"], "least_episodes must be at least 2"),
-    ],
+    "options", [{"every": "fortnight"}, {"reference": 0}, {"least_episodes": 1}]
 )
-def test_what_it_cannot_do_is_refused(
-    flags: list[str], said: str, store: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["coverage", "drift", str(store), *flags]) == 2
-    assert said in capsys.readouterr().err
+def test_what_it_cannot_do_is_refused(options: dict[str, Any], store: Path) -> None:
+    with Store(store) as opened, pytest.raises(ConfigError):
+        measure_drift(opened, **options)

@@ -77,8 +77,6 @@ class AuditCommand:
     the newest."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
     """Memory limit of DuckDB, e.g. 4GB; beyond it, DuckDB spills to a temporary folder."""
-    rows: int = 5
-    """How many offending rows to show per audit, at most 10; `restock sql` shows all."""
     json: bool = False
     """Print one JSON document: {"store", "failed", "audits": [{"part", "audit", "status", …}]}."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -95,7 +93,7 @@ class AuditCommand:
 
         if self.capacity:
             _refuse_with(self, "--capacity", "panel", "run_dir", "audits", "thresholds", "reward")
-            _refuse_with(self, "--capacity", "discount", "strict", "rows", "junit", "summary")
+            _refuse_with(self, "--capacity", "discount", "strict", "junit", "summary")
             _refuse_with(self, "--capacity", "against", "baseline")
             return self._capacity()
         self._check_options()
@@ -132,7 +130,7 @@ class AuditCommand:
         elif reward is not None:
             _print_reward(reward)
         else:
-            _print([one for part in parts for one in part.findings], self.rows)
+            _print([one for part in parts for one in part.findings])
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _check_options(self) -> None:
@@ -155,15 +153,9 @@ class AuditCommand:
                 remedy="give --reward, and the discount per step, for example 0.99",
             )
         if self.reward:
-            _refuse_with(self, "--reward", "panel", "run_dir", "rows", "against", "baseline")
+            _refuse_with(self, "--reward", "panel", "run_dir", "against", "baseline")
             if (Path(self.store) / RUN_CONFIG).is_file():
                 _refuse_with(self, "the --reward of a run", "memory_limit")
-        if self.rows < 0:
-            raise ConfigError(
-                f"must be 0 or more, got {self.rows}",
-                where="--rows",
-                remedy="0 shows no rows; `restock sql` shows all",
-            )
         if self.baseline is None:
             why = "has no effect without --baseline"
             refuse(self, ("margin",), why, remedy="name the run or the saved baseline")
@@ -295,7 +287,7 @@ def _document(part: str, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _print(findings: list[Finding], shown: int) -> None:
+def _print(findings: list[Finding]) -> None:
     """Print each finding with its first rows and advice, then the names of the others."""
     from restock.cli import output
 
@@ -314,9 +306,9 @@ def _print(findings: list[Finding], shown: int) -> None:
         )
     for finding in reported:
         output.stdout().print()
-        more = finding.rows - min(shown, len(finding.sample))
+        more = finding.rows - min(SHOWN, len(finding.sample))
         title = f"{finding.status}: {finding.audit.name}" + (f" ({more} more)" if more else "")
-        output.print_table(finding.sample[:shown], finding.columns, title=title)
+        output.print_table(finding.sample[:SHOWN], finding.columns, title=title)
         output.stdout().print(f"  {finding.audit.advice}", markup=False)
     for status in ("pass", "skipped"):
         names = [finding.audit.name for finding in findings if finding.status == status]
@@ -400,7 +392,7 @@ def _summary(findings: list[Finding]) -> str:
 
 
 _MARKS = {"fail": "❌", "warn": "⚠️", "info": "ℹ️", "pass": "✅", "skipped": "–"}
-SUMMARY_ROWS = 5  # rows of a finding in a summary
+SHOWN = 5  # rows of a finding on a terminal and in a summary
 
 
 class Part(NamedTuple):
@@ -544,10 +536,10 @@ def markdown(title: str, parts: Sequence[Part], *, failing: set[str]) -> str:
         lines += [f"| {' | '.join(map(_cell, columns))} |", f"|{' --- |' * len(columns)}"]
         lines += [
             f"| {' | '.join(_cell(row[column]) for column in columns)} |"
-            for row in one.sample[:SUMMARY_ROWS]
+            for row in one.sample[:SHOWN]
         ]
-        if one.rows > SUMMARY_ROWS:
-            lines.append(f"\n… {one.rows - SUMMARY_ROWS:,} more")
+        if one.rows > SHOWN:
+            lines.append(f"\n… {one.rows - SHOWN:,} more")
     return "\n".join(lines) + "\n"
 
 

@@ -176,15 +176,11 @@ class GapsCommand:
     unit: Literal["missions", "hours"] | None = None
     """Count in missions or in hours of driving. Default: missions if a simulator made the
     recordings, hours if robots did."""
-    confidence: float = 0.8
-    """The probability with which the planned missions close each gap."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
     """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
     newest."""
     missions_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write the plan as a missions file, which must not exist yet."""
-    force: bool = False
-    """Replace an existing missions file."""
     json: bool = False
     """Print one JSON document."""
 
@@ -209,7 +205,7 @@ class GapsCommand:
             refuse(self, ("by",), "has no effect without --min-rows", remedy="give --min-rows, too")
         mixture = load_mixture(self.mixture)
         thresholds = None if self.no_audits else load_thresholds(self.thresholds)
-        if self.missions_out is not None and not self.force:
+        if self.missions_out is not None:
             refuse_existing(self.missions_out)
         expect_file_place(self.missions_out, "--missions-out")
         with Store(self.store, version=given_version(self.version)) as store:
@@ -224,7 +220,7 @@ class GapsCommand:
                 by=[name.strip() for name in self.by.split(",") if name.strip()],
             )
             place, version = str(store.path), store.version
-        found = shopping_list(yields, gaps, unit=self.unit, confidence=self.confidence)
+        found = shopping_list(yields, gaps, unit=self.unit)
         answer = {
             "store": place,
             "store_version": version,
@@ -352,7 +348,7 @@ def _order(order: dict[str, Any], unit: str, with_: dict[str, bool]) -> dict[str
 class DriftCommand:
     """Find out which robot's wheels, lidar or floor have changed.
 
-    Compares each robot's weeks with its own first weeks and with the other robots of its site. Each
+    Compares each robot's weeks with its own first two and with the other robots of its site. Each
     signal (odometry scale, lidar noise, gyroscope bias, …) and the rate at which each condition
     begins gets a two-sample test over recordings or episodes, with an effect size and a p-value
     corrected over all tests. A change that all robots of a site share is reported for the site.
@@ -368,10 +364,6 @@ class DriftCommand:
     """The store."""
     every: str = "week"
     """The length of a period: day, week, month, year or decade."""
-    reference: int = 2
-    """How many first periods of a robot are the reference for its later ones."""
-    least_episodes: int = 5
-    """The least number of episodes on each side; with fewer there is no verdict."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
     """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
     newest."""
@@ -394,12 +386,7 @@ class DriftCommand:
         expect_file_place(self.out, "--out")
         with Store(self.store, version=given_version(self.version)) as store:
             output.say_unverified(store)
-            drift = measure_drift(
-                store,
-                every=self.every,
-                reference=self.reference,
-                least_episodes=self.least_episodes,
-            )
+            drift = measure_drift(store, every=self.every)
         if self.out is not None:
             from restock.report import write_drift_page
 

@@ -62,8 +62,6 @@ class TraceCommand:
     """Seconds after the row that --view shows."""
     critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
     """The run whose critic --view shows, or none. Default for a row of a RUN: that run."""
-    rows: int = 20
-    """How many audited rows to list if no ROW is given."""
     json: bool = False
     """Print one JSON document (without ROW: a list)."""
 
@@ -74,12 +72,8 @@ class TraceCommand:
         from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
         self._check_view()
-        if self.rows < 1:
-            from restock.errors import ConfigError
-
-            raise ConfigError(f"must be at least 1, got {self.rows}", where="--rows")
         if self.row is None:
-            listed = audited_rows(self.place, self.rows)
+            listed = audited_rows(self.place)
             if self.json:
                 output.print_json(listed)
                 return
