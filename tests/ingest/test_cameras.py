@@ -289,10 +289,6 @@ unit = "1"
     assert set(topics[FRONT].fields) == {"header.stamp", "header.frame_id"}
 
 
-def test_a_dry_run_writes_no_frames(bag: Path) -> None:
-    assert counts(ingest(bag, profile_with(), store=None))["kept"] == 30
-
-
 @pytest.mark.parametrize("kind", ["JPEG", "PNG"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_files_decode_to_what_was_encoded(kind: str, channels: int) -> None:

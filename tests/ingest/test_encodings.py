@@ -4,37 +4,26 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from contextlib import ExitStack
-from importlib.resources import files
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
-from deltalake import DeltaTable
 from google.protobuf import duration_pb2, timestamp_pb2
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 from google.protobuf.descriptor_pb2 import FileDescriptorSet as Files
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
-from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.typesys import Stores, get_typestore
-from support.paths import ROOT
 
 from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import CannotDecode, Channel, Ragged
-from restock.ingest.decoding.definitions import RosType, message_type
+from restock.ingest.decoding.columns import CannotDecode, Ragged
 from restock.ingest.decoding.protobuf_messages import protobuf_type
 from restock.ingest.decoding.row_by_row import JsonType
-from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.writer import StoreWriter
 
 START_NS = 1_700_000_000_000_000_000
 Topic = tuple[str, str, str, str, bytes, Sequence[bytes]]  # topic, encoding, type, format, …
@@ -396,157 +385,3 @@ def test_info_names_every_encoding(tmp_path: Path, capsys: pytest.CaptureFixture
     }
     assert topics["/scan"]["type"] == "lab.Scan"
     assert topics["/j"]["definition"] == "inferred"
-
-
-# -- the same drive in every encoding -----------------------------------------------------------
-
-SAMPLE = ROOT / "sample_logs" / "amr_monday.mcap"
-SCALARS = {
-    **dict.fromkeys(("int8", "int16", "int32"), F.TYPE_INT32),
-    **dict.fromkeys(("uint8", "byte", "char", "uint16", "uint32"), F.TYPE_UINT32),
-    **{"int64": F.TYPE_INT64, "uint64": F.TYPE_UINT64, "bool": F.TYPE_BOOL},
-    **{"float32": F.TYPE_FLOAT, "float64": F.TYPE_DOUBLE, "string": F.TYPE_STRING},
-}
-
-
-def proto_name(kind: str) -> str:
-    if kind == "builtin_interfaces/msg/Time":
-        return ".google.protobuf.Timestamp"
-    if kind == "builtin_interfaces/msg/Duration":
-        return ".google.protobuf.Duration"
-    return ".ros." + kind.replace("/", "_")
-
-
-def as_descriptor(kind: RosType) -> Files:
-    """Return a ROS type as protobuf would define it."""
-    files = build_file_descriptor_set(timestamp_pb2.Timestamp)
-    files.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
-    file = files.file.add(name="ros.proto", package="ros", syntax="proto3")
-    file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
-    wanted, done = [kind.name], set(kind.times)
-    while wanted:
-        name = wanted.pop()
-        if name in done:
-            continue
-        done.add(name)
-        message = file.message_type.add(name=name.replace("/", "_"))
-        for number, field in enumerate(kind.fields_of(name), 1):
-            message.field.add(
-                name=field.name,
-                number=number,
-                label=F.LABEL_REPEATED if field.many else F.LABEL_OPTIONAL,
-                type=SCALARS[field.base] if field.base else F.TYPE_MESSAGE,
-                type_name=proto_name(field.message) if field.message else None,
-            )
-            wanted += [field.message] if field.message else []
-    return files
-
-
-def plain(value: Any) -> Any:
-    """Return a message of rosbags as JSON's kinds of values."""
-    if hasattr(value, "__msgtype__"):
-        # Constants are fields of rosbags' classes, too.
-        names = [name for name in value.__dataclass_fields__ if name.islower()]
-        names.remove("__msgtype__")
-        return {name: plain(getattr(value, name)) for name in names}
-    if isinstance(value, np.ndarray | list):
-        return [plain(item) for item in (value.tolist() if hasattr(value, "tolist") else value)]
-    return value
-
-
-def fill(message: Any, values: dict[str, Any]) -> Any:
-    """Return the same values in a protobuf message."""
-    for name, value in values.items():
-        if isinstance(value, dict) and value.keys() == {"sec", "nanosec"}:
-            part = getattr(message, name)
-            part.seconds, part.nanos = value["sec"], value["nanosec"]
-            part.SetInParent()
-        elif isinstance(value, dict):
-            fill(getattr(message, name), value)
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            for item in value:
-                fill(getattr(message, name).add(), item)
-        elif isinstance(value, list):
-            getattr(message, name).extend(value)
-        else:
-            setattr(message, name, value)
-    return message
-
-
-def copies(folder: Path, count: int) -> dict[str, Path]:
-    """Return the first messages of a sample recording as they are, in JSON and in protobuf."""
-    paths = {encoding: folder / f"{encoding}.mcap" for encoding in ("cdr", "json", "protobuf")}
-    with ExitStack() as stack:
-        writers = {
-            name: Writer(stack.enter_context(path.open("wb"))) for name, path in paths.items()
-        }
-        for writer in writers.values():
-            writer.start()
-        channels: dict[tuple[str, int], int] = {}
-        kinds: dict[int, tuple[Any, Any]] = {}
-        reader = make_reader(stack.enter_context(SAMPLE.open("rb")))
-        for schema, channel, message in islice(reader.iter_messages(log_time_order=False), count):
-            assert schema is not None
-            if channel.id not in kinds:
-                form = (channel.topic, schema.name, "cdr", "ros2msg", schema.data)
-                kind = message_type(Channel(1, *form), "humble")
-                store = get_typestore(Stores.EMPTY)
-                store.register({name: kind.raw[name] for name in family(kind)})
-                described = as_descriptor(kind).SerializeToString()
-                name = proto_name(kind.name)[1:]
-                kinds[channel.id] = store, protobuf_type(name, described)
-                forms = {
-                    "cdr": (schema.name, "ros2msg", schema.data),
-                    "json": (schema.name, "jsonschema", b'{"type": "object"}'),
-                    "protobuf": (name, "protobuf", described),
-                }
-                for encoding, writer in writers.items():
-                    channels[encoding, channel.id] = writer.register_channel(
-                        channel.topic, encoding, writer.register_schema(*forms[encoding])
-                    )
-            store, proto = kinds[channel.id]
-            values = plain(store.deserialize_cdr(message.data, schema.name))
-            payloads = {
-                "cdr": message.data,
-                "json": json.dumps(values).encode(),
-                "protobuf": fill(proto.message_class(), values).SerializeToString(),
-            }
-            for encoding, writer in writers.items():
-                number = channels[encoding, channel.id]
-                writer.add_message(number, message.log_time, payloads[encoding], message.log_time)
-        for writer in writers.values():
-            writer.finish()
-    return paths
-
-
-def family(kind: RosType) -> set[str]:
-    wanted, names = [kind.name], set[str]()
-    while wanted:
-        name = wanted.pop()
-        if name not in names:
-            names.add(name)
-            wanted += [field.message for field in kind.fields_of(name) if field.message]
-    return names
-
-
-@pytest.mark.long
-def test_the_same_drive_in_every_encoding(tmp_path: Path) -> None:
-    profile, ingest_files = load_profile("warehouse_amr"), files("restock.ingest.profile")
-    tables: dict[str, pa.Table] = {}
-    for encoding, path in copies(tmp_path, 4000).items():
-        using = profile
-        if encoding == "protobuf":  # whose types have other names
-            text = (ingest_files / "profiles" / "warehouse_amr.toml").read_text("utf-8")
-            kinds = [source.type for _, source in profile.inputs.items()]
-            for kind in sorted(set(kinds), key=len, reverse=True):
-                text = text.replace(f'"{kind}"', f'"{proto_name(kind)[1:]}"')
-            (tmp_path / "proto.toml").write_text(text)
-            using = load_profile(str(tmp_path / "proto.toml"))
-        store = StoreWriter(tmp_path / encoding)
-        outcome = ingest(path, using, store=store)
-        assert not outcome.lost_messages
-        tables[encoding] = DeltaTable(str(tmp_path / encoding / "transitions")).to_pyarrow_table()
-        assert outcome.manifest["transitions"] == 291
-    for encoding in ("json", "protobuf"):
-        for name in ("observation", "action", "reward", "condition", "stamp_ns"):
-            assert tables[encoding][name].equals(tables["cdr"][name]), (encoding, name)

@@ -332,12 +332,6 @@ def test_idl_that_would_take_its_parser_hours_is_refused(text: str) -> None:
         message_type(channel, "humble")
 
 
-def test_brackets_in_annotations_and_comments_are_no_hindrance() -> None:
-    text = '@verbatim (language="comment", text="(a (b")  double y;  // sequence<(<<<<'
-    channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", IDL.format("", text + "\n").encode())
-    assert [leaf.path for leaf in message_type(channel, "humble").leaves()] == ["y", "x"]
-
-
 # -- metadata.yaml ------------------------------------------------------------------------------
 
 
@@ -438,11 +432,6 @@ def test_any_name_of_a_file_is_ingested_and_escaped(
     assert main(["ingest", given, "--dry-run", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)["recordings"]
     assert row["path"] == given
-
-
-def test_visible_text_stays_as_it_is() -> None:
-    assert visible("/odom läuft 🤖") == "/odom läuft 🤖"
-    assert visible("a\nb\tc", keep="\n") == "a\nb\\tc"
 
 
 def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from support.bag_samples import TOPICS, write_bag, write_mcap
-from support.paths import ROOT, SHARED
 
 from restock.cli import main
 from restock.cli.data.info import offered
@@ -62,39 +61,9 @@ def test_one_bad_recording_does_not_hide_the_others(
     assert "Traceback" not in printed.err
 
 
-def test_a_cut_file_needs_salvage(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cut = tmp_path / "cut.mcap"
-    whole = (folder / "one.mcap").read_bytes()
-    cut.write_bytes(whole[: len(whole) // 2])
-    assert main(["info", str(cut), "--json"]) == 2
-    assert "--salvage" in capsys.readouterr().err
-    assert main(["info", str(cut), "--json", "--salvage"]) == 3
-    entry = json.loads(capsys.readouterr().out)["recordings"][0]
-    assert 20 < entry["messages"] < 140
-    assert "cut short" in entry["damage"][0]
-
-
 def test_no_such_path(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["info", str(tmp_path / "nothing")]) == 2
     assert "no such file" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_topics_that_cannot_be_decoded_are_still_counted(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    bag = SHARED / "turtlebot3-sim-humble"
-    refused = SHARED / "rosbag2-tests" / "mcap" / "wrong_rmw_test"
-    assert main(["info", str(bag), str(refused), "--json"]) == 2
-    printed = capsys.readouterr()
-    (entry,) = json.loads(printed.out)["recordings"]
-    assert entry["messages"] == 9432
-    metrics = entry["topics"]["/performance_metrics"]
-    assert metrics["messages"] == 142
-    assert "gazebo_msgs/msg/PerformanceMetrics" in metrics["skipped"]
-    assert "wrong_format" in printed.err
 
 
 def test_it_says_when_it_ends_and_how_an_mcap_file_is_packed(
@@ -151,21 +120,6 @@ def test_offered_qos_is_named_whatever_version_wrote_it(
     text: str, profiles: list[dict[str, object]]
 ) -> None:
     assert offered(text) == profiles
-
-
-def test_sample_logs_say_what_their_publishers_offered(capsys: pytest.CaptureFixture[str]) -> None:
-    """As `ros2 bag info --verbose` and the MCAP channel's metadata have it."""
-    assert main(["info", str(ROOT / "sample_logs"), "--json"]) == 0
-    for entry in json.loads(capsys.readouterr().out)["recordings"]:
-        assert entry["topics"]["/map"]["qos"] == [
-            {
-                "reliability": "reliable",
-                "durability": "transient_local",
-                "history": "keep_last",
-                "depth": 1,
-            }
-        ]
-        assert entry["topics"]["/imu"]["qos"][0]["reliability"] == "best_effort"
 
 
 def test_it_says_that_damage_is_unseen_until_messages_are_read(

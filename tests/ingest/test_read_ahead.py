@@ -97,16 +97,6 @@ def test_damage_is_told_in_the_same_words_and_order(
     assert len(damage) > 4
 
 
-def test_a_file_that_is_cut_is_salvaged_as_far(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = recording.read_bytes()
-    recording.write_bytes(data[: len(data) * 2 // 3])
-    ahead, plain = both(recording, monkeypatch, salvage=True)
-    assert ahead == plain
-    assert ahead[0]  # type: ignore[index]
-
-
 def test_a_reader_that_stops_early_leaves_no_thread(recording: Path) -> None:
     file = McapFile(recording)
     batches = file.batches(file.channels)

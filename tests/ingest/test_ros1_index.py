@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
-from support.paths import SHARED
 
 from restock.errors import RecordingError
 from restock.ingest.containers import ros1_file
@@ -84,18 +83,6 @@ def test_a_message_of_a_connection_that_is_not_named_is_counted(bag: Path) -> No
     counts, _, lost = read(bag)
     assert sum(counts.values()) == 2 * ROWS - 1
     assert lost == 1
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-@pytest.mark.parametrize("other", [1, 3, 77])
-def test_the_index_of_a_huskys_bag(other: int, tmp_path: Path) -> None:
-    content = bytearray((SHARED / "ros1" / "husky_robot_localization.bag").read_bytes())
-    places = index_records(content)
-    place = places[len(places) // 2]
-    content[place : place + 4] = struct.pack("<I", other)
-    (tmp_path / "run.bag").write_bytes(content)
-    counts, messages, lost = read(tmp_path / "run.bag")
-    assert (sum(counts.values()), messages, lost) == (16806, 16806, 0)
 
 
 def test_a_bag_that_was_cut_short_is_read_up_to_the_cut(bag: Path) -> None:

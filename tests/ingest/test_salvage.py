@@ -101,18 +101,6 @@ def test_without_a_summary_chunks_show_themselves(
     assert any(loss.startswith(f"{lost:,} bytes from byte {places[2][0]:,} on") for loss in reasons)
 
 
-def test_twice_damaged_without_a_summary(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "run.mcap", chunk_size=2048)
-    places = chunks_of(path)
-    chunks = McapFile(path)._contents.chunks
-    held = sum(sum(chunks[at].counts().values()) for at in (2, 5))
-    wreck = b"\x05" + HUGE + b"\xff" * 60
-    damaged(path, places[5][0], wreck)
-    decoded, reasons, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
-    assert decoded == COUNT - held
-    assert sum("bytes from byte" in loss for loss in reasons) == 3  # and what is left at the end
-
-
 def test_of_a_chunk_that_is_cut_what_is_read_is_not_called_lost(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap", compression=CompressionType.NONE, chunk_size=1 << 20)
     ((start, stop),) = chunks_of(path)

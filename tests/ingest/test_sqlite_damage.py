@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from support.bag_samples import write_bag
-from support.paths import SHARED
 
 from restock.cli import main
 from restock.errors import RecordingError
@@ -165,12 +164,6 @@ def test_planted_damage_is_refused_and_salvaged(name: str, whole: Path, tmp_path
         assert rows.total() > 0.4 * before.total()
 
 
-def test_a_whole_file_is_read_without_a_word(whole: Path) -> None:
-    rows, _, said = read(whole, salvage=True)
-    assert rows == rows_of(whole)
-    assert not said
-
-
 def test_salvaged_columns_are_those_of_the_whole_file(whole: Path, tmp_path: Path) -> None:
     """Twice: what one reading takes is there for the next."""
     file = tmp_path / "run.db3"
@@ -254,18 +247,3 @@ def test_the_oldest_schema_is_read(tmp_path: Path) -> None:
             assert recording.topics["/bumper"].encoding == "cdr"
             assert recording.read({"/bumper": ["data"]})["/bumper"].fields["data"].all()
             assert recording.accounts["/bumper"].decoded == 7
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_an_inserted_page_in_the_bag_of_a_turtlebot(tmp_path: Path) -> None:
-    content = (SHARED / "turtlebot3-sim-sparse-cmd" / "bag_0.db3").read_bytes()
-    at = len(content) // 2 // PAGE * PAGE
-    file = tmp_path / "bag_0.db3"
-    file.write_bytes(content[:at] + bytes(PAGE) + content[at:])
-    with pytest.raises(RecordingError, match="SQLite finds it damaged"):
-        open_recording(file)
-    (tmp_path / "whole.db3").write_bytes(content)
-    rows, _, said = read(file, salvage=True)
-    assert rows == rows_of(tmp_path / "whole.db3")
-    assert rows.total() == 7811
-    assert said
