@@ -26,7 +26,7 @@ from restock.ingest.profile.profile import Profile, not_live
 from restock.ingest.profile.signal_paths import conventions_of, element_of
 from restock.ingest.steps.align import NS, TOLERANCE_S, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.steps.clocks import WINDOW_NS, ClockMap, median
+from restock.ingest.steps.clocks import JUMP_S, WINDOW_NS, ClockMap, median
 from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
@@ -225,7 +225,7 @@ class LiveObserver:
     def reset(self) -> None:
         """Discard all messages: the clock was set, or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
-        self._clock = LiveClock(round(self.profile.clock.jump_s * NS))
+        self._clock = LiveClock(round(JUMP_S * NS))
         self._newest_ns = 0  # log time of the last message
         self._command: _Message | None = None  # the first since the last tick, or the last before
         self._ticked = True

@@ -37,12 +37,10 @@ from restock.ingest.profile.inputs import (
     COMMAND_THROUGH,
     FALLBACKS,
     FIX_FALLBACK,
-    FIX_SETTINGS,
     HINDSIGHT,
     POLICY_FALLBACK,
     POSE_FALLBACK,
     ROUTE_FALLBACK,
-    SCAN_SETTINGS,
     SCANS,
     STEERED,
     WHEELS_FALLBACK,
@@ -79,9 +77,11 @@ from restock.ingest.task.robot import Robot, beyond_limits, refuse_beyond_steeri
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import Task
+from restock.renamed import PROFILE_KEYS
 from restock.toml import Checked, changed, parse_toml, read_toml, toml_value, typed
 
 ELSEWHERE = "elsewhere"
+_NOT_IN_ROWS = ("conditions", "exposures", "condition", "tags", "noise", "robot", "limiter")
 
 
 class Profile(Checked, frozen=True):
@@ -152,31 +152,8 @@ class Profile(Checked, frozen=True):
         That leaves out conditions, which can be changed without the recordings (labels depend on
         `labels_version`), their [noise], whose drive it is, and what only the twin needs of it.
         """
-        without = msgspec.structs.replace(
-            self, shipped_conditions=[], shipped_exposures=[], own_conditions=[]
-        )
-        values = msgspec.to_builtins(without)
-        apart = {"tags", "noise", "robot", "limiter"}
-        if self.goal == GoalRules():  # rows are as before there was such a table
-            apart |= {"goal"}
-        if self.motion is None:
-            apart |= {"motion"}
-        apart |= {name for name in ("command_sources", "cameras") if not values[name]}
-        for signal in values["signals"].values():
-            if signal["length"] is None:
-                del signal["length"]
-        for source in values["command_sources"].values():
-            for key in (*SCAN_SETTINGS, *FIX_SETTINGS):
-                del source[key]
-        apart |= {name for name in ("command_through", "origin_m") if values[name] is None}
-        for name in ("heading", *SCANS[1:]):
-            if values["inputs"][name] is None:
-                del values["inputs"][name]
-        for source in filter(None, values["inputs"].values()):
-            for key in ("stop_holds", "wheelbase_m", *SCAN_SETTINGS, *FIX_SETTINGS):
-                if not source[key]:
-                    del source[key]
-        rest = {key: value for key, value in values.items() if key not in apart}
+        values = _given(msgspec.to_builtins(self))
+        rest = {key: value for key, value in values.items() if key not in _NOT_IN_ROWS}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
     @property
@@ -303,7 +280,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
     cameras = document.get("cameras")
     for name, table in cameras.items() if isinstance(cameras, dict) else ():
         typed(table, Camera, where=where, prefix=f"cameras.{name}")
-    profile = typed(document, Profile, where=where)
+    profile = typed(document, Profile, where=where, renamed=PROFILE_KEYS)
     if not profile.inputs.scans:
         profile = without_lidar(profile)  # whatever number of sectors it gives
     check_profile(profile, where)
@@ -545,21 +522,13 @@ def _check_goal(profile: Profile, where: str) -> None:
 
 def _check_goal_rules(profile: Profile, where: str) -> None:
     """Raise ConfigError if a profile says how goals are found, and they are not found so."""
-    goal, source = profile.task.goal, profile.goal.source
     rules = [f"goal.{key}" for key in changed(profile.goal)]
-    limits = changed(profile.episodes, ("goal_moved_m", "plan_goal_tolerance_m"))
-    limits = [f"episodes.{key}" for key in limits]
-    for unused, keys, decides, now, instead in (
-        (source == "logged", rules, "goal.source", source, "hindsight"),
-        (source == "hindsight", limits, "goal.source", source, "logged"),
-        (goal == "none", limits, "task.goal", goal, "route"),
-    ):
-        if unused and keys:
-            raise ConfigError(
-                f"`{keys[0]}` is given, and `{decides}` is {now!r}: it would not be used",
-                where=where,
-                remedy=f'leave {keys[0]} out, or set {decides} = "{instead}"',
-            )
+    if profile.goal.source == "logged" and rules:
+        raise ConfigError(
+            f"`{rules[0]}` is given, and `goal.source` is 'logged': it would not be used",
+            where=where,
+            remedy=f'leave {rules[0]} out, or set goal.source = "hindsight"',
+        )
 
 
 def _check_conditions(profile: Profile, where: str) -> None:

@@ -36,8 +36,6 @@ class Clock(Checked, frozen=True):
     alignment: Literal["header.stamp", "log_time"] = "header.stamp"
     steps: Literal["rate", "command"] = "rate"
     max_gap_s: Annotated[float, Meta(gt=0)] = 0.5  # longest gap between two steps of an episode
-    # Change of (log time - stamp) that means the clock was set.
-    jump_s: Annotated[float, Meta(gt=0)] = 1.0
 
 
 class Episodes(Checked, frozen=True):
@@ -45,10 +43,6 @@ class Episodes(Checked, frozen=True):
 
     # Larger: the robot was carried, or relocalised.
     max_pose_jump_m: Annotated[float, Meta(gt=0)] = 1.0
-    # Distance from the last goal that means a new one.
-    goal_moved_m: Annotated[float, Meta(ge=0)] = 0.01
-    # A plan that ends further from the goal is for another one.
-    plan_goal_tolerance_m: Annotated[float, Meta(ge=0)] = 0.5
 
 
 class Frames(Checked, frozen=True):

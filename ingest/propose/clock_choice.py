@@ -130,7 +130,7 @@ def choose_clock(
     if clock is not None and clock.skipped is None and CLOCK_FIELD in recording.leaves(CLOCK_TOPIC):
         wanted[CLOCK_TOPIC] = [CLOCK_FIELD]
     columns = recording.read(wanted)
-    seen = [topic_clock(name, columns[name], 1.0) for name in sorted(with_stamp - latched)]
+    seen = [topic_clock(name, columns[name]) for name in sorted(with_stamp - latched)]
     comments = [f"{one.topic}: {what}" for one in seen if (what := odd(one.as_row()))]
     choice, why_not = _by_stamp(columns, latched, gaps)
     if why_not:

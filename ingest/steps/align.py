@@ -30,6 +30,7 @@ from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.steps.clocks import (
+    JUMP_S,
     STAMP,
     ClockMap,
     drift_ns,
@@ -126,7 +127,7 @@ def align(
     """Put every topic on the alignment clock, cut where that clock jumps.
 
     `topics` are in the order of their log time; stamped ones hold the field `header.stamp`.
-    A message whose stamp is more than `clock.jump_s` from where its segment's clock has it is
+    A message whose stamp is more than JUMP_S from where its segment's clock has it is
     left out and counted, but one of a `latched` topic (it may have been published long before
     the recording began) is put at its log time instead. `transforms` may be stamped ahead: they
     do not say what time it is, and count from when they were received. So do images of cameras.
@@ -222,9 +223,9 @@ def _align(
         report.by_reception[name] = ahead_ns
         del stamped[name]
     reference = max(stamped, key=lambda name: (len(stamped[name]), name))
-    if np.ptp(np.asarray(stamped[reference].fields[STAMP], np.int64)) > clock.jump_s * NS:
+    if np.ptp(np.asarray(stamped[reference].fields[STAMP], np.int64)) > JUMP_S * NS:
         refuse_still_log_time(reference, stamped[reference])
-    edges = _edges(stamped[reference], round(clock.jump_s * NS))
+    edges = _edges(stamped[reference], round(JUMP_S * NS))
     report.jumps += len(edges)
     drifts = _Drifts(clock, round(tolerance_s * NS), simulated, report)
     segments = []
@@ -377,7 +378,7 @@ class _Drifts:
         index: int,
     ) -> tuple[ClockMap, int]:
         """Return the map of one segment, and the reference topic's median delay in it."""
-        jump_ns, rows = round(self.clock.jump_s * NS), inside[reference]
+        jump_ns, rows = round(JUMP_S * NS), inside[reference]
         log = stamped[reference].log_time_ns[rows]
         late = delay_ns(stamped[reference], rows)
         middle = median(late)
@@ -440,7 +441,7 @@ class _Drifts:
             if not stamp.any():
                 continue
             ahead = -median(clock_map.stamped(log) - stamp)
-            if self.tolerance_ns < abs(ahead) <= round(self.clock.jump_s * NS):
+            if self.tolerance_ns < abs(ahead) <= round(JUMP_S * NS):
                 self.report.by_reception[name] = ahead
 
 
@@ -455,7 +456,7 @@ def _segment(
     transforms: frozenset[str],
     report: ClockReport,
 ) -> ClockSegment:
-    jump_ns = round(clock.jump_s * NS)
+    jump_ns = round(JUMP_S * NS)
     samples = {}
     for name, rows in inside.items():
         columns, numbers = topics[name], every[rows]

@@ -21,6 +21,7 @@ from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
 from restock.words import counted
 
+JUMP_S = 1.0  # a change of (log time - stamp) by more means that a clock was set
 STAMP = "header.stamp"
 WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
 
@@ -34,7 +35,7 @@ class TopicClock:
     publish_offset_ns: int | None  # log time - publish time, median; None without a message
     offset_ns: int | None = None  # log time - header stamp, median, of stamps that are not zero
     spread_ns: int | None = None  # … 1st to 99th percentile
-    jumps: int | None = None  # times that this difference changes by more than `jump_s`
+    jumps: int | None = None  # times that this difference changes by more than JUMP_S
     backsteps: int | None = None  # stamps before that of the message received just before
     duplicates: int | None = None  # messages whose stamp another one has, too
     zero_stamps: int | None = None
@@ -44,7 +45,7 @@ class TopicClock:
         return {**asdict(self), "stamped": self.offset_ns is not None}
 
 
-def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
+def topic_clock(topic: str, columns: TopicColumns) -> TopicClock:
     """Compare one topic's clocks. Messages are in the order of their log time."""
     log, publish = columns.log_time_ns, columns.publish_time_ns
     count = len(log)
@@ -69,7 +70,7 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
         sent,
         middle,
         int(high - low),
-        len(jumps(log, delay, round(jump_s * 1e9))),
+        len(jumps(log, delay, round(JUMP_S * 1e9))),
         backsteps,
         duplicates,
         count - len(stamp),
@@ -96,9 +97,9 @@ def odd(row: Mapping[str, Any]) -> str:
 _BLOCK = 1 << 16  # windows sorted at a time: bounds memory
 
 
-def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[TopicClock]:
+def topic_clocks(topics: Mapping[str, TopicColumns]) -> list[TopicClock]:
     """Compare every topic's clocks."""
-    return [topic_clock(name, columns, jump_s) for name, columns in topics.items()]
+    return [topic_clock(name, columns) for name, columns in topics.items()]
 
 
 def median(delay_ns: Ints) -> int:

@@ -99,7 +99,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or a field is
             not what its input needs.
     """
-    clocks = topic_clocks(topics, profile.clock.jump_s)
+    clocks = topic_clocks(topics)
     aligned = align_inputs(profile, topics)
     filling = Filling(aligned)
     signals = filling.fill()

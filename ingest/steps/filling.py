@@ -149,6 +149,8 @@ def plan_ends(plans_m: Sequence[F64]) -> F64:
 
 
 # What rows have in place of a field without an estimate, if it is not left unknown.
+GOAL_MOVED_M = 0.01  # from the last goal: more is a new one
+PLAN_GOAL_TOLERANCE_M = 0.5  # a plan that ends further from the goal is for another one
 NO_ESTIMATE = {
     "angular_velocity": ": gyro yaw rate taken from the wheels",
     "linear_acceleration": ": acceleration 0",
@@ -455,10 +457,9 @@ class Filling:
             if name in self.inputs.placed:
                 reasons = np.where(one.known, self.inputs.placed[name].problem[one.row], "")
                 self._mark_reasons(name, reasons, route=True)
-        settings = self.profile.episodes
         goal, plan = (np.where(one.known, one.row, -1) for one in latest.values())
         if len(goals):
-            goal = np.where(goal >= 0, same_goals(goals, settings.goal_moved_m)[goal], -1)
+            goal = np.where(goal >= 0, same_goals(goals, GOAL_MOVED_M)[goal], -1)
             sane = (np.abs(goals[goal]) <= LARGEST).all(axis=1)
             self._mark_invalid((goal >= 0) & ~sane, "goal: not finite", route=True)
         if len(plans):
@@ -468,7 +469,7 @@ class Filling:
         if usable.any():
             away = np.linalg.norm(plan_ends(plans)[plan[usable]] - goals[goal[usable]], axis=-1)
             other = np.zeros(len(usable), np.bool_)
-            other[usable] = away > settings.plan_goal_tolerance_m
+            other[usable] = away > PLAN_GOAL_TOLERANCE_M
             self._mark_invalid(other, "plan: for another goal", route=True)
         usable = self.route_problem == ""
         goal, plan = np.where(usable, goal, -1), np.where(usable, plan, -1)

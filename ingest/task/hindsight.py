@@ -30,6 +30,7 @@ STANDING = f"{NO_MISSION}, standing still"
 NOWHERE = f"{NO_MISSION}, nowhere far enough"
 
 _SHORTEST = 3.0  # goal radii from start to goal, at least
+_WAIT_S = 10.0  # standing before the start, at most, that belongs to the mission
 _BACK = 0.6  # of the farthest from its start: nearer again, the robot has turned back
 _OFTEN = 3  # visits
 _LIMIT = 0.9  # of the task's time limit
@@ -42,13 +43,12 @@ class GoalRules(Checked, frozen=True):
 
     source: GoalSource = "logged"  # from inputs.goal and inputs.plan; or in hindsight
     still_s: Annotated[float, Meta(gt=0)] = 3.0  # how long a robot stands when it has arrived
-    wait_s: Annotated[float, Meta(ge=0)] = 10.0  # standing before the start, in the mission
-    shortest_m: Annotated[float, Meta(gt=0)] | None = None  # from start to goal; None: 3 goal radii
     longest_m: Annotated[float, Meta(gt=0)] = 10.0  # from start to goal
 
-    def at_least_m(self, task: Task) -> float:
-        """Return how far a goal must be from where its mission starts."""
-        return self.shortest_m or _SHORTEST * task.goal_radius_m
+
+def shortest_m(task: Task) -> float:
+    """Return how far a goal must be from where its mission starts."""
+    return _SHORTEST * task.goal_radius_m
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class _Cutting:
         self.xy_m = xy_m
         self.at_s = np.cumsum(np.maximum(np.diff(stamp_ns, prepend=stamp_ns[:1]), 0)) * 1e-9
         self.leg = leg
-        self.shortest_m = rules.at_least_m(task)
+        self.shortest_m = shortest_m(task)
         self.longest_s = _LIMIT * task.time_limit_steps * task.control_period_s
         self.arc_m = driven_m(xy_m, leg, self.radius_m / 2)
         self.standing = self._standing()  # and, after the cutting, in no mission
@@ -154,7 +154,7 @@ class _Cutting:
                 continue
             arrives = stop <= last
             # What it did before it set off belongs to the drive: it looked where to go, and turned.
-            since = np.searchsorted(self.at_s, self.at_s[begin] - self.rules.wait_s, "left")
+            since = np.searchsorted(self.at_s, self.at_s[begin] - _WAIT_S, "left")
             start = min(max(stood, int(since)), begin)
             self._cut_drive(start, stop if arrives else last, "stood still" if arrives else end)
 

@@ -7,6 +7,10 @@ def _now(name: str) -> str:
     return f"it is now called {name}: rename it"
 
 
+def _fixed(value: str) -> str:
+    return f"it was removed, and is always {value} now: leave it out"
+
+
 _CAP = "it was removed: set it for the whole mixture"
 _LEAST = "it was removed: leave the stratum out, or give it a smaller share"
 _GONE = "it was removed, as it gained nothing (docs/evidence.md): leave it out"
@@ -29,6 +33,13 @@ TRAINING_KEYS = {
     "loss.munchausen": _GONE,
     "loss.munchausen_floor": _GONE,
     "loss.munchausen_temperature": _GONE,
+}
+PROFILE_KEYS = {
+    "clock.jump_s": _fixed("1 s"),
+    "episodes.goal_moved_m": _fixed("0.01 m"),
+    "episodes.plan_goal_tolerance_m": _fixed("0.5 m"),
+    "goal.shortest_m": _fixed("3 goal radii"),
+    "goal.wait_s": _fixed("10 s"),
 }
 STUDY_KEYS = {
     "space": "it was removed: call `restock train --set` from Optuna instead",

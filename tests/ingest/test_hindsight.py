@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
-from restock.ingest.profile.tables import Episodes
-from restock.ingest.task.hindsight import GoalRules, missions
+from restock.ingest.task.hindsight import GoalRules, missions, shortest_m
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 
@@ -209,23 +207,6 @@ def test_rules_of_hindsight_are_refused_where_goals_are_logged(tmp_path) -> None
         load_profile(unused)
 
 
-@pytest.mark.parametrize("key", ["goal_moved_m", "plan_goal_tolerance_m"])
-@pytest.mark.parametrize("goals", ["goal.source", "task.goal"])
-def test_limits_of_logged_goals_need_logged_goals(tmp_path, key, goals) -> None:
-    logged = load_profile("warehouse_amr")
-    inputs = replace(logged.inputs, goal=None, plan=None)
-    if goals == "goal.source":
-        found = replace(logged, inputs=inputs, goal=GoalRules(source="hindsight"))
-    else:
-        found = replace(logged, inputs=inputs, task=replace(logged.task, goal="none"))
-    file = tmp_path / "robot.toml"
-    file.write_text(profile_toml(found))
-    load_profile(file)
-    file.write_text(profile_toml(replace(found, episodes=Episodes(**{key: 0.7}))))
-    with pytest.raises(ConfigError, match=rf"`episodes\.{key}` is given, and `{goals}` is"):
-        load_profile(file)
-
-
 def test_a_running_robot_has_no_hindsight(tmp_path, capsys) -> None:
     _, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
     with pytest.raises(ConfigError, match="in hindsight, which is not possible live"):
@@ -318,7 +299,7 @@ def test_every_mission_arrives_in_time_and_on_its_own_leg(moves, seed, noise) ->
         assert np.allclose(made.routes_m[number][-1], goal)
         gap = np.hypot(*(xy[ticks] - goal).T)
         then = gap[(gap <= RADIUS_M).argmax() :]  # arrived, if it did before the last tick
-        assert gap.min() > RADIUS_M or then.max() <= GoalRules().at_least_m(TASK)
+        assert gap.min() > RADIUS_M or then.max() <= shortest_m(TASK)
         away = np.hypot(*(xy[ticks[0]] - goal))
-        assert away >= GoalRules().at_least_m(TASK) - RADIUS_M / 2 - 1e-9
+        assert away >= shortest_m(TASK) - RADIUS_M / 2 - 1e-9
     assert all((made.mission >= 0) | (np.array(made.problem) != ""))

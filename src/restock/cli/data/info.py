@@ -40,7 +40,6 @@ _QOS = {
     "history": ("system_default", "keep_last", "keep_all"),
 }
 MAX_PROFILES = 20  # of a topic: publishers that offer others
-JUMP_S = 1.0  # a change of (log time - stamp) that means a clock was set, as in profiles
 
 
 @dataclass
@@ -235,7 +234,7 @@ def _clocks(recording: Recording) -> dict[str, dict[str, Any]]:
         if topic.skipped is None
     }
     return {
-        name: topic_clock(name, columns, JUMP_S).as_row()
+        name: topic_clock(name, columns).as_row()
         | {"log_backsteps": recording.accounts[name].log_backsteps}
         for name, columns in recording.read(wanted).items()
     }
