@@ -176,11 +176,11 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
 
 
 def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
-    """Return whether the profile of an earlier ingest has another [robot] table."""
-    if not (text := before.get("profile_toml")):
-        return False
+    """Whether the profile that a recording was ingested with says something else in [robot]."""
     try:
-        return read_profile_toml(text, where="profile_toml").robot != profile.robot
+        return (
+            read_profile_toml(before["profile_toml"], where="profile_toml").robot != profile.robot
+        )
     except ConfigError:  # as another version wrote it
         return False
 
@@ -209,7 +209,7 @@ class _Ingest:
     ) -> None:
         self.path, self.recording, self.profile, self.reported = path, recording, profile, reported
         self.repeated, self.before = repeated, before or {}
-        self.corrections = corrections_in(self.before)
+        self.corrections = corrections_in(before) if before else []
         self.ingest_id = uuid.uuid4().hex[:16]
 
     def run(self, store: StoreWriter | None) -> Prepared:

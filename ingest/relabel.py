@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError, expect
-from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml, with_conditions
+from restock.ingest.profile.profile import profile_toml, read_profile_toml, with_conditions
 from restock.ingest.store.corrections import (
     COLUMN,
     Correction,
@@ -152,14 +152,12 @@ def relabel_rows(
     stored = rows.select(ends.column_names)  # the signals, and the profile's own
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
-    conditions, situations_told = (
+    conditions, exposures = (
         reported(several, lidar=task.lidar, driven_plan=driven_plan(rows))
         for several in (every_condition, every_exposure)
     )
     if row["format"] == TWIN:  # which fills none of the profile's own signals
-        conditions = runnable(stored, conditions)
-    # An older store has not all signals that exposures are told by: then they stay unknown.
-    exposures = runnable(stored, situations_told)
+        conditions, exposures = (runnable(stored, one) for one in (conditions, exposures))
     steps = pa.concat_tables([stored, ends.cast(stored.schema)])
     begin = np.arange(len(rows))
     try:
@@ -183,9 +181,7 @@ def relabel_rows(
         "conditions": names_of(labels, begin),
         "probabilities": by_name(probable, begin),
         "uncertain": names_of(too_near_to_call(probable, conditions), begin),
-        "exposures": names_of(situations, begin)
-        if exposures or not situations_told
-        else pa.nulls(len(rows), pa.list_(pa.string())),
+        "exposures": names_of(situations, begin),
         "labels_version": labels_version(definitions),
         "ingest_id": ingest_id,
     }
@@ -194,7 +190,8 @@ def relabel_rows(
     rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
     named = rows["condition"].to_pylist()
     scores = label_scores(rows, labels, task.control_period_s)
-    profile = _with_conditions(row["profile_toml"], definitions)
+    profile = read_profile_toml(row["profile_toml"], where="the manifest's profile")
+    profile = with_conditions(profile, definitions)
     manifest = row | {
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
@@ -207,8 +204,8 @@ def relabel_rows(
         "corrections": correction_rows(corrections),
         "conditions_json": conditions_json(every_condition),
         "exposures_json": conditions_json(every_exposure),
-        "profile_toml": None if profile is None else profile_toml(profile),
-        "uncertain_conditions": None if profile is None else uncertain_conditions(profile),
+        "profile_toml": profile_toml(profile),
+        "uncertain_conditions": uncertain_conditions(profile),
     }
     outcome = Relabelled(
         row["recording_id"],
@@ -221,18 +218,6 @@ def relabel_rows(
         scores,
     )
     return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome
-
-
-def _with_conditions(text: str | None, conditions: Sequence[Condition]) -> Profile | None:
-    """Return the manifest's profile with the conditions that label its rows now.
-
-    None if it has no profile, or one that only a newer Restock can read.
-    """
-    try:
-        profile = read_profile_toml(text or "", where="the manifest's profile")
-    except ConfigError:
-        return None
-    return with_conditions(profile, conditions)
 
 
 def open_for_relabel(path: Path | str) -> StoreWriter:

@@ -2,7 +2,7 @@
 
 A commit takes files that are written already, and what they replace, from a fresh look at the
 table; an attempt whose answer was lost is not done twice. Tables are made, and get the columns of
-newer software, when rows with them are first written.
+a profile's own signals, when rows with them are first written.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from restock.ingest.store.lineage import StoredFile, active_files, own_path, sto
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.reader import StoreReader
 from restock.ingest.store.summary import SUMMARY_SCHEMA
-from restock.ingest.store.version import expect_writable
+from restock.ingest.store.version import FORMAT, expect_writable
 from restock.ingest.task.schema import recording_schema
 
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
@@ -39,10 +39,7 @@ class TableCommits(StoreReader):
     """A store whose tables can be made and committed to."""
 
     def create(self, name: str, schema: pa.Schema) -> None:
-        """See that there is a table with these columns.
-
-        Columns that newer software writes are added; rows from before hold null in them.
-        """
+        """Make the table, or add the columns that it lacks: rows from before hold null in them."""
         self.expect_folder()
         from restock.ingest.profile.tables import refuse_other_signals
 
@@ -54,6 +51,7 @@ class TableCommits(StoreReader):
                     mode="ignore",
                     storage_options=self.path.options,
                     configuration={"delta.checkpointInterval": str(CHECKPOINT_COMMITS)},
+                    description=FORMAT,
                 )
             table = self.path.open_table(name)
             expect_writable(table, where=str(self.path))
@@ -88,20 +86,6 @@ class TableCommits(StoreReader):
             raise self.path.absent()
         for name in (RECORDINGS, TRANSITIONS):
             expect_writable(self.path.open_table(name), where=str(self.path), removing=True)
-
-    def allow_nulls(self, names: Collection[str]) -> None:
-        """Let these signals be null: in a store of an older Restock the clearance of a robot
-        without a lidar was a number."""
-
-        def allow() -> None:
-            table = self.path.open_table(TRANSITIONS)
-            strict = {field.name for field in table.schema().fields if not field.nullable}
-            for name in sorted(names):
-                if name in strict:
-                    table.alter.drop_column_not_null(name)
-
-        if names:
-            self.again_on_conflict(allow)
 
     def commit(
         self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]

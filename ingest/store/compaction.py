@@ -20,7 +20,7 @@ from restock.ingest.store.commits import ATTEMPTS, delta_columns, recording_colu
 from restock.ingest.store.data_files import merge, parquet_options, written_whole
 from restock.ingest.store.lineage import Ingest, StoredFile, changed_by_others, own_path
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
-from restock.ingest.store.summary import VERSION, summarised
+from restock.ingest.store.summary import summarised
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import recording_schema
 
@@ -40,7 +40,7 @@ class Compacted:
     files_after: int = 0  # of those: what other writers added meanwhile is not counted
     manifests_before: int = 0  # files of manifests
     manifests_after: int = 0
-    summaries: int = 0  # of recordings that had none, an older Restock's, or one of other rows
+    summaries: int = 0  # of recordings whose rows another tool changed
     changed_meanwhile: int = 0  # files that another writer replaced before they were done
     version: int | None = None  # of the store's transitions, where they were written
 
@@ -73,8 +73,8 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
 
 
 def fold(store: StoreWriter, done: Compacted | None = None, changed: Collection[str] = ()) -> None:
-    """Make one file of the manifests of all recordings, with summaries of those that lack them, and
-    of the ingests whose rows another tool `changed`.
+    """Make one file of the manifests of all recordings, with new summaries of the ingests whose
+    rows another tool `changed`.
 
     Manifests whose rows are not there yet, those of replaced rows, and files that have many already
     stay as they are.
@@ -125,26 +125,20 @@ class _Fold:
     files: int
     chosen: list[StoredFile]
     live: list[Ingest]
-    lacking: list[Ingest]  # of these, those that have no summary of this version, and true
+    lacking: list[Ingest]  # of these, those whose summary is of other rows
 
     @classmethod
     def of(cls, store: StoreWriter, changed: Collection[str]) -> _Fold:
         shown = {one.ingest_id for one in store.shown()}
         files = store.files(RECORDINGS)
-        live = [one for file in files for one in file.ingests if one.ingest_id in shown]
-        names = pa.schema([("ingest_id", pa.string()), ("summary_version", pa.int32())])
-        reported = store.manifests(live, names).to_pylist()
-        current = {one["ingest_id"] for one in reported if one["summary_version"] == VERSION}
-        current -= set(changed)
-
         chosen = []
         for file in files:
             held = shown.intersection(one.ingest_id for one in file.ingests)
-            full = len(held) >= FULL_MANIFESTS and held <= current
+            full = len(held) >= FULL_MANIFESTS and held.isdisjoint(changed)
             if not full and (held or not file.own):
                 chosen.append(file)
         live = [one for file in chosen for one in file.ingests if one.ingest_id in shown]
-        lacking = [one for one in live if one.ingest_id not in current]
+        lacking = [one for one in live if one.ingest_id in changed]
         return cls(len(files), chosen, live, lacking)
 
     @property
@@ -160,7 +154,7 @@ class _Fold:
 
 
 def _summarise(store: StoreWriter, lacking: Sequence[Ingest], made: dict[str, pa.Table]) -> None:
-    """Add the manifests of these ingests with a summary of this version."""
+    """Add the manifests of these ingests with a summary of their rows."""
     manifests = store.manifests(lacking, recording_schema())
     for one in lacking:
         with suppress(FileNotFoundError):  # replaced meanwhile

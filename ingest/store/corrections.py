@@ -49,7 +49,7 @@ class Moments:
     def of(cls, rows: pa.Table, clock_offset_ns: int | None) -> Moments:
         """`clock_offset_ns` is the manifest's: log time less alignment clock."""
         logged = rows["stamp_ns"].to_numpy() + (clock_offset_ns or 0)
-        if "logged_ns" in rows.column_names and not rows["logged_ns"].null_count:
+        if not rows["logged_ns"].null_count:
             logged = rows["logged_ns"].to_numpy()
         return cls(rows["episode_index"].to_numpy(), logged)
 
@@ -67,8 +67,8 @@ class Moments:
 
 
 def corrections_in(manifest: Mapping[str, Any]) -> list[Correction]:
-    """The corrections of a manifest row; none in one of an older Restock."""
-    return [Correction(**row) for row in manifest.get(COLUMN) or []]
+    """Read the corrections of a manifest row."""
+    return [Correction(**row) for row in manifest[COLUMN]]
 
 
 def correction_rows(corrections: Iterable[Correction]) -> list[dict[str, Any]]:
@@ -153,13 +153,11 @@ def _with_labels(
         "condition": primary(labels, conditions) or [NOMINAL] * len(rows),
         "conditions": names_of(labels, every),
     }
-    if "uncertain" in rows.column_names and not rows["uncertain"].null_count:
-        open_to_doubt = held(rows["uncertain"], [condition.name for condition in conditions])
-        for name, values in said.items():
-            open_to_doubt[name] &= values < 0
-        new["uncertain"] = names_of(open_to_doubt, every)
-    if "probabilities" in rows.column_names and not rows["probabilities"].null_count:
-        new["probabilities"] = _certain(rows["probabilities"].combine_chunks(), said)
+    open_to_doubt = held(rows["uncertain"], [condition.name for condition in conditions])
+    for name, values in said.items():
+        open_to_doubt[name] &= values < 0
+    new["uncertain"] = names_of(open_to_doubt, every)
+    new["probabilities"] = _certain(rows["probabilities"].combine_chunks(), said)
     return replaced(rows, new)
 
 

@@ -31,6 +31,7 @@ from restock.files import first_line
 from restock.ingest.store.version import (
     LOG,
     Version,
+    expect_format,
     expect_readable,
     expect_whole,
     log_damage,
@@ -214,8 +215,8 @@ class Location:
         """One of its tables, at a version (or the newest of a moment) or at its newest.
 
         Raises:
-            StoreError: no such table or version, one that uses a feature that Restock cannot read,
-                or the place cannot be reached.
+            StoreError: no such table or version, one of another format or with a feature that
+                Restock cannot read, or the place cannot be reached.
         """
         try:
             with self.translate_errors():
@@ -230,6 +231,7 @@ class Location:
                         )
                     table.load_as_version(version)
                 self._expect_whole(name, table.version())
+                expect_format(table, where=self.text)
                 expect_readable(table, where=self.text)
                 return table
         except (TableNotFoundError, DeltaError, ValueError) as error:
@@ -403,7 +405,7 @@ class Location:
 
 def open_parquet(source: pa.NativeFile, **options: Any) -> pq.ParquetFile:
     """A Parquet file, to be read with the checksums of its pages verified: bytes that changed are
-    an OSError. Files of an older Restock have none, and are read as they are."""
+    an OSError. Files of other tools may have none, and are read as they are."""
     return pq.ParquetFile(source, page_checksum_verification=True, **options)
 
 

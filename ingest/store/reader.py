@@ -24,7 +24,7 @@ from restock.ingest.store.lineage import (
     stored_files,
 )
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
-from restock.ingest.store.repeated import SKETCH, UNREADABLE, Hashes, Sketch, read_sketch
+from restock.ingest.store.repeated import UNREADABLE, Hashes, Sketch, read_sketch
 from restock.ingest.store.summary import with_ends
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
@@ -72,7 +72,7 @@ class StoreReader:
         *,
         skip: tuple[type[Exception], ...] = (),
     ) -> pa.Table:
-        """These columns of the manifests of ingests; null where an older store has them not.
+        """Return these columns of the manifests of ingests.
 
         An ingest whose manifest the store does not have any more is left out, and so is a file at
         which one of `skip` is raised.
@@ -95,8 +95,7 @@ class StoreReader:
                 absent = () if path in listed else (FileNotFoundError,)
                 place = f"{RECORDINGS}/{path}"
                 with suppress(*skip), damage_named(self.path, place), suppress(*absent):
-                    part = self.path.read(place, columns=schema.names)
-                    return _with_sketch(part) if "sketch" in schema.names else part
+                    return self.path.read(place, columns=schema.names)
                 return schema.empty_table()
 
             with ThreadPoolExecutor(READERS) as pool:
@@ -159,13 +158,7 @@ class StoreReader:
 
         reported = self._packed_ends(ingests)
         for one in ingests:
-            bare = with_ends(pa.table({}), reported.get(one.ingest_id))
-            if not reported.get(one.ingest_id):
-                path = f"{TRANSITIONS}/{own_path(one.recording_id, one.ingest_id)}"
-                # Of an older store they lie with its rows.
-                with damage_named(self.path, path), suppress(FileNotFoundError):
-                    bare = self.path.read_schema(path).empty_table()
-            ends = episode_ends(bare)
+            ends = episode_ends(with_ends(pa.table({}), reported.get(one.ingest_id)))
             if ends is not None:
                 yield one.recording_id, ends
 
@@ -191,7 +184,7 @@ class StoreReader:
         new = [one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES]
         # What cannot be read is another recording's, which `restock sql` reports.
         for reported in self.manifests(new, schema, skip=UNREADABLE).to_pylist():
-            hashes = read_sketch({SKETCH: (reported["sketch"] or "").encode()})
+            hashes = read_sketch(reported["sketch"] or "")
             sketch = Sketch(reported["recording_id"], reported["ingest_id"], hashes)
             _SKETCHES[self.path, sketch.ingest_id] = sketch
         keys = [(self.path, one.ingest_id) for one in ingests]
@@ -206,11 +199,3 @@ def frame_files(manifests: pa.Table) -> list[str]:
     """The files of `frames` that manifests name."""
     rows = manifests["cameras"].to_pylist() if "cameras" in manifests.column_names else []
     return sorted({camera["file"] for cameras in rows for camera in cameras or ()} - {""})
-
-
-def _with_sketch(manifests: pa.Table) -> pa.Table:
-    """Manifests of an earlier version have their sketch in their metadata."""
-    said = (manifests.schema.metadata or {}).get(SKETCH)
-    if said and "sketch" not in manifests.column_names:
-        manifests = manifests.append_column("sketch", pa.array([said.decode()] * len(manifests)))
-    return manifests

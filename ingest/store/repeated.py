@@ -4,7 +4,7 @@ Ids come from bytes, so a salvaged part, another cut or a drive that was replaye
 has another one. Rows are compared by what they hold. Beside each manifest lies a sketch of its
 recording, the smallest hashes of its rows (bottom-k, Broder 1997), so that an ingest reads the rows
 of those recordings alone that look alike. The audit `repeated_steps` finds the same in SQL, of all
-rows: by the hashes in the manifests, or where an older Restock wrote one, by the rows.
+rows.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from restock.arrays import Bools, Ints, splitmix64
 from restock.errors import StoreError
 
-SKETCH = b"restock.sketch"  # key in the metadata of a manifest
 SKETCH_HASHES = 256
 MIN_HASHES = 3  # that two recordings must share
 LARGELY = 0.5  # of the smaller recording's rows
@@ -77,14 +76,13 @@ class Sketch:
         return cls(recording_id, ingest_id, hashes[:SKETCH_HASHES])
 
 
-def sketch(hashes: Hashes) -> bytes:
-    """The sketch of a recording's `distinctive` hashes, for `SKETCH`."""
-    return hashes[:SKETCH_HASHES].astype("<u8").tobytes().hex().encode()
+def sketch(hashes: Hashes) -> str:
+    """Write the sketch of a recording's `distinctive` hashes as a manifest keeps it."""
+    return hashes[:SKETCH_HASHES].astype("<u8").tobytes().hex()
 
 
-def read_sketch(metadata: dict[bytes, bytes] | None) -> Hashes:
-    """Of a manifest's metadata; empty where older software wrote it."""
-    text = (metadata or {}).get(SKETCH, b"").decode()
+def read_sketch(text: str) -> Hashes:
+    """Read a manifest's sketch; "" gives none, as of a manifest that another tool wrote."""
     return np.frombuffer(bytes.fromhex(text), "<u8")
 
 

@@ -21,10 +21,8 @@ import numpy as np
 import pyarrow as pa
 
 from restock.ingest.store.repeated import distinctive, sketch
-from restock.ingest.task.schema import COLUMNS
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
-VERSION = 4  # of summary.sql: a summary by another one is not used
 # Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.
 STRETCH_ROWS = 8192
 # Tables whose rows are made of one episode's each, by queries of their names, and their order.
@@ -105,10 +103,9 @@ TABLES = {  # of summary.sql, and `distinctive_rows`; each a column
     ),
     "distinctive_rows": _rows_of(transition_id=_COUNT, content=_COUNT),
 }
-# Beside the columns of `recording_schema`; null in manifests of an older store.
+# Beside the columns of `recording_schema`.
 SUMMARY_SCHEMA = pa.schema(
     [
-        pa.field("summary_version", pa.int32()),
         pa.field("sketch", _TEXT),
         pa.field("packed_ends", _TEXT),
         *(pa.field(name, kind) for name, kind in TABLES.items()),
@@ -123,8 +120,7 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     manifest = manifest.set_column(place, manifest.schema.field(place), count)
     hashes, at = distinctive(rows)
     values: dict[str, Any] = {
-        "summary_version": VERSION,
-        "sketch": sketch(hashes).decode(),
+        "sketch": sketch(hashes),
         "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
     }
     in_order = np.argsort(at)
@@ -138,8 +134,9 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     }
     with _database().cursor() as connection:  # with temporary tables of its own
         connection.register("recordings", manifest)
-        rows = _complete(rows).rename_columns({"condition": "primary_condition"})  # as rows.sql
-        tables |= _of_episodes(connection, rows, custom=_has_custom_signals(manifest))
+        rows = rows.rename_columns({"condition": "primary_condition"})  # as rows.sql
+        custom = any(manifest["signals"].to_pylist())  # whether the profile has its own
+        tables |= _of_episodes(connection, rows, custom=custom)
         connection.register("transitions", rows.drop_columns(list(WIDE)))
         connection.execute(_definitions())
         tables |= {n: connection.table(n).to_arrow_table() for n in TABLES.keys() - tables.keys()}
@@ -151,19 +148,6 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
         )
         manifest = manifest.append_column(field, column)
     return manifest
-
-
-def _complete(rows: pa.Table) -> pa.Table:
-    """Rows with the columns that an older Restock did not write, null."""
-    for column in COLUMNS:
-        if column.name not in rows.schema.names:
-            rows = rows.append_column(column.name, pa.nulls(len(rows), column.type))
-    return rows
-
-
-def _has_custom_signals(manifest: pa.Table) -> bool:
-    """Whether its profile has signals of its own. An older Restock's has no such column."""
-    return "signals" in manifest.column_names and any(manifest["signals"].to_pylist())
 
 
 def _of_episodes(

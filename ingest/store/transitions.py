@@ -20,7 +20,6 @@ from restock.ingest.store.summary import ENDS, WIDE
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import (
-    COVERAGE,
     PROVENANCE,
     STEP_BITS,
     signal_columns,
@@ -29,8 +28,6 @@ from restock.ingest.task.schema import (
 )
 from restock.ingest.task.task import observe, reward
 
-# Columns that rows of an older store may lack.
-_LATER = {column.name: pa.field(column.name, column.type) for column in COVERAGE if column.nullable}
 _OF_ONE_VALUE = ("recording_id", *(column.name for column in PROVENANCE))
 _SECTORS = "sector_clearance_m"  # the one signal of many numbers a step
 
@@ -282,19 +279,12 @@ def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
 
 
 def replaced(rows: pa.Table, columns: Mapping[str, Any]) -> pa.Table:
-    """The table with other values in some columns; its metadata stays.
-
-    A column that rows of an older store do not have comes last.
-    """
+    """Return the table with other values in some columns, and its metadata."""
     metadata = rows.schema.metadata
     for name, values in columns.items():
         index = rows.schema.get_field_index(name)
-        if index < 0:
-            field = _LATER[name]
-            rows = rows.append_column(field, column_array(values, field.type, len(rows)))
-        else:
-            field = rows.schema.field(index)
-            rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
+        field = rows.schema.field(index)
+        rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
     return rows.replace_schema_metadata(metadata)
 
 

@@ -4,6 +4,8 @@ A version is a number, or the moment whose newest version it was. Every commit t
 version of its transitions table; older ones stay readable for as long as the files they need are
 kept (`RETENTION_HOURS` after they were replaced).
 
+The description of a table says which format of the store it has: this Restock reads FORMAT alone.
+
 Other tools may set features that change what a file's rows mean (deletion vectors, column mapping),
 or that every writer must follow (constraints, change feeds). Delta's library opens some of these
 tables, while Restock reads the Parquet files themselves: a feature that is not known here is
@@ -26,6 +28,8 @@ from restock.errors import StoreError
 from restock.files import first_line
 
 Version = int | datetime
+# The description of its tables. Raise it when columns, their meaning or the summaries change.
+FORMAT = "restock-store/2"
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
 LOG = "_delta_log"  # of a table, its folder
 _LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
@@ -221,6 +225,17 @@ _REMOVE = (
 _AGAIN = "ingest the recordings into a new store"
 _EARLIER = f"name a version from before with --version, or {_AGAIN}"
 _UNSUPPORTED = re.compile(r"Feature '([^']+)' is not supported")  # Delta's library
+
+
+def expect_format(table: DeltaTable, *, where: str) -> None:
+    """Raise StoreError if another version of Restock, or another tool, made a store's table."""
+    found = table.metadata().description
+    if found != FORMAT:
+        raise StoreError(
+            f"the format of this store is {found or 'not known'}; this Restock reads {FORMAT}",
+            where=where,
+            remedy="make a new store of its recordings: `restock ingest RECORDINGS --store NEW`",
+        )
 
 
 def expect_readable(table: DeltaTable, *, where: str) -> None:

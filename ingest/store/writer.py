@@ -35,7 +35,6 @@ from restock.ingest.store.reader import frame_files
 from restock.ingest.store.repeated import UNREADABLE, Hashes, RepeatedDrive, Sketch, find_repeat
 from restock.ingest.store.summary import summarised
 from restock.ingest.task.schema import frame_schema
-from restock.ingest.task.signals import LIDAR_SIGNALS
 
 # Files that no version of a table needs are kept this long: a writer may be about to commit them,
 # and a reader that opened an older version may be about to read them.
@@ -52,7 +51,6 @@ class Staged:
     manifest: AddedFile
     rows: AddedFile  # of `transitions`
     columns: pa.Schema  # of `transitions`
-    nulls: Sequence[str]  # signals that a robot without a lidar has not
     contents: Hashes  # of its distinctive rows, (N,) ascending
     instead_of: str | None = None  # the ingest that was read to make it, if one was
 
@@ -77,7 +75,6 @@ class StoreWriter(TableCommits):
 
         `period_s` is the control period: rows further apart than half of it do not count. Those
         `ahead` of it are looked at as if they were in the store, ingests `aside` are not.
-        Recordings that older software wrote are not looked at; the audit `repeated_steps` does.
         """
         shown = self.shown() if self.path.has_table(TRANSITIONS) else []
         others = [one for one in shown if one.ingest_id not in aside]
@@ -166,14 +163,12 @@ class StoreWriter(TableCommits):
             self._reached = True
         ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()
         manifest = summarised(manifest, rows)
-        nulls = [name for name in sorted(LIDAR_SIGNALS) if name in rows.column_names]
         contents = manifest["distinctive_rows"].combine_chunks().flatten().field("content")
         staged = Staged(
             *ids,
             AddedFile(ids[0], own_path(*ids), len(manifest)),
             AddedFile(ids[0], own_path(*ids), len(rows)),
             delta_columns(rows.schema).remove_metadata(),
-            [name for name in nulls if rows[name].null_count],
             np.sort(contents.to_numpy().view(np.uint64)),
             instead_of,
         )
@@ -234,7 +229,6 @@ class StoreWriter(TableCommits):
                 self.create(RECORDINGS, recording_columns())
                 self.create(TRANSITIONS, one.columns)
                 self._fitting.append(one.columns)
-        self.allow_nulls({name for one in staged for name in one.nulls})
 
     def discard(self, staged: Sequence[Staged]) -> None:
         """Delete the files of recordings whose commit has not begun, with their frames."""

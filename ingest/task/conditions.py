@@ -134,12 +134,12 @@ def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:
 
 
 def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """Read a kind's conditions from a manifest row; one of an older Restock has no exposures.
+    """Read the conditions of a kind of a manifest row.
 
     Raises:
         msgspec.MsgspecError: a newer Restock wrote them.
     """
-    text = manifest.get("conditions_json" if kind == "outcome" else "exposures_json") or "[]"
+    text = manifest["conditions_json" if kind == "outcome" else "exposures_json"]
     read = msgspec.json.decode(text, type=list[Condition], strict=False)
     return [msgspec.structs.replace(condition, kind=kind) for condition in read]
 

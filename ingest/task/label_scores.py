@@ -186,9 +186,7 @@ def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[
 
 
 def exposures_named(rows: pa.Table) -> list[str]:
-    """Return the exposures that labels or truth of rows name, sorted; none in older rows."""
-    if not {"exposures", "true_exposure"} <= set(rows.column_names):
-        return []
+    """Return the exposures that labels or truth of rows name, sorted."""
     labelled = set(rows["exposures"].combine_chunks().flatten().unique().to_pylist())
     true = rows["true_exposure"].unique().to_pylist()
     return sorted(labelled.union(*(true_names(text) for text in true if text is not None)))

@@ -74,22 +74,17 @@ COVERAGE: tuple[Column, ...] = (
     Column(
         "probabilities",
         pa.map_(pa.string(), pa.float32()),
-        "probability of each condition that has a rule for it; null: from a Restock without such "
-        "rules",
-        nullable=True,
+        "probability of each condition that has a rule for it",
     ),
     Column(
         "uncertain",
         pa.list_(pa.string()),
-        "conditions that are uncertain by their probability; null: from a Restock without such "
-        "rules",
-        nullable=True,
+        "conditions that are uncertain by their probability",
     ),
     Column(
         "exposures",
         pa.list_(pa.string()),
-        "all exposures that hold, whatever the condition; null: from a Restock without exposures",
-        nullable=True,
+        "all exposures that hold, whatever the condition",
     ),
     Column(
         "true_exposure",
@@ -120,8 +115,7 @@ COVERAGE: tuple[Column, ...] = (
     Column(
         "goal_source",
         pa.string(),
-        "logged: a recorded goal; hindsight: where the robot arrived; null: no goal, or an older "
-        "row",
+        "logged: a recorded goal; hindsight: where the robot arrived; null: no goal",
         nullable=True,
     ),
 )
@@ -222,8 +216,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     Column(
         "tags",
         pa.map_(pa.string(), pa.string()),
-        "robot, site, … and any other tag; null: from a Restock without tags",
-        nullable=True,
+        "robot, site, … and any other tag",
     ),
     Column("ticks", pa.int64(), "number of ticks of the control clock = transitions + "
         "episode_ends + drops"),
@@ -260,8 +253,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             agreed=pa.int64(), event_labelled=pa.int64(), event_right=pa.int64(),
             event_support=pa.int64(), event_found=pa.int64(),
         ),
-        "the counts behind those scores, in steps and events; null: from a Restock without events",
-        nullable=True,
+        "the counts behind those scores, in steps and events",
     ),
     Column(
         "clocks",
@@ -272,7 +264,6 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             zero_stamps=pa.int64(), off_clock=pa.int64(), restamped=pa.int64(),
         ),
         "per topic that was read: log time against header stamp, and irregular stamps",
-        nullable=True,
     ),
     Column(
         "findings",
@@ -281,8 +272,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             cause=pa.string(), remedy=pa.string(), repaired=pa.bool_(),
         ),
         "topics that contradict the rest of the recording: how far, in how many steps, the likely "
-        "cause, what to do; null: from a Restock without this check",
-        nullable=True,
+        "cause, what to do",
     ),
     Column(
         "signals",
@@ -293,7 +283,6 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         ),
         "custom signals: unit and source, number of messages, messages with a value, steps with a "
         "value",
-        nullable=True,
     ),
     Column(
         "cameras",
@@ -305,16 +294,14 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         ),
         "per camera: messages expected and decoded; frames kept, thinned out (max_hz) and unused "
         "(in"
-        " force at no step); problems; steps with a frame; null: from an older Restock",
-        nullable=True,
+        " force at no step); problems; steps with a frame",
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, sql, …, as JSON"),
     Column(
         "exposures_json",
         pa.string(),
-        "the exposures, as in conditions_json; null: from a Restock without exposures",
-        nullable=True,
+        "the exposures, as in conditions_json",
     ),
     Column(
         "unknown_conditions",
@@ -322,15 +309,12 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             condition=pa.string(), kind=pa.string(), signals=pa.list_(pa.string()),
             because=pa.string(),
         ),
-        "conditions and exposures that are unknown in all its rows; null: from an older Restock",
-        nullable=True,
+        "conditions and exposures that are unknown in all its rows",
     ),
     Column(
         "uncertain_conditions",
         pa.list_(pa.string()),
-        "conditions and exposures whose labels rest on an outline that is a guess; null: from an "
-        "older Restock",
-        nullable=True,
+        "conditions and exposures whose labels rest on an outline that is a guess",
     ),
     Column(
         "corrections",
@@ -339,12 +323,9 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             first_ns=pa.int64(), last_ns=pa.int64(), given_at=pa.timestamp("us", "UTC"),
             rows=pa.int64(),
         ),
-        "corrections of its labels by people, see the view; null: from a Restock without "
-        "corrections",
-        nullable=True,
+        "corrections of its labels by people, see the view",
     ),
-    Column("profile_toml", pa.string(), "the profile, including the SQL of its "
-        "files", nullable=True),
+    Column("profile_toml", pa.string(), "the profile, including the SQL of its files"),
 )  # fmt: skip
 
 # One row a frame of a camera that is in force at a step: `frames/` of a store.
@@ -391,43 +372,3 @@ def recording_schema() -> pa.Schema:
     return pa.schema(
         [pa.field(column.name, column.type, column.nullable) for column in RECORDING_COLUMNS]
     )
-
-
-_DUCKDB_TYPES = {
-    pa.int16(): "SMALLINT",
-    pa.int32(): "INTEGER",
-    pa.int64(): "BIGINT",
-    pa.float32(): "FLOAT",
-    pa.float64(): "DOUBLE",
-    pa.bool_(): "BOOLEAN",
-    pa.string(): "VARCHAR",
-    pa.binary(): "BLOB",
-    pa.timestamp("us", "UTC"): "TIMESTAMPTZ",
-}
-
-
-def duckdb_type(kind: pa.DataType) -> str:
-    """Return DuckDB's name of the type of a column."""
-    if pa.types.is_map(kind):
-        return f"MAP({duckdb_type(kind.key_type)}, {duckdb_type(kind.item_type)})"
-    if pa.types.is_list(kind):
-        return f"{duckdb_type(kind.value_type)}[]"
-    if pa.types.is_struct(kind):
-        fields = ", ".join(f'"{field.name}" {duckdb_type(field.type)}' for field in kind)
-        return f"STRUCT({fields})"
-    return _DUCKDB_TYPES[kind]
-
-
-def with_columns(sql: str) -> str:
-    """Fill in `/* nulls: transitions */` and `/* nulls: recordings */` in SQL.
-
-    Each becomes a select list of null for each nullable column of that table.
-    """
-    for table, columns in (("transitions", COLUMNS), ("recordings", RECORDING_COLUMNS)):
-        nulls = ", ".join(
-            f"NULL::{duckdb_type(column.type)} AS {column.name}"
-            for column in columns
-            if column.nullable
-        )
-        sql = sql.replace(f"/* nulls: {table} */", nulls)
-    return sql

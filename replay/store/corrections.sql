@@ -1,5 +1,4 @@
--- What people said of labels, one row a correction: a view over `recordings`. Recordings of an older
--- store have none.
+-- What people said of labels, one row a correction: a view over `recordings`.
 CREATE OR REPLACE VIEW corrections AS
 SELECT
     recording_id,
@@ -15,15 +14,6 @@ SELECT
     said.given_at AS given_at
 FROM (
     SELECT recording_id, source_file, unnest(corrections) AS said
-    FROM (
-        FROM recordings
-        UNION ALL BY NAME
-        SELECT
-            NULL::STRUCT(
-                condition VARCHAR, "value" BOOLEAN, episode_index BIGINT, first_ns BIGINT,
-                last_ns BIGINT, given_at TIMESTAMPTZ, "rows" BIGINT
-            )[] AS corrections
-        WHERE false
-    )
+    FROM recordings
 )
 ORDER BY source_file, first_ns, condition;

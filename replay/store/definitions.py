@@ -19,12 +19,7 @@ import duckdb
 import pyarrow as pa
 
 from restock.ingest.store.summary import with_included
-from restock.ingest.task.schema import (
-    COLUMNS,
-    FRAME_COLUMNS,
-    RECORDING_COLUMNS,
-    with_columns,
-)
+from restock.ingest.task.schema import COLUMNS, FRAME_COLUMNS, RECORDING_COLUMNS
 from restock.interrupts import was_interrupted
 from restock.replay.store.same_drives import install_same_drives
 
@@ -355,7 +350,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
     """Return the text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    whole = with_columns(with_included("\n".join(text), folder))
+    whole = with_included("\n".join(text), folder)
     return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 

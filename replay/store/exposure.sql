@@ -1,6 +1,5 @@
 -- Exposures: the situations that rows were in, whatever came of them, beside their conditions. Views
--- over `recordings`, `transitions` and `episodes`. Rows of an older store have no
--- exposures: there they are null, and count as in none.
+-- over `recordings`, `transitions` and `episodes`.
 
 -- The exposures that are told of the store's rows, of the newest ingest.
 CREATE OR REPLACE VIEW exposures AS

@@ -1,8 +1,7 @@
 -- How good the labels are, where a simulator knew the true conditions: views over `recordings` and
 -- `transitions`.
 
--- Each recording's scores, by step and by event. Where the manifest is older than its counts, the
--- steps that both have follow from the precision, and nothing is known of events.
+-- Each recording's scores, by step and by event.
 CREATE OR REPLACE VIEW label_scores AS
 SELECT
     scores.recording_id,
@@ -11,7 +10,7 @@ SELECT
     scores.recall,
     scores.labelled,
     scores.support,
-    coalesce(counts.agreed, CAST(round(scores.precision * scores.labelled) AS BIGINT), 0) AS agreed,
+    coalesce(counts.agreed, 0) AS agreed,
     counts.known,
     counts.event_right / nullif(counts.event_labelled, 0) AS event_precision,
     counts.event_found / nullif(counts.event_support, 0) AS event_recall,

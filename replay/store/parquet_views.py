@@ -281,15 +281,14 @@ def manifest_tables(
 ) -> tuple[StoredTable, StoredTable]:
     """Return two tables of these transition files' manifests: without summaries, and summaries.
 
-    They are `stored_recordings`, which keeps the version of the summary, and `stored_summaries`.
+    They are `stored_recordings` and `stored_summaries`.
     """
     paths = _manifests(place, recordings, held)
     columns = pa.schema(recordings.schema().to_arrow())
     reported = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
-    brief = pa.schema([*reported, SUMMARY_SCHEMA.field("summary_version")])
     kept = [columns.field("ingest_id"), *(one for one in SUMMARY_SCHEMA if one.name in TABLES)]
     return (
-        StoredTable(place, "stored_recordings", RECORDINGS, brief, paths),
+        StoredTable(place, "stored_recordings", RECORDINGS, pa.schema(reported), paths),
         StoredTable(place, "stored_summaries", RECORDINGS, pa.schema(kept), paths),
     )
 

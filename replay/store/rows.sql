@@ -1,6 +1,5 @@
 -- The two tables of a store as views, over stored_transitions and stored_recordings (its Parquet as
--- it lies, or that of several stores): all other views are of these. A nullable column that no row has
--- yet is null: the list is rendered from `ingest/task/schema.py`.
+-- it lies, or that of several stores): all other views are of these.
 
 -- A recording's manifest row is committed before its transitions: an ingest that was cut between
 -- the two is in stored_recordings and in no view.
@@ -16,12 +15,7 @@ SELECT
     make_timestamp(end_stamp_ns // 1000) AS end_stamp_time,
     make_timestamp((start_stamp_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_start_time,
     make_timestamp((end_stamp_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_end_time
-FROM (
-    FROM stored_recordings
-    UNION ALL BY NAME
-    SELECT /* nulls: recordings */
-    WHERE false
-)
+FROM stored_recordings
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
 -- Stamps can be a simulator's, which begin at zero: logged_ns is the same moment by log time. What the
@@ -44,12 +38,7 @@ SELECT
     told.map AS map,
     told.shift AS shift,
     told.tags AS tags
-FROM (
-    FROM stored_transitions
-    UNION ALL BY NAME
-    SELECT /* nulls: transitions */
-    WHERE false
-) AS stored
+FROM stored_transitions AS stored
 JOIN (
     SELECT
         ingest_id,
@@ -60,10 +49,5 @@ JOIN (
         tags['map'] AS map,
         tags['shift'] AS shift,
         tags
-    FROM (
-        FROM stored_recordings
-        UNION ALL BY NAME
-        SELECT /* nulls: recordings */
-        WHERE false
-    )
+    FROM stored_recordings
 ) AS told USING (ingest_id);

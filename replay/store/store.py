@@ -32,7 +32,6 @@ from restock.ingest.store.lineage import (
 )
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import StoreReader, frame_files
-from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
 from restock.ingest.store.version import Version
 from restock.ingest.store.writer import RETENTION_HOURS
 from restock.ingest.task.conditions import NOMINAL, Condition
@@ -58,7 +57,7 @@ class StoredProfile(NamedTuple):
 
     name: str
     hash: str
-    toml: str  # "" where an older Restock wrote them
+    toml: str
 
 
 class Store:
@@ -227,7 +226,7 @@ class Store:
         rows = self.sql(
             "SELECT exposures_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
-        found = self._decode(rows[0][0] or "[]", list[Condition], "exposures") if rows else []
+        found = self._decode(rows[0][0], list[Condition], "exposures") if rows else []
         return tuple(msgspec.structs.replace(one, kind="exposure") for one in found)
 
     def profile_name(self, task_hash: str) -> str:
@@ -265,7 +264,7 @@ class Store:
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
         """Yield the id of each recording with a table of its episodes' ends, one row each.
 
-        Without `recordings` these are all recordings. Older stores have no such ends.
+        Without `recordings` these are all recordings.
         """
         held = [
             Ingest(one["recording_id"], one["ingest_id"], one["rows"])
@@ -338,16 +337,13 @@ class Store:
         return sorted(changed)
 
     def _present_summaries(self) -> bool:
-        """Create `stored_summaries` if it covers all rows; return whether it does.
+        """Create `stored_summaries` and return True, unless another tool changed rows.
 
-        It does if every manifest has a summary and no other tool changed rows. If not, rows are
-        scanned.
+        If one did, rows are scanned.
         """
-        versions = self._manifests["summary_version"].to_pylist()
-        reported = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
-        summarised = {ingest_id for ingest_id, version in reported if version == SUMMARY_VERSION}
+        manifests = set(self._manifests["ingest_id"].to_pylist())
         held = self._ingests["ingest_id"].to_pylist()
-        if not held or self.changed_by_others or not summarised.issuperset(held):
+        if not held or self.changed_by_others or not manifests.issuperset(held):
             return False
         self._summaries.present(self.bare)
         return True
@@ -364,9 +360,8 @@ class Store:
 
         Manifests are held in memory; transitions on S3 are read at each query.
         """
-        manifests = self._manifests.drop_columns(["summary_version"])
         register(connection, "stored_ingests", self._ingests, schema=schema)
-        register(connection, self._recordings.view, manifests, schema=schema)
+        register(connection, self._recordings.view, self._manifests, schema=schema)
         try:
             self._transitions.present(connection, schema=schema)
         except StoreError as error:
@@ -408,10 +403,9 @@ def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[S
 
     The connection must have a view `recordings`.
     """
-    # Recordings of an older store carry no text: null.
     rows = connection.execute(
-        "SELECT profile, profile_hash, arg_max(coalesce(profile_toml, ''), ingested_at)"
-        " FROM (FROM recordings UNION ALL BY NAME SELECT NULL::VARCHAR AS profile_toml WHERE false)"
+        "SELECT profile, profile_hash, arg_max(profile_toml, ingested_at)"
+        " FROM recordings"
         " WHERE task_hash = ? AND profile <> ''"
         " GROUP BY profile, profile_hash ORDER BY max(ingested_at) DESC, profile_hash",
         [task_hash],

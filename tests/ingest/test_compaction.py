@@ -9,11 +9,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from deltalake import DeltaTable, write_deltalake
+from deltalake import DeltaTable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.long import one_in
-from support.stores import manifest, one, shown, views_over
+from support.stores import manifest, one, shown, views_over, write_store
 
 from restock.cli import main
 from restock.errors import StoreError
@@ -229,21 +229,6 @@ def test_a_replacing_ingest_is_not_undone_by_a_compaction_that_was_faster(tmp_pa
     same_as_scanned(tmp_path / "s")
 
 
-def test_a_store_of_an_older_restock_gets_its_summaries(tmp_path):
-    for name, tables in zip(
-        (RECORDINGS, TRANSITIONS), zip(one(1), one(2), strict=True), strict=True
-    ):
-        for table in tables:
-            write_deltalake(str(tmp_path / "s" / name), table, mode="append")
-    with Store(tmp_path / "s") as store:
-        assert "cells" not in str(store.sql("EXPLAIN FROM coverage").fetchall())
-        before = rounded(store.sql("FROM coverage"))
-    assert compact(StoreWriter(tmp_path / "s")).summaries == 2
-    with Store(tmp_path / "s") as store:
-        assert rounded(store.sql("FROM coverage")) == before
-    same_as_scanned(tmp_path / "s")
-
-
 steps = st.lists(
     st.tuples(st.sampled_from(["ingest", "compact", "fold", "clean"]), st.integers(1, 3)),
     min_size=2,
@@ -446,11 +431,7 @@ def test_what_the_command_says(tmp_path, capsys):
 
 
 def test_a_dry_run_tells_of_summaries_what_the_run_does(tmp_path):
-    for name, tables in zip(
-        (RECORDINGS, TRANSITIONS), zip(one(1), one(2), strict=True), strict=True
-    ):
-        for table in tables:
-            write_deltalake(str(tmp_path / "s" / name), table, mode="append")
+    write_store(tmp_path / "s", [one(1)[1], one(2)[1]])
     planned = compact(StoreWriter(tmp_path / "s"), dry_run=True)
     done = compact(StoreWriter(tmp_path / "s"))
     done.version = None

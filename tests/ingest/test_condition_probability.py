@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pyarrow as pa
 import pytest
 from support.profile_texts import WAREHOUSE
-from support.stores import manifest, recording_transitions
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import parse_profile, profile_toml, read_profile_toml
-from restock.ingest.relabel import relabel_store
-from restock.ingest.store.episode_rows import ENDS, packed
-from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.condition_files import settings_of, shipped
 from restock.ingest.task.conditions import (
     Condition,
@@ -23,9 +17,8 @@ from restock.ingest.task.conditions import (
     probabilities,
     too_near_to_call,
 )
-from restock.ingest.task.schema import COVERAGE, steps_schema
+from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.signals import Noise
-from restock.replay.store.store import Store
 
 FILE = """-- Fast, for a while.
 -- timing: pre
@@ -129,28 +122,6 @@ def test_noise_of_a_profile_does_not_change_rows():
     assert shipped(noisy.constants)["near_collision"] == near
     with pytest.raises(ConfigError, match="lidar_m"):
         parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0\n", where="c")
-
-
-def test_old_rows_get_probabilities_when_relabelled(tmp_path: Path):
-    rows = recording_transitions(1)
-    later = [column.name for column in COVERAGE if column.name in ("probabilities", "uncertain")]
-    names = [field.name for field in steps_schema()]
-    ends = rows.select([name for name in names if name in rows.column_names]).slice(0, 1)
-    old = rows.drop_columns(later).replace_schema_metadata({ENDS: packed(ends)})
-    writer = StoreWriter(tmp_path / "s")
-    writer.write(manifest(rows).drop_columns(["label_counts"]), old)
-    query = "SELECT count(probabilities), count(uncertain), count(*) FROM transitions"
-    with Store(tmp_path / "s") as store:
-        assert store.sql(query).fetchall() == [(0, 0, len(rows))]
-    # One more that never holds: the labels are of another version.
-    conditions = [*shipped().values(), Condition("never", "pre", "false")]
-    relabel_store(StoreWriter(tmp_path / "s"), lambda name: conditions)
-    with Store(tmp_path / "s") as store:
-        assert store.sql(query).fetchall() == [(len(rows), len(rows), len(rows))]
-        ((reported,),) = store.sql(
-            "SELECT map_keys(probabilities) FROM transitions LIMIT 1"
-        ).fetchall()
-        assert set(reported) <= set(shipped())
 
 
 OWN = '''

@@ -9,14 +9,13 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
 from support.panels import panel_of
 from support.profile_texts import WAREHOUSE
-from support.stores import CONDITIONS, one, recording_transitions
+from support.stores import one
 
 from restock.cli import main
 from restock.errors import StoreError
@@ -31,7 +30,6 @@ from restock.ingest.store.corrections import (
     Correction,
     Moments,
     corrected_version,
-    lay_over,
     merged,
 )
 from restock.ingest.store.writer import StoreWriter
@@ -187,19 +185,6 @@ def test_condition_conditions_probabilities_and_uncertain_follow(tmp_path: Path)
 def writer_key(writer: StoreWriter) -> tuple[str, str]:
     row = writer.live().to_pylist()[0]
     return row["recording_id"], row["ingest_id"]
-
-
-def test_rows_of_an_older_store_have_no_probability_and_get_none() -> None:
-    rows = recording_transitions(1)
-    for name in ("probabilities", "uncertain"):
-        place = rows.schema.get_field_index(name)
-        rows = rows.set_column(
-            place, rows.schema.field(place), pa.nulls(len(rows), rows[name].type)
-        )
-    stamp = rows["stamp_ns"][0].as_py()
-    after, _ = lay_over(rows, [Correction("recovery", True, 0, stamp, stamp, NOW)], CONDITIONS, 0)
-    assert "recovery" in after["conditions"][0].as_py()
-    assert after["probabilities"].null_count == after["uncertain"].null_count == len(rows)
 
 
 STRETCHES = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 6), st.booleans()), max_size=5)

@@ -194,7 +194,7 @@ def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
 
 
 def test_files_without_checksums_are_read_as_before(tmp_path, monkeypatch):
-    """Those of an older Restock."""
+    """Another tool may write them."""
     options = data_files.parquet_options
     without = {"write_page_checksum": False}
     for module in (data_files, writer_module, compaction):

@@ -18,8 +18,6 @@ from restock.ingest.profile.profile import (
     profile_toml,
     read_profile_toml,
 )
-from restock.ingest.store.episode_rows import ENDS, episode_ends, packed
-from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Condition, label, labels_version, primary
 from restock.ingest.task.label_scores import label_scores
@@ -170,44 +168,6 @@ def test_changed_exposures_are_told_again_from_the_store(store, profile):
             " WHERE len(exposures) > 0"
         ).fetchall() == [(True, "nominal")]
         assert "2.2" in opened.exposures()[-1].sql
-
-
-def test_a_store_from_before_exposures_opens_and_says_null(store, profile, capsys):
-    """And is labelled again without those whose signals it does not have."""
-    store = _before_exposures(store, store.parent / "older")
-    with Store(store) as opened:
-        assert opened.exposures() == ()
-        assert opened.sql("SELECT DISTINCT exposures FROM transitions").fetchall() == [(None,)]
-        assert opened.sql("FROM coverage_by_exposure").fetchall() == []
-    # A condition is not left out so: the recordings have to be read again for its signals.
-    assert main(["store", "label", str(store), "--profile", str(profile)]) == 2
-    assert "ingest the recordings again" in capsys.readouterr().err
-    profile.write_text(profile.read_text().replace(', "blocked_aisle"]', "]"))
-    assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
-    with Store(store) as opened:
-        held = opened.sql("SELECT DISTINCT unnest(exposures) FROM transitions").fetchall()
-        assert held == [("far_out",)]
-
-
-def _before_exposures(store: Path, out: Path) -> Path:
-    """Return the same store as it was written before there were exposures."""
-    signals = {"came_nearer_m", "plan_return_m", "plan_gap_m"}
-    gone = signals | {"exposures", "true_exposure", "exposures_json"}
-
-    def older(table: pa.Table) -> pa.Table:
-        return table.drop_columns([name for name in table.column_names if name in gone])
-
-    manifest = StoreWriter(store).live()
-    row = manifest.to_pylist()[0]
-    rows = StoreWriter(store).rows(row["recording_id"], row["ingest_id"])
-    ends = episode_ends(rows)
-    assert ends is not None
-    version = manifest.column_names.index("labels_version")
-    manifest = manifest.set_column(version, "labels_version", pa.array(["before"]))
-    StoreWriter(out).write(
-        older(manifest), older(rows).replace_schema_metadata({ENDS: packed(older(ends))})
-    )
-    return out
 
 
 def test_exposures_are_scored_against_their_own_truth():

@@ -51,6 +51,8 @@ def test_a_row_of_several_conditions_is_scored_for_each():
             "condition": ["recovery", "near_collision", "nominal", "near_collision"],
             "conditions": [["near_collision", "recovery"], ["near_collision"], [], None],
             "true_condition": ["near_collision,recovery", "nominal", "near_collision", None],
+            "exposures": pa.array([[]] * 4, pa.list_(pa.string())),
+            "true_exposure": pa.nulls(4, pa.string()),
         }
     )
     near, after = label_scores(rows, ["near_collision", "recovery"], 0.2)

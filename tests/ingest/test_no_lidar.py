@@ -270,23 +270,6 @@ def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path, capsys
     assert rows["near_collision"]["rows_held"] is None
 
 
-def test_rows_of_an_older_restock_are_named_by_the_audit(blind, tmp_path):
-    """It took every way for free where there was no scan, and its manifests say so alone."""
-    from support.stores import recording_transitions, write_store
-
-    write_store(tmp_path / "old", [recording_transitions(1)])
-    with Store(tmp_path / "old") as store:
-        connection = store.connection
-        connection.execute(
-            "CREATE OR REPLACE TEMP TABLE recordings AS SELECT * REPLACE (NULL AS"
-            " unknown_conditions, [{'input': 'scan', 'instead': 'free'}] AS stand_ins)"
-            " FROM recordings"
-        )
-        audit = [one for one in shipped_audits() if one.name == "unknown_conditions"]
-        (finding,) = run_audits(connection, audit, {})
-    assert "an older Restock" in finding.sample[0]["because"]
-
-
 HUSKY = ROOT.parent / "shared" / "bags" / "sim-time-husky"
 
 

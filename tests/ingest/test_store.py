@@ -212,20 +212,26 @@ def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
     assert DeltaTable(str(tmp_path / "s" / "transitions")).version() == version
 
 
+def with_payload(recording: int) -> tuple[pa.Table, pa.Table]:
+    """A recording with a signal of its profile's own."""
+    manifest, rows = one(recording)
+    return manifest, rows.append_column("payload_kg", pa.array([3.0] * len(rows)))
+
+
 def test_columns_that_two_writers_add_at_once_are_added_once(tmp_path, monkeypatch):
-    path, (manifest, rows) = tmp_path / "s", one(1)
-    StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1))
     open_table = Location.open_table
 
     def overtaken(self, name, *rest):
         table = open_table(self, name, *rest)
         if name == TRANSITIONS:
             monkeypatch.undo()
-            StoreWriter(path).write(*one(2))
+            StoreWriter(path).write(*with_payload(2))
         return table
 
     monkeypatch.setattr(Location, "open_table", overtaken)
-    StoreWriter(path).write(*one(3))
+    StoreWriter(path).write(*with_payload(3))
     assert len(shown(path)) == 3
 
 
@@ -281,12 +287,12 @@ def test_a_writer_overtaken_by_another_of_the_same_recording_loses_nothing(tmp_p
 
 
 def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
-    path, (manifest, rows) = tmp_path / "s", one(1)
-    StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
-    StoreWriter(path).write(*one(2))
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1))
+    StoreWriter(path).write(*with_payload(2))
     with Store(path) as store:
         found = store.sql(
-            "SELECT recording_id[-1:] AS r, count(zone) > 0 FROM stored_transitions"
+            "SELECT recording_id[-1:] AS r, count(payload_kg) > 0 FROM stored_transitions"
             " GROUP BY ALL ORDER BY ALL"
         ).fetchall()
     assert found == [("1", False), ("2", True)]

@@ -6,12 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pytest
-from deltalake import write_deltalake
 from support.driven_robot import Drive, write_bag
 from support.profile_texts import WAREHOUSE
-from support.stores import manifest, recording_transitions
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -124,31 +121,3 @@ def test_a_wrong_tag_writes_nothing(bag, tmp_path, capsys):
     assert ingest(bag, tmp_path / "store", "--tag", "robot") == 2
     assert "such as --tag robot=amr-07" in capsys.readouterr().err
     assert not (tmp_path / "store").exists()
-
-
-def without_tags(transitions: pa.Table) -> pa.Table:
-    return manifest(transitions).drop_columns(["tags"])
-
-
-def test_a_store_from_before_there_were_tags(tmp_path):
-    """Opens with null; gets them by the next ingest, beside recordings that have none."""
-    path = tmp_path / "store"
-    for number in (1, 2):
-        rows = recording_transitions(number)
-        write_deltalake(str(path / "recordings"), without_tags(rows), mode="append")
-        write_deltalake(str(path / "transitions"), rows, mode="append")
-    for view in ("recordings", "transitions", "episodes"):
-        assert requested(path, f"SELECT DISTINCT robot, tags FROM {view}") == [(None, None)]
-    newer = without_tags(recording_transitions(3))
-    entry = pa.array([{"robot": "amr-07"}], pa.map_(pa.string(), pa.string()))
-    write_deltalake(
-        str(path / "recordings"),
-        newer.append_column("tags", entry),
-        mode="append",
-        schema_mode="merge",
-    )
-    write_deltalake(str(path / "transitions"), recording_transitions(3), mode="append")
-    assert sorted(requested(path, "SELECT DISTINCT robot FROM episodes"), key=str) == [
-        ("amr-07",),
-        (None,),
-    ]

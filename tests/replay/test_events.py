@@ -16,6 +16,7 @@ from support.stores import START_NS, TASK, manifest, recording_transitions, writ
 
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.version import FORMAT
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
 from restock.replay.store.store import Store
@@ -181,8 +182,8 @@ def write_case(path: Path, number: int, case: Case, policies: str = "") -> None:
     for name, column in values.items():
         table = replaced(table, name, column)
     row = replaced(manifest(table), "end_stamp_ns", [int(stamps[-1] + case.more_s * 1e9)])
-    write_deltalake(str(path / "recordings"), row, mode="append")
-    write_deltalake(str(path / "transitions"), table, mode="append")
+    write_deltalake(str(path / "recordings"), row, mode="append", description=FORMAT)
+    write_deltalake(str(path / "transitions"), table, mode="append", description=FORMAT)
 
 
 def replaced(table: pa.Table, name: str, values: object) -> pa.Table:

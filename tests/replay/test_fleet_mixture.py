@@ -147,7 +147,6 @@ def test_one_robot_cannot_be_split(tmp_path):
 
 
 def test_stores_of_two_fleets_are_one_fleet_in_a_mixture(fleet, tmp_path):
-    """Also where one of them is from before there were tags."""
     other = write_store(tmp_path / "other", [recording_transitions(9)], tags=[{"robot": "z"}])
     text = f"[sources]\nlogs = 0.5\n[[sources.stores]]\nname = 'z'\npath = '{other}'\nshare = 0.3\n"
     panel = panel_of(fleet, text + NO_SPLIT + EVERY, tmp_path / "panel")

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from support.stores import manifest, recording_transitions, write_store
+from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import QueryError
-from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.label_quality import label_quality
 from restock.replay.store.store import Store
 
@@ -74,22 +73,3 @@ def test_a_store_without_truth_has_nothing_to_score(
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     assert main(["store", "label", str(path), "--score"]) == 0
     assert "nothing to score" in capsys.readouterr().out
-
-
-def test_scores_of_recordings_older_than_events_are_read(tmp_path: Path) -> None:
-    """The manifest has ratios only: the views give steps, and null for events."""
-    writer = StoreWriter(tmp_path / "store")
-    rows = recording_transitions(1)
-    old = manifest(rows)
-    at = old.column_names.index("label_counts")
-    old = old.set_column(at, old.schema.field(at), pa.nulls(1, old.schema.types[at]))
-    writer.write(old, rows)
-    writer.write(manifest(recording_transitions(2)), recording_transitions(2))
-    with Store(tmp_path / "store") as opened:
-        first, second = opened.sql(
-            "SELECT agreed, event_recall FROM label_scores ORDER BY recording_id"
-        ).fetchall()
-        pooled = opened.sql("SELECT labelled, event_support FROM pooled_label_scores").fetchall()
-    assert first == (32, None)
-    assert second == (32, 0.5)
-    assert pooled == [(72, 6)]

@@ -20,6 +20,7 @@ import restock
 from restock.cli import main
 from restock.errors import QueryError, StoreError
 from restock.ingest.store.transitions import replaced
+from restock.ingest.store.version import FORMAT
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
@@ -94,6 +95,18 @@ def test_an_older_version_can_be_opened(store_path: Path, transitions: pa.Table)
         assert store.sql("SELECT count(*) FROM recordings").fetchall() == [(1,)]
     with pytest.raises(StoreError, match="version 9"):
         Store(store_path, version=9)
+
+
+@pytest.mark.parametrize("found", [None, "restock-store/1", "restock-store/99"])
+@pytest.mark.parametrize("command", [["sql", "FROM recordings"], ["audit"], ["store", "compact"]])
+def test_a_store_of_another_format_is_refused(tmp_path, monkeypatch, capsys, found, command):
+    monkeypatch.setattr("support.stores.FORMAT", found)
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    words = command if command[0] == "store" else command[:1]
+    assert main([*words, str(path), *command[len(words) :]]) == 2
+    said = capsys.readouterr().err
+    assert str(path) in said
+    assert "restock ingest RECORDINGS --store NEW" in said
 
 
 def test_columns_that_older_rows_lack_are_null(tmp_path: Path) -> None:
@@ -284,8 +297,8 @@ def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path: Path) -> N
     place = row.schema.get_field_index("clock_offset_ns")
     offset = pa.array([1_700_000_000 * 10**9])
     row = row.set_column(place, row.schema.field(place), offset)
-    write_deltalake(str(tmp_path / "recordings"), row)
-    write_deltalake(str(tmp_path / "transitions"), table)
+    write_deltalake(str(tmp_path / "recordings"), row, description=FORMAT)
+    write_deltalake(str(tmp_path / "transitions"), table, description=FORMAT)
     with Store(tmp_path) as store:
         ((oldest,),) = store.sql("SELECT min(oldest)::VARCHAR FROM ages").fetchall()
     assert oldest == "2023-11-14 22:13:20"

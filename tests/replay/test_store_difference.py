@@ -235,8 +235,10 @@ def test_the_manifest_of_an_empty_store_is_no_task(tmp_path: Path) -> None:
     empty = write_store(tmp_path / "a", [])
     from deltalake import write_deltalake
 
-    write_deltalake(str(empty / "recordings"), manifest(rows).slice(0, 0))
-    write_deltalake(str(empty / "transitions"), rows.slice(0, 0))
+    from restock.ingest.store.version import FORMAT
+
+    write_deltalake(str(empty / "recordings"), manifest(rows).slice(0, 0), description=FORMAT)
+    write_deltalake(str(empty / "transitions"), rows.slice(0, 0), description=FORMAT)
     full = write_store(tmp_path / "b", [rows])
     with Store(empty) as a, Store(full) as b:
         found = diff_stores(a, b).document()

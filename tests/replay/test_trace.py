@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable, write_deltalake
-from support.long import one_in
 from support.panels import panel_of
 from support.paths import ROOT
 from support.stores import TASK, manifest, recording_transitions, write_store
@@ -23,13 +22,11 @@ from restock import cli
 from restock.errors import PanelError, RecordingError, RunError, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.version import FORMAT
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
-from restock.replay.places import open_place
-from restock.replay.store.audit import load_audits, load_thresholds, run_audits
-from restock.replay.store.query import query
 from restock.replay.store.store import Store
 from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
@@ -262,7 +259,7 @@ def test_a_row_that_was_labelled_again_since_says_so(tmp_path: Path) -> None:
 
 def replace_recording(store: Path, rows: pa.Table) -> None:
     """As an ingest does: the recording's old rows go in the commit that brings the new ones."""
-    write_deltalake(str(store / "recordings"), manifest(rows), mode="append")
+    write_deltalake(str(store / "recordings"), manifest(rows), mode="append", description=FORMAT)
     table = DeltaTable(str(store / "transitions"))
     predicate = f"recording_id = '{rows['recording_id'][0].as_py()}'"
     write_deltalake(table, rows, mode="overwrite", predicate=predicate)
@@ -285,43 +282,3 @@ def test_the_verb_prints_a_trace_and_its_document(
     assert document["notes"] == []
     assert cli.main(["trace", str(places.run), "9/9"]) == 2
     assert "was not audited" in capsys.readouterr().err
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("newer_beside", one_in(2, [True, False]))
-def test_a_store_that_an_older_version_wrote_audits_mixes_and_traces(
-    tmp_path: Path, newer_beside: bool
-) -> None:
-    # Its manifests lack what was added since; a newer recording beside them brings a column more.
-    store = tmp_path / "store"
-    for number in (1, 2):
-        rows = recording_transitions(number)
-        old = manifest(rows).drop_columns(["clocks", "signals"])
-        write_deltalake(str(store / "recordings"), old, mode="append")
-        write_deltalake(str(store / "transitions"), rows, mode="append")
-
-    def works(expected: int) -> None:
-        with open_place(store) as connection:
-            findings = run_audits(connection, load_audits(), load_thresholds())
-            views = query(connection, 'SELECT DISTINCT "view" FROM columns', where=str(store))
-            for (view,) in views.fetchall():
-                connection.sql(f'FROM "{view}"').fetchall()
-        assert {f.audit.name for f in findings if f.status == "fail"} == {"rare_condition"}
-        panel = tmp_path / f"panel{expected}"
-        with Store(store) as opened:
-            assert len(build_panel(opened, MIXTURE, panel)) == expected
-        origin = trace_row(panel, "3").origin
-        assert origin is not None
-        assert origin.recording is not None
-        assert origin.recording.get("clocks") is None
-        assert origin.transition.get("payload_kg") is None
-
-    if not newer_beside:
-        works(sum(len(recording_transitions(number)) for number in (1, 2)))
-        return
-    newer = recording_transitions(3)
-    carried = pa.array(np.full(len(newer), 3.0))
-    rows = newer.append_column("payload_kg", carried)
-    write_deltalake(str(store / "recordings"), manifest(newer), mode="append", schema_mode="merge")
-    write_deltalake(str(store / "transitions"), rows, mode="append", schema_mode="merge")
-    works(sum(len(recording_transitions(number)) for number in (1, 2, 3)))

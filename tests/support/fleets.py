@@ -15,6 +15,7 @@ import pyarrow as pa
 from deltalake import write_deltalake
 from scipy.signal import lfilter
 
+from restock.ingest.store.version import FORMAT
 from support.stores import TASK, manifest, recording_transitions, views_over
 
 MONDAY_NS = 1_772_409_600 * 10**9  # 2026-03-02
@@ -56,7 +57,7 @@ def fleet_store(path: Path, robots: list[SyntheticRobot], **size: int) -> Path:
         ("recordings", [row for _, row in made]),
         ("transitions", [rows for rows, _ in made]),
     ):
-        write_deltalake(str(path / name), pa.concat_tables(tables), mode="append")
+        write_deltalake(str(path / name), pa.concat_tables(tables), description=FORMAT)
     return path
 
 

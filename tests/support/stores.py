@@ -16,6 +16,7 @@ import pyarrow as pa
 from deltalake import write_deltalake
 
 from restock.ingest.store.summary import summarised
+from restock.ingest.store.version import FORMAT
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import labels_version, primary
 from restock.ingest.task.scan import Body
@@ -181,11 +182,14 @@ def write_store(
     task: Task = TASK,
     tags: Sequence[Mapping[str, str]] = (),
 ) -> Path:
-    """Write a store of these recordings and their tags, one commit each, the manifest row first."""
+    """Write a store of these recordings and their tags, one commit each, the manifest row first.
+
+    As another tool writes it: manifests have no summaries.
+    """
     for transitions, reported in zip_longest(recordings, tags):
         row = manifest(transitions, task=task, tags=reported)
-        write_deltalake(str(path / "recordings"), row, mode="append")
-        write_deltalake(str(path / "transitions"), transitions, mode="append")
+        write_deltalake(str(path / "recordings"), row, mode="append", description=FORMAT)
+        write_deltalake(str(path / "transitions"), transitions, mode="append", description=FORMAT)
     return path
 
 

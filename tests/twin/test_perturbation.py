@@ -12,15 +12,13 @@ import pyarrow as pa
 import pytest
 from support.driven_robot import Drive, columns
 from support.paths import ROOT
-from support.stores import one, recording_transitions
+from support.stores import one
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.perturbation_columns import Perturbed, parse_perturbation
-from restock.replay.mixture.mixture import load_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.store.audit import load_audits, run_audits
 from restock.replay.store.store import Store
 from restock.train.dqn.config import parse_config
@@ -206,43 +204,6 @@ def test_a_recording_holds_what_was_said_from_then_on() -> None:
     assert values[len(steps) - 1].as_py() == []
     hardware = steps_of(profile, Drive(duration_s=4.0).topics())
     assert set(hardware.perturbed.columns(np.arange(5))[0].to_pylist()) == {None}
-
-
-@pytest.fixture
-def old_store(tmp_path: Path) -> Path:
-    """Return a store written before these columns existed."""
-    manifest, rows = one(1)
-    StoreWriter(tmp_path / "s").write(manifest, rows.drop_columns(COLUMNS))
-    return tmp_path / "s"
-
-
-def test_a_store_from_before_reads_as_null(old_store: Path, tmp_path: Path) -> None:
-    with Store(old_store) as store:
-        assert store.sql("SELECT DISTINCT perturbation, perturbation_values FROM transitions")
-        (line,) = store.sql("FROM coverage_by_perturbation").to_arrow_table().to_pylist()
-        assert (line["perturbation"], line["share"]) == (None, 1.0)
-        panel = build_panel(store, load_mixture("uniform"), tmp_path / "panel")
-    assert panel.meta["perturbation"].null_count == len(panel)
-
-
-def test_rows_with_the_columns_are_added_to_a_store_from_before(old_store: Path) -> None:
-    StoreWriter(old_store).write(*one(2))
-    with Store(old_store) as store:
-        rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
-        covered = store.sql("FROM coverage_by_perturbation").to_arrow_table().to_pylist()
-        reached = store.sql("FROM perturbation_ranges").to_arrow_table().to_pylist()
-    new = recording_transitions(2)
-    assert rows["perturbation"].to_pylist()[-len(new) :] == new["perturbation"].to_pylist()
-    kept = rows["perturbation_values"].to_pylist()
-    assert set(map(str, kept[: -len(new)])) == {"None"}
-    assert kept[-len(new) :] == new["perturbation_values"].to_pylist()
-    wet = sum(name == "wet" for name in new["perturbation"].to_pylist())
-    assert {line["perturbation"]: line["rows"] for line in covered} == {
-        "wet": wet,
-        None: len(rows) - wet,
-    }
-    (line,) = reached
-    assert (line["field"], line["rows"], line["value_min"]) == ("friction_scale", wet, 0.5)
 
 
 def test_the_audit_names_thin_cells_of_a_perturbation(tmp_path: Path) -> None:
