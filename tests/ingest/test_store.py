@@ -213,7 +213,7 @@ def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
 
 
 def with_payload(recording: int) -> tuple[pa.Table, pa.Table]:
-    """A recording with a signal of its profile's own."""
+    """Return tables of a recording with a signal of its profile's own."""
     manifest, rows = one(recording)
     return manifest, rows.append_column("payload_kg", pa.array([3.0] * len(rows)))
 
