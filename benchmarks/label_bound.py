@@ -19,7 +19,7 @@ import torch
 
 from restock.arrays import F32, Bools
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.episode_rows import episode_ends
+from restock.ingest.store.transitions import episode_ends
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.label_scores import LabelScore, events, touched, true_names, widened

@@ -33,7 +33,6 @@ from restock.ingest.store.corrections import (
     merged,
     rules_of,
 )
-from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import (
     conditions_json,
     count_rows,
@@ -41,7 +40,7 @@ from restock.ingest.store.manifest import (
     score_rows,
     uncertain_conditions,
 )
-from restock.ingest.store.transitions import by_name, names_of, replaced
+from restock.ingest.store.transitions import by_name, episode_ends, names_of, replaced
 from restock.ingest.store.version import Version
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (

@@ -105,7 +105,7 @@ class Input(Checked, frozen=True):
     upside_down: bool = False
     lidar_at_m: tuple[_OnRobot, _OnRobot] | None = None
     lidar_yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
-    # Of a pose by latitude and longitude (`restock.ingest.steps.fixes`).
+    # Of a pose by latitude and longitude (`restock.ingest.steps.input_columns`).
     origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
     max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5
     track_m: Annotated[float, Meta(gt=0)] | None = None  # distance that gives the yaw; None: 1

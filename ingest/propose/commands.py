@@ -32,7 +32,7 @@ from restock.ingest.propose.robot_choice import (
     drive_evidence,
 )
 from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
-from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.signals import wrap_angle
 
 PASSED_WITHIN_S = 0.5

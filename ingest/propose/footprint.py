@@ -40,8 +40,7 @@ from restock.ingest.propose.pose_choice import named_frames, transform_topics
 from restock.ingest.propose.roles import Kind, shared, sort_own_first
 from restock.ingest.steps.align import align
 from restock.ingest.steps.clearance import BEAMS, angle_keys, beam_angles
-from restock.ingest.steps.frames import Edges, Tree, frame_id_path, plain, upward
-from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.steps.frames import Edges, PoseSeries, Tree, frame_id_path, plain, upward
 from restock.ingest.task.signals import yaw_of
 
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms

@@ -75,9 +75,8 @@ from restock.ingest.propose.roles import (
     usable_topics,
 )
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.frames import plain
+from restock.ingest.steps.frames import PoseSeries, plain
 from restock.ingest.steps.input_columns import estimate_reduction
-from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
 RADIUS_M = (0.1, 0.4)  # the least and the most of a goal

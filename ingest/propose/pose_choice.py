@@ -20,9 +20,15 @@ from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.roles import Roles, robots_in
 from restock.ingest.steps.align import align
-from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M, Fixes, fixes_of
-from restock.ingest.steps.frames import Edges, Tree, transform_fields, upward
-from restock.ingest.steps.motion import PoseSeries, poses_along
+from restock.ingest.steps.frames import (
+    Edges,
+    PoseSeries,
+    Tree,
+    poses_along,
+    transform_fields,
+    upward,
+)
+from restock.ingest.steps.input_columns import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.task.signals import wrap_angle, yaw_of
 
 FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")

@@ -31,7 +31,7 @@ from restock.ingest.propose.footprint import (
     outline,
 )
 from restock.ingest.propose.roles import shared
-from restock.ingest.steps.motion import PoseSeries, motion_at
+from restock.ingest.steps.frames import PoseSeries, motion_at
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.signals import wrap_angle
 from restock.toml import toml_value

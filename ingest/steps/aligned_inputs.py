@@ -33,9 +33,8 @@ from restock.ingest.steps.align import (
     ticks_of,
 )
 from restock.ingest.steps.cameras import CameraFrames, usable_frames
-from restock.ingest.steps.frames import Edges, Placement, Tree, plain
+from restock.ingest.steps.frames import Edges, Placement, PoseSeries, Tree, plain, poses_along
 from restock.ingest.steps.input_columns import InputColumns
-from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.words import counted
 
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used

@@ -23,19 +23,21 @@ from restock.ingest.profile.inputs import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.clearance import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction
-from restock.ingest.steps.motion import motion_at
+from restock.ingest.steps.frames import motion_at
 from restock.ingest.task.hindsight import missions
-from restock.ingest.task.perturbation_columns import Perturbed
-from restock.ingest.task.route import RouteView, pad_plans, view_route
 from restock.ingest.task.scan import with_unseen
+from restock.ingest.task.schema import Perturbed
 from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.surroundings import (
     PLAN_PARTS,
     SCANNED,
+    RouteView,
     came_nearer,
+    pad_plans,
     plan_distances_m,
     returns_on_plan,
     steps_remembered,
+    view_route,
 )
 from restock.ingest.task.task import Task, clearance_ahead
 

@@ -16,8 +16,14 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 from restock.errors import StoreError
-from restock.ingest.store.commits import ATTEMPTS, delta_columns, recording_columns
-from restock.ingest.store.data_files import merge, parquet_options, written_whole
+from restock.ingest.store.commits import (
+    ATTEMPTS,
+    delta_columns,
+    merge,
+    parquet_options,
+    recording_columns,
+    written_whole,
+)
 from restock.ingest.store.lineage import Ingest, StoredFile, changed_by_others, own_path
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.summary import summarised

@@ -24,14 +24,16 @@ import pyarrow as pa
 import pyarrow.fs
 
 from restock.errors import StoreError
-from restock.ingest.store.data_files import READ_ROWS, merge
+from restock.ingest.store.commits import READ_ROWS, merge
 from restock.ingest.store.lineage import (
     OWN_PATH,
     StoredFile,
+    StoreReader,
     active_files,
     by_system,
     damage_named,
     damage_remedy,
+    frame_files,
     held_by,
     stored_files,
 )
@@ -42,7 +44,6 @@ from restock.ingest.store.location import (
     Location,
     open_parquet,
 )
-from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.writer import StoreWriter
 from restock.words import counted, quoted
 

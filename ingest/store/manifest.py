@@ -17,8 +17,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, profile_toml
 from restock.ingest.steps.aligned_inputs import fallbacks_used
 from restock.ingest.steps.episodes import Split, Steps
-from restock.ingest.store.episode_rows import EpisodeRows
-from restock.ingest.store.transitions import Provenance
+from restock.ingest.store.transitions import EpisodeRows, Provenance
 from restock.ingest.task.conditions import Condition, reported, unknown_rows, unseen
 from restock.ingest.task.label_scores import LabelScore
 from restock.ingest.task.signals import OUTLINE_SIGNALS

@@ -27,11 +27,17 @@ import pyarrow.parquet as pq
 from deltalake.exceptions import DeltaError
 
 from restock.errors import StoreError
-from restock.ingest.store.commits import TableCommits, delta_columns, plain_lists, recording_columns
-from restock.ingest.store.data_files import AddedFile, parquet_options, written_whole
-from restock.ingest.store.lineage import own_path, stored_files
+from restock.ingest.store.commits import (
+    AddedFile,
+    TableCommits,
+    delta_columns,
+    parquet_options,
+    plain_lists,
+    recording_columns,
+    written_whole,
+)
+from restock.ingest.store.lineage import frame_files, own_path, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
-from restock.ingest.store.reader import frame_files
 from restock.ingest.store.repeated import UNREADABLE, Hashes, RepeatedDrive, Sketch, find_repeat
 from restock.ingest.store.summary import summarised
 from restock.ingest.task.schema import frame_schema

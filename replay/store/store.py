@@ -26,12 +26,13 @@ from restock.ingest.store.damaged_files import damaged_error, unverified_files, 
 from restock.ingest.store.lineage import (
     Ingest,
     StoredFile,
+    StoreReader,
     changed_by_others,
+    frame_files,
     ingests_table,
     stored_files,
 )
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
-from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.version import Version
 from restock.ingest.store.writer import RETENTION_HOURS
 from restock.ingest.task.conditions import NOMINAL, Condition

@@ -19,9 +19,8 @@ from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.store import compaction
 from restock.ingest.store.compaction import OPERATION, compact, fold
-from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
-from restock.ingest.store.transitions import replaced
+from restock.ingest.store.transitions import ENDS, packed, replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.audit import Finding, run_audits, shipped_audits
 from restock.replay.store.store import Store

@@ -16,7 +16,7 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import QueryError, StoreError
-from restock.ingest.store import compaction, data_files, lineage
+from restock.ingest.store import commits, compaction, lineage
 from restock.ingest.store import writer as writer_module
 from restock.ingest.store.commits import recording_columns
 from restock.ingest.store.compaction import compact
@@ -195,9 +195,9 @@ def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
 
 def test_files_without_checksums_are_read_as_before(tmp_path, monkeypatch):
     """Another tool may write them."""
-    options = data_files.parquet_options
+    options = commits.parquet_options
     without = {"write_page_checksum": False}
-    for module in (data_files, writer_module, compaction):
+    for module in (commits, writer_module, compaction):
         monkeypatch.setattr(module, "parquet_options", lambda schema: options(schema) | without)
     writer = StoreWriter(tmp_path / "s")
     writer.write_all([one(1), one(2)])

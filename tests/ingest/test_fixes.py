@@ -16,7 +16,7 @@ from restock.errors import ConfigError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.steps.fixes import Fixes, local_plane_m, track_yaw
+from restock.ingest.steps.input_columns import Fixes, local_plane_m, track_yaw
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 

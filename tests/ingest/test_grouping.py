@@ -25,7 +25,7 @@ from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import split, steps_of
-from restock.ingest.store import episode_rows
+from restock.ingest.store import transitions as transitions_module
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import Staged, StoreWriter
 
@@ -151,7 +151,7 @@ def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None
         store = Kept(tmp_path / f"store{len(tables)}")
         with pytest.MonkeyPatch.context() as patch:
             cut_by(patch, size, rows)
-            patch.setattr(episode_rows, "GROUP_ROWS", group)
+            patch.setattr(transitions_module, "GROUP_ROWS", group)
             ingest(bag, PROFILE, store=store)
         tables.append(store.rows.drop_columns(["ingest_id"]))
     assert len(tables[0]) > 50
@@ -168,7 +168,7 @@ def test_rows_do_not_depend_on_which_episodes_come_together(
     episodes = split(PROFILE.task, steps)
     assert len(episodes.episodes) > 2
     whole, every = recording_table(PROFILE, steps, episodes, PROVENANCE)
-    monkeypatch.setattr(episode_rows, "GROUP_ROWS", group)
+    monkeypatch.setattr(transitions_module, "GROUP_ROWS", group)
     table, rows = recording_table(PROFILE, steps, episodes, PROVENANCE)
     assert table.equals(whole, check_metadata=True)
     assert np.array_equal(rows.tick, every.tick)

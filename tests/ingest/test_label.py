@@ -146,7 +146,7 @@ def test_wrong_usage(store, tmp_path, capsys):
 
 
 def test_the_ends_are_kept_with_the_rows(store):
-    from restock.ingest.store.episode_rows import episode_ends
+    from restock.ingest.store.transitions import episode_ends
 
     writer = StoreWriter(store)
     for row in writer.live().to_pylist():

@@ -31,7 +31,8 @@ from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import align
 from restock.ingest.steps.clocks import STAMP, topic_clock
 from restock.ingest.steps.episodes import Steps, split, steps_of
-from restock.ingest.store import episode_rows, summary
+from restock.ingest.store import summary
+from restock.ingest.store import transitions as transitions_module
 from restock.ingest.store.commits import plain_lists
 from restock.ingest.store.transitions import Provenance, recording_table
 
@@ -163,7 +164,7 @@ def steps() -> Steps:
 def test_rows_lie_in_memory_once(steps: Steps, monkeypatch: pytest.MonkeyPatch) -> None:
     episodes = split(PROFILE.task, steps)
     assert len(episodes.episodes) > 5
-    monkeypatch.setattr(episode_rows, "GROUP_ROWS", 20)  # several groups
+    monkeypatch.setattr(transitions_module, "GROUP_ROWS", 20)  # several groups
     table, rows = recording_table(PROFILE, steps, episodes, PROVENANCE)
     a_copy = 4 * PROFILE.task.observation_size * len(rows.tick)
     wide = table.select(summary.WIDE)

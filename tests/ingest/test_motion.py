@@ -18,7 +18,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import steps_of
-from restock.ingest.steps.motion import PoseSeries, motion_at
+from restock.ingest.steps.frames import PoseSeries, motion_at
 from restock.ingest.steps.needs import read_topics
 
 NS = 10**9

@@ -15,8 +15,14 @@ from support.ros_graph import Graph, Returned, message_class
 from support.twin_robot import TwinRobot, follower_onnx
 
 from restock.cli import main, run_node
-from restock.ingest.live.node import lifecycle_node
-from restock.ingest.live.node_topics import ACTION, LIMITER, SHADOW, TAKEOVER, with_node_topics
+from restock.ingest.live.node import (
+    ACTION,
+    LIMITER,
+    SHADOW,
+    TAKEOVER,
+    lifecycle_node,
+    with_node_topics,
+)
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.task.limiter import Limiter
 from restock.replay.store.store import Store

@@ -18,7 +18,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.commands import CommandHold, command_hold
 from restock.ingest.steps.align import NS
-from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.physics.simulation import blocks_of

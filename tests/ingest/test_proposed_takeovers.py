@@ -18,7 +18,7 @@ from support.driven_robot import (
 )
 
 from restock.cli import main
-from restock.ingest.live.node_topics import (
+from restock.ingest.live.node import (
     ACTION,
     LIMITER,
     PROPOSAL,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from restock.ingest.task.route import pad_plans, view_route
+from restock.ingest.task.surroundings import pad_plans, view_route
 
 L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
 

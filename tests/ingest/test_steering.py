@@ -17,7 +17,7 @@ from twin.test_robot_drives import CAR, MECANUM, OUTLINE
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.propose.robot_choice import DriveEvidence, drive_evidence
-from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task

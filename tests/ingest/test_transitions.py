@@ -11,8 +11,7 @@ from support.driven_robot import SPEED_MPS, START_NS, Drive, columns, without
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.steps.episodes import split, steps_of
-from restock.ingest.store.episode_rows import episode_rows
-from restock.ingest.store.transitions import Provenance, transitions
+from restock.ingest.store.transitions import Provenance, episode_rows, transitions
 from restock.ingest.task.schema import STEP_BITS, transition_schema
 
 PROFILE = load_profile("warehouse_amr")

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from restock.ingest.live.policy_file import FORMAT
+from restock.ingest.live.pilot import FORMAT
 from restock.ingest.profile.profile import Profile, profile_toml
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec

@@ -18,8 +18,8 @@ from restock.cli import main
 from restock.errors import RunError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, load_profile
-from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import definitions
+from restock.ingest.store.transitions import episode_ends
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS
 from restock.replay.mixture.mixture import load_mixture

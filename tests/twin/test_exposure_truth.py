@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.episode_rows import label_table
+from restock.ingest.store.transitions import label_table
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import label
 from restock.ingest.task.label_scores import true_names

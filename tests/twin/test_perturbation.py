@@ -18,7 +18,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.perturbation_columns import Perturbed, parse_perturbation
+from restock.ingest.task.schema import Perturbed, parse_perturbation
 from restock.replay.store.audit import load_audits, run_audits
 from restock.replay.store.store import Store
 from restock.train.dqn.config import parse_config

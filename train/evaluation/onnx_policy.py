@@ -21,7 +21,7 @@ from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
 from restock.imports import import_extra
-from restock.ingest.live.policy_file import FORMAT, open_session
+from restock.ingest.live.pilot import FORMAT, open_session
 from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork

@@ -31,14 +31,18 @@ import pyarrow as pa
 
 from restock.errors import RunError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.store.episode_rows import EpisodeRows, label_table
 from restock.ingest.store.manifest import definitions, manifest_row, software_version
-from restock.ingest.store.transitions import Provenance, TransitionValues, transition_table
+from restock.ingest.store.transitions import (
+    EpisodeRows,
+    Provenance,
+    TransitionValues,
+    label_table,
+    transition_table,
+)
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import label, probabilities, reported, runnable
 from restock.ingest.task.label_scores import label_scores
-from restock.ingest.task.perturbation_columns import Perturbed
-from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
+from restock.ingest.task.schema import SIGNAL_COLUMNS, Perturbed, recording_schema
 from restock.train.run.run import now_ns
 
 _STEP = ("action", "probability", "reward", "progress_m", "truth", "exposure")

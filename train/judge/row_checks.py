@@ -15,7 +15,7 @@ import pyarrow as pa
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.store.episode_rows import label_table
+from restock.ingest.store.transitions import label_table
 from restock.ingest.task.conditions import Condition, label
 from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import reward_parts, terminated

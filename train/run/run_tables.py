@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from restock.ingest.task.perturbation_columns import VALUES
+from restock.ingest.task.schema import VALUES
 
 _F, _I, _S, _B = pa.float64(), pa.int64(), pa.string(), pa.bool_()
 _STEPS = [

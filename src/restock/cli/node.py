@@ -43,7 +43,7 @@ class NodeCommand:
 
     def run(self) -> int:
         from restock.errors import ConfigError
-        from restock.ingest.live.policy_file import PolicyFile
+        from restock.ingest.live.pilot import PolicyFile
 
         if self.on is not None:
             return self._play(self.on)
@@ -63,8 +63,7 @@ class NodeCommand:
 
     def _play(self, recording: Path) -> int:
         from restock.cli.output import print_json
-        from restock.ingest.live.pilot import Pilot, play, summary
-        from restock.ingest.live.policy_file import PolicyFile
+        from restock.ingest.live.pilot import Pilot, PolicyFile, play, summary
         from restock.ingest.task.limiter import Limits
 
         policy = PolicyFile(self.policy, self.profile)
@@ -77,7 +76,7 @@ class NodeCommand:
         from restock.cli.output import say
         from restock.errors import ConfigError
         from restock.files import expect_file_place, write_bytes
-        from restock.ingest.live.node_topics import with_node_topics
+        from restock.ingest.live.node import with_node_topics
         from restock.ingest.profile.profile import profile_toml
 
         if out.exists():

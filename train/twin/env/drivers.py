@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
-from restock.ingest.task.route import view_route
+from restock.ingest.task.surroundings import view_route
 from restock.state import Stateful
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.navigation import PathFollower

@@ -49,8 +49,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.label_scores import truth_text
-from restock.ingest.task.route import view_route
 from restock.ingest.task.signals import Signals
+from restock.ingest.task.surroundings import view_route
 from restock.ingest.task.task import Task, reached_goal
 from restock.state import Stateful
 from restock.train.twin.env.interface import Info

@@ -13,7 +13,6 @@ from statistics import NormalDist
 import numpy as np
 
 from restock.arrays import F64, Ints
-from restock.ingest.task.route import view_route
 from restock.ingest.task.scan import Body, SectorMap, outline_reach
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.surroundings import (
@@ -23,6 +22,7 @@ from restock.ingest.task.surroundings import (
     plan_distances_m,
     returns_on_plan,
     steps_remembered,
+    view_route,
 )
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful

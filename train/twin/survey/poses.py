@@ -24,7 +24,6 @@ from restock.ingest.propose.roles import (
     usable_topics,
 )
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.fixes import fixes_of
 from restock.ingest.steps.frames import (
     AXES,
     FRAME_ID,
@@ -35,6 +34,7 @@ from restock.ingest.steps.frames import (
     rotations,
     transform_fields,
 )
+from restock.ingest.steps.input_columns import fixes_of
 from restock.ingest.task.signals import yaw_of
 
 MAX_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
