@@ -30,12 +30,15 @@ from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows, kept
 from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
 from restock.ingest.steps.frames import FIELDS, frame_id_path, plain, transform_fields
 from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
-from restock.ingest.store.corrections import correction_rows, corrections_in, lay_over, rules_of
 from restock.ingest.store.lineage import own_path
 from restock.ingest.store.manifest import (
+    correction_rows,
+    corrections_in,
     definitions,
+    lay_over,
     manifest_row,
     recorded_facts,
+    rules_of,
     software_version,
     uncertain_conditions,
 )

@@ -23,20 +23,18 @@ import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError, expect
 from restock.ingest.profile.profile import profile_toml, read_profile_toml, with_conditions
-from restock.ingest.store.corrections import (
+from restock.ingest.store.manifest import (
     COLUMN,
     Correction,
     Moments,
+    conditions_json,
     correction_rows,
     corrections_in,
+    count_rows,
+    driven_plan,
     lay_over,
     merged,
     rules_of,
-)
-from restock.ingest.store.manifest import (
-    conditions_json,
-    count_rows,
-    driven_plan,
     score_rows,
     uncertain_conditions,
 )

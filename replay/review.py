@@ -25,7 +25,7 @@ from restock.arrays import Ints
 from restock.errors import LabelError, StoreError
 from restock.files import first_line
 from restock.ingest.relabel import RecordingCorrections
-from restock.ingest.store.corrections import Correction
+from restock.ingest.store.manifest import Correction
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 

@@ -31,7 +31,7 @@ from restock.ingest.profile.inputs import Input, is_motion
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import CustomSignal
 from restock.ingest.task.conditions import Condition
-from restock.ingest.task.limiter import RULES, Limiter, Limits
+from restock.ingest.task.robot import RULES, Limiter, Limits
 
 PROPOSAL, SHADOW = "/restock/proposal", "/restock/shadow_cmd_vel"
 ACTION, LIMITER = "/restock/action", "/restock/limiter"

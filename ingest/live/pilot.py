@@ -27,7 +27,7 @@ from restock.ingest.live.observer import LiveObserver, Observed, value_of
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
 from restock.ingest.steps.align import NS
-from restock.ingest.task.limiter import NONE, RULES, UNKNOWN, Limits, limit
+from restock.ingest.task.robot import NONE, RULES, UNKNOWN, Limits, limit
 from restock.ingest.task.task import nearest_action
 
 FORMAT = "restock-policy/1"
@@ -135,7 +135,7 @@ class Decision:
     action: int | None  # that it proposes; None: nothing could be decided
     proposal: tuple[float, float]  # speed m/s, yaw rate rad/s; stop where there is none
     command: tuple[float, float]  # what of it may be driven
-    rule: int  # of `restock.ingest.task.limiter.RULES`
+    rule: int  # of `restock.ingest.task.robot.RULES`
     reason: str  # why it is a stop, or ""
     taken_over: bool  # a person drives: it is not to be published
 

@@ -63,17 +63,17 @@ from restock.ingest.profile.tables import (
     name_problem,
 )
 from restock.ingest.profile.tag_rules import TagRules
-from restock.ingest.task.condition_files import shipped, with_files
 from restock.ingest.task.conditions import (
     Condition,
     Kind,
     label_with_probabilities,
     labels_version,
     of_kind,
+    shipped,
+    with_files,
 )
 from restock.ingest.task.hindsight import GoalRules, GoalSource
-from restock.ingest.task.limiter import Limiter
-from restock.ingest.task.robot import Robot, beyond_limits, refuse_beyond_steering
+from restock.ingest.task.robot import Limiter, Robot, beyond_limits, refuse_beyond_steering
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import Task

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from restock.errors import StoreError
 from restock.ingest.profile.signal_paths import PathProblem, SignalPath
+from restock.ingest.profile.tag_rules import NAMED
 from restock.ingest.task.schema import COLUMNS
-from restock.ingest.task.tags import NAMED
 from restock.toml import Checked
 
 if TYPE_CHECKING:

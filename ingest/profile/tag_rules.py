@@ -1,14 +1,18 @@
-"""Where a recording's tags come from: the command line, the recording itself, the path it lies at.
+"""Tags of a recording: robot, site and others, and where they come from.
 
-What the command line says decides. The recording's own metadata and its path must not contradict
-each other; where both say the same, or one of them nothing, there is no question.
+A tag is text by name, one of each per recording. `robot`, `site`, `firmware`, `map` and `shift` are
+columns of the views; all, with any other names, are in their column `tags`.
+
+They come from the command line, the recording itself and the path it lies at. The command line
+decides. The recording's own metadata and its path must not contradict each other; if both say the
+same, or one of them nothing, there is no question.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -16,9 +20,69 @@ from typing import TypeAlias
 
 import msgspec
 
-from restock.errors import RecordingError
-from restock.ingest.task.tags import MAX_TAGS, NAMED, in_words, tag_problem
+from restock.errors import ConfigError, RecordingError
 from restock.toml import Checked
+
+NAMED = ("robot", "site", "firmware", "map", "shift")  # columns of the views
+MAX_TAGS = 64  # of a recording
+MAX_NAME, MAX_VALUE = 64, 256  # characters
+
+
+def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False) -> dict[str, str]:
+    """Tags of `KEY=VALUE` texts, as the command line has them.
+
+    Args:
+        texts: such as `robot=amr-07`.
+        flag: the option, for errors.
+        empty: whether a value may be empty (`KEY=`): it then takes the tag off.
+
+    Raises:
+        ConfigError: a text of another form, a name or value that is too long, or a name with two
+            values.
+    """
+    tags: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name, value = name.strip(), value.strip()
+        if not equals or not (value or empty):
+            raise ConfigError(
+                f"{text!r} is not KEY=VALUE", where=flag, remedy=f"such as {flag} robot=amr-07"
+            )
+        if problem := tag_problem(name, value):
+            raise ConfigError(problem, where=flag)
+        if tags.setdefault(name, value) != value:
+            raise ConfigError(
+                f"{name} is given twice, as {tags[name]!r} and as {value!r}",
+                where=flag,
+                remedy="a recording has one value of a tag: ingest the recordings of each value "
+                "separately",
+            )
+    if len(tags) > MAX_TAGS:
+        raise ConfigError(
+            f"{len(tags)} tags are too many: at most {MAX_TAGS} are allowed", where=flag
+        )
+    return tags
+
+
+def tag_problem(name: str, value: str) -> str | None:
+    """Why this cannot be a tag, or None."""
+    if not 0 < len(name) <= MAX_NAME or "=" in name or not name.isprintable():
+        return (
+            f"{name[: MAX_NAME + 1]!r} is not a name of a tag: use 1 to {MAX_NAME} "
+            "characters, without = and control characters"
+        )
+    if len(value) > MAX_VALUE:
+        return f"the value of {name} has {len(value):,} characters, more than {MAX_VALUE}"
+    if not value.isprintable():
+        return f"the value of {name} has control characters"
+    return None
+
+
+def in_words(tags: Mapping[str, str]) -> str:
+    """Tags on one line, the named ones first."""
+    names = [*(name for name in NAMED if name in tags), *sorted(tags.keys() - set(NAMED))]
+    return ", ".join(f"{name}={tags[name]}" for name in names)
+
 
 Said: TypeAlias = "tuple[str, str, Mapping[str, str]]"  # source, record, entries: of a recording
 _TABLE = "`[tags]` of the profile"

@@ -41,8 +41,7 @@ from restock.ingest.propose.roles import (
 )
 from restock.ingest.propose.trial import Trial
 from restock.ingest.steps.needs import field_paths
-from restock.ingest.task.condition_files import shipped
-from restock.ingest.task.conditions import unseen
+from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import Rewards, Task

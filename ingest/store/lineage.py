@@ -26,8 +26,7 @@ from deltalake import DeltaTable
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
-from restock.ingest.store.repeated import UNREADABLE, Hashes, Sketch, read_sketch
-from restock.ingest.store.summary import with_ends
+from restock.ingest.store.summary import UNREADABLE, Hashes, Sketch, read_sketch, with_ends
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
 from restock.words import quoted

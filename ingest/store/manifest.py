@@ -1,10 +1,18 @@
-"""The manifest row of an ingest: what was read, by which definitions, and what became of it."""
+"""The manifest row of an ingest: what was read, by which definitions, and what became of it.
+
+It also has the corrections: what people said about the recording's labels, laid over what the rules
+say. A correction says of one condition that it holds, or does not, on a stretch of an episode. The
+stretch is kept as an interval of log time, so that it is found again after the recording was
+ingested again or labelled by other rules. Corrections change with the labels in one commit; the
+labels' version then names both: `RULES+CORRECTIONS`.
+"""
 
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -12,13 +20,22 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
+from restock.arrays import Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, profile_toml
 from restock.ingest.steps.aligned_inputs import fallbacks_used
 from restock.ingest.steps.episodes import Split, Steps
-from restock.ingest.store.transitions import EpisodeRows, Provenance
-from restock.ingest.task.conditions import Condition, reported, unknown_rows, unseen
+from restock.ingest.store.transitions import EpisodeRows, Provenance, names_of, replaced
+from restock.ingest.task.conditions import (
+    NOMINAL,
+    Condition,
+    held,
+    primary,
+    reported,
+    unknown_rows,
+    unseen,
+)
 from restock.ingest.task.label_scores import LabelScore
 from restock.ingest.task.signals import OUTLINE_SIGNALS
 
@@ -190,3 +207,158 @@ def conditions_json(conditions: Sequence[Condition]) -> str:
     return msgspec.json.encode(
         [{name: getattr(condition, name) for name in names} for condition in conditions]
     ).decode()
+
+
+COLUMN = "corrections"  # of `recordings`
+
+
+@dataclass(frozen=True)
+class Correction:
+    """One condition on one stretch of an episode, as a person sees it."""
+
+    condition: str
+    value: bool  # whether it holds there
+    episode_index: int  # when it was given: decides where a clock that was set back repeats times
+    first_ns: int  # of its first step, by log time
+    last_ns: int  # of its last step
+    given_at: dt.datetime
+    rows: int = 0  # that it changes or confirms now
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Which episode and log time each row (N,) of a recording is of."""
+
+    episode_index: Ints
+    logged_ns: Ints
+
+    @classmethod
+    def of(cls, rows: pa.Table, clock_offset_ns: int | None) -> Moments:
+        """`clock_offset_ns` is the manifest's: log time less alignment clock."""
+        logged = rows["stamp_ns"].to_numpy() + (clock_offset_ns or 0)
+        if not rows["logged_ns"].null_count:
+            logged = rows["logged_ns"].to_numpy()
+        return cls(rows["episode_index"].to_numpy(), logged)
+
+    def covered(self, correction: Correction) -> Bools:
+        """The rows (N,) that a correction is about."""
+        inside = (self.logged_ns >= correction.first_ns) & (self.logged_ns <= correction.last_ns)
+        same = inside & (self.episode_index == correction.episode_index)
+        return np.asarray(same if same.any() else inside, np.bool_)
+
+    def stretch(self, rows: Ints) -> tuple[int, int, int]:
+        """Episode, first and last log time of some rows of one episode."""
+        first, last = int(rows[0]), int(rows[-1])
+        stamps = self.logged_ns
+        return int(self.episode_index[first]), int(stamps[first]), int(stamps[last])
+
+
+def corrections_in(manifest: Mapping[str, Any]) -> list[Correction]:
+    """Read the corrections of a manifest row."""
+    return [Correction(**row) for row in manifest[COLUMN]]
+
+
+def correction_rows(corrections: Iterable[Correction]) -> list[dict[str, Any]]:
+    """Corrections as the manifest holds them."""
+    return [asdict(correction) for correction in corrections]
+
+
+def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
+    """The version of labels that rules of this version made, and corrections changed."""
+    if not corrections:
+        return rules
+    said = sorted(
+        (c.condition, c.value, c.episode_index, c.first_ns, c.last_ns) for c in corrections
+    )
+    digest = hashlib.blake2b(msgspec.json.encode(said), digest_size=4).hexdigest()
+    return f"{rules}+{digest}"
+
+
+def rules_of(version: str) -> str:
+    """The rules' part of the version of labels."""
+    return version.partition("+")[0]
+
+
+def merged(
+    before: Sequence[Correction], given: Sequence[Correction], moments: Moments
+) -> list[Correction]:
+    """What was said before and what is said now; where both speak of a row, the latter counts."""
+    kept: list[Correction] = []
+    for old in before:
+        covered = moments.covered(old)
+        rest = covered.copy()
+        for new in given:
+            if new.condition == old.condition:
+                rest &= ~moments.covered(new)
+        if (rest == covered).all():
+            kept.append(old)
+            continue
+        rows = np.flatnonzero(rest)
+        for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+            if len(part):
+                episode, first_ns, last_ns = moments.stretch(part)
+                kept.append(replace(old, episode_index=episode, first_ns=first_ns, last_ns=last_ns))
+    return [*kept, *given]
+
+
+def lay_over(
+    rows: pa.Table,
+    corrections: Sequence[Correction],
+    conditions: Sequence[Condition],
+    clock_offset_ns: int | None,
+) -> tuple[pa.Table, list[Correction]]:
+    """A recording's rows with these corrections in their labels, and the corrections with the
+    number of rows that each is about now.
+
+    A correction of a condition that is not among `conditions`, or whose stretch has no row any
+    more, is about none: it changes nothing, and is kept.
+    """
+    moments, known = Moments.of(rows, clock_offset_ns), [c.name for c in conditions]
+    said: dict[str, Ints] = {}  # condition -> (N,) 1 it holds, 0 it does not, -1 nobody said
+    counted = []
+    for correction in corrections:
+        covered = np.zeros(len(rows), np.bool_)
+        if correction.condition in known:
+            covered = moments.covered(correction)
+            values = said.setdefault(correction.condition, np.full(len(rows), -1, np.int64))
+            values[covered] = int(correction.value)
+        counted.append(replace(correction, rows=int(covered.sum())))
+    if said and len(rows):
+        rows = _with_labels(rows, said, conditions)
+    version = corrected_version(rules_of(rows["labels_version"][0].as_py()), corrections)
+    return replaced(rows, {"labels_version": version}), counted
+
+
+def _with_labels(
+    rows: pa.Table, said: Mapping[str, Ints], conditions: Sequence[Condition]
+) -> pa.Table:
+    labels = held(rows["conditions"], [condition.name for condition in conditions])
+    for name, values in said.items():
+        labels[name] = np.where(values < 0, labels[name], values > 0)
+    every = np.arange(len(rows))
+    new: dict[str, Any] = {
+        "condition": primary(labels, conditions) or [NOMINAL] * len(rows),
+        "conditions": names_of(labels, every),
+    }
+    open_to_doubt = held(rows["uncertain"], [condition.name for condition in conditions])
+    for name, values in said.items():
+        open_to_doubt[name] &= values < 0
+    new["uncertain"] = names_of(open_to_doubt, every)
+    new["probabilities"] = _certain(rows["probabilities"].combine_chunks(), said)
+    return replaced(rows, new)
+
+
+def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArray:
+    """The probabilities with 1 and 0 where somebody said so, of conditions that have one."""
+    ends = np.asarray(probabilities.offsets)
+    first, count = int(ends[0]), int(ends[-1] - ends[0])
+    row = np.repeat(np.arange(len(probabilities)), np.diff(ends))
+    keys = probabilities.keys.slice(first, count)
+    items = np.array(probabilities.items.slice(first, count), np.float32)
+    named = np.asarray(keys, object)
+    for name, values in said.items():
+        entry = np.flatnonzero(named == name)
+        value = values[row[entry]]
+        items[entry[value >= 0]] = value[value >= 0]
+    made = pa.MapArray.from_arrays(pa.array(ends - first), keys, pa.array(items))
+    return made.cast(probabilities.type)

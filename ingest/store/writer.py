@@ -38,8 +38,14 @@ from restock.ingest.store.commits import (
 )
 from restock.ingest.store.lineage import frame_files, own_path, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
-from restock.ingest.store.repeated import UNREADABLE, Hashes, RepeatedDrive, Sketch, find_repeat
-from restock.ingest.store.summary import summarised
+from restock.ingest.store.summary import (
+    UNREADABLE,
+    Hashes,
+    RepeatedDrive,
+    Sketch,
+    find_repeat,
+    summarised,
+)
 from restock.ingest.task.schema import frame_schema
 
 # Files that no version of a table needs are kept this long: a writer may be about to commit them,

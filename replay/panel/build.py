@@ -21,8 +21,15 @@ from restock import __version__
 from restock.errors import ArgumentError, PanelError, RestockError, StoreError, expect
 from restock.files import building, expect_place
 from restock.ingest.store.location import Location
-from restock.ingest.task.condition_files import shipped
-from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
+from restock.ingest.task.conditions import (
+    NOMINAL,
+    Condition,
+    Kind,
+    Timing,
+    labels_version,
+    of_kind,
+    shipped,
+)
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.task import Task
 from restock.interrupts import interrupts_raised

@@ -9,12 +9,13 @@ from support.profile_texts import WAREHOUSE
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import parse_profile, profile_toml, read_profile_toml
-from restock.ingest.task.condition_files import settings_of, shipped
 from restock.ingest.task.conditions import (
     Condition,
     label,
     labels_version,
     probabilities,
+    settings_of,
+    shipped,
     too_near_to_call,
 )
 from restock.ingest.task.schema import steps_schema

@@ -16,9 +16,15 @@ from hypothesis import strategies as st
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task import condition_sql, conditions
-from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.condition_sql import refusal
-from restock.ingest.task.conditions import Condition, label, labels_version, let_values, primary
+from restock.ingest.task.conditions import (
+    Condition,
+    label,
+    labels_version,
+    let_values,
+    primary,
+    shipped,
+)
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import STAND_IN_LIMITS

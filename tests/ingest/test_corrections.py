@@ -26,7 +26,7 @@ from restock.ingest.relabel import (
     relabel_store,
     remove_corrections,
 )
-from restock.ingest.store.corrections import (
+from restock.ingest.store.manifest import (
     Correction,
     Moments,
     corrected_version,

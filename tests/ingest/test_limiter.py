@@ -10,8 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from restock.arrays import F64
 from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
-from restock.ingest.task.limiter import RULES, Limited, Limiter, Limits, limit
-from restock.ingest.task.robot import Robot
+from restock.ingest.task.robot import RULES, Limited, Limiter, Limits, Robot, limit
 
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task

@@ -26,9 +26,8 @@ from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.commits import delta_columns, recording_columns
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.condition_files import shipped
-from restock.ingest.task.conditions import reported, unseen
-from restock.ingest.task.limiter import NONE, SPEED, Limits, limit
+from restock.ingest.task.conditions import reported, shipped, unseen
+from restock.ingest.task.robot import NONE, SPEED, Limits, limit
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
 from restock.replay.mixture.mixture import parse_mixture

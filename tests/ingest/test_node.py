@@ -24,7 +24,7 @@ from restock.ingest.live.node import (
     with_node_topics,
 )
 from restock.ingest.profile.profile import load_profile, profile_toml
-from restock.ingest.task.limiter import Limiter
+from restock.ingest.task.robot import Limiter
 from restock.replay.store.store import Store
 from restock.train.twin.physics.episode import EpisodeSpec
 

@@ -22,8 +22,8 @@ from restock.errors import StoreError
 from restock.ingest.prepared import RemovedRecording, remove_recordings
 from restock.ingest.relabel import RecordingCorrections, correct_store
 from restock.ingest.store.compaction import compact
-from restock.ingest.store.corrections import Correction
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
+from restock.ingest.store.manifest import Correction
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store

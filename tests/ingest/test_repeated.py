@@ -13,7 +13,7 @@ from support.paths import ROOT, SHARED
 from support.stores import manifest, recording_transitions
 
 from restock.cli import main
-from restock.ingest.store.repeated import SKETCH_HASHES, row_hashes
+from restock.ingest.store.summary import SKETCH_HASHES, row_hashes
 from restock.ingest.store.writer import StoreWriter
 
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.limiter import Limits, limit
+from restock.ingest.task.robot import Limits, limit
 from restock.ingest.task.scan import Body, MovedMap, SectorMap, outline_reach
 
 BODY = Body(length_m=0.7, width_m=0.5)

@@ -25,8 +25,7 @@ from restock.ingest.containers.storage import (
     custom_data,
 )
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.profile.tag_rules import TagRules, path_pattern, resolve_tags
-from restock.ingest.task.tags import MAX_TAGS
+from restock.ingest.profile.tag_rules import MAX_TAGS, TagRules, path_pattern, resolve_tags
 from restock.replay.store.store import Store
 
 

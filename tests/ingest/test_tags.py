@@ -12,7 +12,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.task.tags import MAX_TAGS, parse_tags
+from restock.ingest.profile.tag_rules import MAX_TAGS, parse_tags
 from restock.replay.store.store import Store
 
 

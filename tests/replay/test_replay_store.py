@@ -19,10 +19,10 @@ from support.stores import TASK, manifest, one, recording_transitions, write_sto
 import restock
 from restock.cli import main
 from restock.errors import QueryError, StoreError
+from restock.ingest.profile.tag_rules import NAMED
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.version import FORMAT
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
 from restock.replay.store.definitions import column_docs, view_docs
 from restock.replay.store.store import Store, is_store

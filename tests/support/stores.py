@@ -17,8 +17,7 @@ from deltalake import write_deltalake
 
 from restock.ingest.store.summary import summarised
 from restock.ingest.store.version import FORMAT
-from restock.ingest.task.condition_files import shipped
-from restock.ingest.task.conditions import labels_version, primary
+from restock.ingest.task.conditions import labels_version, primary, shipped
 from restock.ingest.task.scan import Body
 from restock.ingest.task.schema import STEP_BITS, recording_schema, transition_schema
 from restock.ingest.task.task import Task

@@ -10,8 +10,7 @@ import pytest
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import label_table
-from restock.ingest.task.condition_files import shipped
-from restock.ingest.task.conditions import label
+from restock.ingest.task.conditions import label, shipped
 from restock.ingest.task.label_scores import true_names
 from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import STORED_SIGNALS

@@ -20,7 +20,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import ConfigError, RunError
-from restock.ingest.task.limiter import Limiter, Limits
+from restock.ingest.task.robot import Limiter, Limits
 from restock.interrupts import interrupts_raised
 from restock.toml import read_toml, typed
 from restock.train.dqn.config import LAST_SEED, TrainConfig, parse_config

@@ -64,7 +64,7 @@ class NodeCommand:
     def _play(self, recording: Path) -> int:
         from restock.cli.output import print_json
         from restock.ingest.live.pilot import Pilot, PolicyFile, play, summary
-        from restock.ingest.task.limiter import Limits
+        from restock.ingest.task.robot import Limits
 
         policy = PolicyFile(self.policy, self.profile)
         profile = policy.profile

@@ -37,7 +37,7 @@ taken, whole even if an episode ended:
 - `final_obs`, with the mask `_final_obs`;
 - in the continuous action space, and behind a limiter (`env.limits`), `action`, the nearest of the
   task's, and `action_residual`;
-- behind a limiter `limiter`, the rule that held: `restock.ingest.task.limiter.RULES`.
+- behind a limiter `limiter`, the rule that held: `restock.ingest.task.robot.RULES`.
 """
 
 from __future__ import annotations

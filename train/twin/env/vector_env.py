@@ -34,8 +34,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.limiter import Limits, limit
-from restock.ingest.task.robot import Robot, refuse_beyond_steering
+from restock.ingest.task.robot import Limits, Robot, limit, refuse_beyond_steering
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated

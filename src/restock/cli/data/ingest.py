@@ -72,7 +72,7 @@ class IngestCommand:
 
             warm_up()
         from restock.ingest.profile.profile import load_profile
-        from restock.ingest.task.tags import parse_tags
+        from restock.ingest.profile.tag_rules import parse_tags
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock ingest PATH --store STORE")
@@ -185,8 +185,8 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
 def show(outcome: IngestResult) -> None:
     """Print the counts of one recording as tables."""
     from restock.cli import output
+    from restock.ingest.profile.tag_rules import in_words
     from restock.ingest.store.manifest import UNUSED
-    from restock.ingest.task.tags import in_words
 
     row = outcome.manifest
     console = output.stdout()

@@ -446,7 +446,7 @@ class StartCommand:
             ConfigError, RecordingError: it cannot.
         """
         if self.tag:
-            from restock.ingest.task.tags import parse_tags
+            from restock.ingest.profile.tag_rules import parse_tags
 
             parse_tags(self.tag, empty=True)
         if self.out.exists() and not self.out.is_dir():

@@ -81,7 +81,7 @@ class RecordCommand:
         """Record, and print what was recorded."""
         from restock.cli import output
         from restock.files import expect_place
-        from restock.ingest.task.tags import parse_tags
+        from restock.ingest.profile.tag_rules import parse_tags
         from restock.replay.fleet.missions_file import MissionsFile
         from restock.train.twin.floors.floors import open_floors
         from restock.train.twin.floors.planner import planners
