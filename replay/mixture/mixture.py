@@ -22,7 +22,7 @@ from msgspec import Meta
 from restock.errors import ConfigError
 from restock.renamed import MIXTURE_KEYS, MIXTURES
 from restock.replay.sampling.rules import RULES, Prioritised
-from restock.toml import Checked, json_schema, parse_toml, read_toml, typed
+from restock.toml import Checked, parse_toml, read_toml, typed
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 EnvSteps = Annotated[int, Meta(ge=0)]
@@ -110,7 +110,6 @@ def _check_span(ramp: Linear) -> None:
 
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
-SCHEMA_FILE = "mixture.schema.json"
 
 AtLeastOne = Annotated[int, Meta(ge=1)]
 Count = Annotated[int, Meta(ge=0)]
@@ -407,29 +406,6 @@ def _mixture(document: dict[str, Any], where: str) -> Mixture:
     )
 
 
-def shipped_schema() -> str:
-    """Return the JSON Schema of mixture files, as it is shipped.
-
-    Editors complete and check a mixture by it: `#:schema FILE` as the first line of a TOML file
-    names it to Taplo and to VS Code's Even Better TOML.
-    """
-    return (_SHIPPED / SCHEMA_FILE).read_text(encoding="utf-8")
-
-
 def nanoseconds(moment: datetime) -> int:
     """Since 1970, exactly."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
-
-
-def mixture_schema() -> str:
-    """Return the JSON schema of the mixture structs; comments beside fields are descriptions.
-
-    `python -m restock.replay.mixture.mixture` writes the file that is shipped.
-    """
-    return json_schema(Mixture, "Restock mixture")
-
-
-if __name__ == "__main__":
-    (Path(__file__).parent / "mixtures" / SCHEMA_FILE).write_text(
-        mixture_schema(), encoding="utf-8"
-    )

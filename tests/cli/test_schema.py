@@ -16,7 +16,6 @@ from support.paths import ROOT
 
 from restock import cli
 from restock.cli.learning.schema import CONFIGS, schema_of
-from restock.replay.mixture.mixture import shipped_schema
 from restock.train.dqn.config import TrainConfig
 from restock.train.twin.physics.perturbation import PERTURBATIONS
 
@@ -121,7 +120,6 @@ def test_a_condition_has_its_rule_or_names_its_file() -> None:
 def test_keys_have_the_comments_beside_them_as_descriptions() -> None:
     record = SCHEMAS["train"]["$defs"]["RecordConfig"]["properties"]
     assert record["every_updates"]["description"] == "length of a logging interval"
-    assert json.loads(shipped_schema()) == SCHEMAS["mixture"]
 
 
 def test_the_command_prints_lists_and_writes(

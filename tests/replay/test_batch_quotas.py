@@ -126,13 +126,6 @@ def test_logged_rows_alone_fill_a_quota_that_fresh_rows_cannot_be_in() -> None:
         assert shares.forecast()[2]["short_share"] == 0
 
 
-def test_no_shelf_has_a_stratum() -> None:
-    shares = controller(48_000, rows=(7_628, 915, 0), known=(True, True, False))
-    assert shares.forecast()[2]["reason"] == (
-        "the logs have no row of it, and the twin gives no fresh rows of it"
-    )
-
-
 def test_fresh_rows_are_not_boosted_where_weights_would_take_it_away() -> None:
     shares = controller(1_800_000, corrected=(False, False, True))
     shares.at(2_000, PLENTY)

@@ -12,7 +12,7 @@ from support.stores import recording_transitions, write_store
 
 from restock import cli
 from restock.cli.learning.train import describe_run
-from restock.errors import ArgumentError, ConfigError
+from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
@@ -110,11 +110,6 @@ def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str
     assert document["curve"][-1]["cells_share"] == 1.0
     assert cli.main(["audit", str(store_path), "--capacity"]) == 0
     assert f"{document['recommended']:,} rows: " in capsys.readouterr().out
-
-
-def test_a_path_is_no_connection(store_path: Path) -> None:
-    with pytest.raises(ArgumentError, match=r'give Store\("store"\)\.connection'):
-        recommend_capacity(str(store_path))  # type: ignore[arg-type]
 
 
 def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> None:

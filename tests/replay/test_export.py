@@ -531,16 +531,6 @@ def test_a_panel_has_no_commands_but_its_store_has(store_path: Path, tmp_path: P
     assert document["provenance"]["panel"] == panel.id
 
 
-def test_nothing_is_exported_into_a_store(
-    store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = sorted(store_path.rglob("*"))
-    for out in (store_path / "a.npz", store_path / "transitions" / "a.npz"):
-        assert cli.main(["export", str(store_path), "--to", "npz", "--out", str(out)]) == 2
-        assert f"is within the store {store_path}" in " ".join(capsys.readouterr().err.split())
-    assert sorted(store_path.rglob("*")) == before
-
-
 def test_the_verb_says_what_it_wrote(
     store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -581,16 +571,6 @@ def test_a_directory_has_a_card_with_what_a_hub_reads(
         count = len(store.sql(nominal).to_arrow_table())
     assert f"| nominal | {count:,} |" in text
     assert str(store_path) not in text
-
-
-def test_a_card_without_a_licence_says_so(store_path: Path, tmp_path: Path) -> None:
-    export_dataset(store_path, "lerobot", tmp_path / "set")
-    text = (tmp_path / "set" / "README.md").read_text()
-    assert "license:" not in text
-    assert "No licence was given" in text
-    with pytest.raises(StoreError, match="not an identifier of a licence"):
-        export_dataset(store_path, "lerobot", tmp_path / "b", license="CC BY 4.0")
-    assert not (tmp_path / "b").exists()
 
 
 def test_a_library_that_is_missing_is_named_with_how_it_is_installed(

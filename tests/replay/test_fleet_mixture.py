@@ -99,19 +99,6 @@ def test_only_episodes_that_the_mixture_admits_are_held_out(fleet, by):
         assert plan.evaluation_split.sum() == pytest.approx(0.1 * (robots == "a").sum(), rel=0.5)
 
 
-def test_strata_of_robots_have_their_quotas(fleet, tmp_path):
-    strata = "".join(
-        f"[[strata]]\nname = '{robot}'\nwhere = \"robot = '{robot}'\"\nshare = {share}\n"
-        for robot, share in (("a", 0.25), ("d", 0.75))
-    )
-    panel = panel_of(fleet, "unlisted = 'drop'\n" + NO_SPLIT + strata, tmp_path / "panel")
-    assert {line.name: line.share for line in panel.strata} == {"a": 0.25, "d": 0.75}
-    assert set(found(panel, "SELECT DISTINCT stratum::VARCHAR, robot FROM rows")) == {
-        ("a", "a"),
-        ("d", "d"),
-    }
-
-
 def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     store = write_store(tmp_path / "store", tables, tags=[{}, {"robot": "a"}, {"robot": "b"}])
@@ -136,14 +123,6 @@ def test_a_split_that_holds_out_far_more_than_was_asked_says_so(tmp_path: Path) 
     assert f"holds out {plan.evaluation_split.mean():.0%} of the rows, where 10% were" in warning
     assert "1 of 2 recordings, whole" in warning
     assert not planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4").warnings
-
-
-def test_one_robot_cannot_be_split(tmp_path):
-    store = write_store(
-        tmp_path / "store", [recording_transitions(1)], tags=[{"robot": "a", "site": "o"}]
-    )
-    with pytest.raises(MixtureError, match="one robot cannot be split into a panel"):
-        panel_of(store, "[evaluation_split]\nby = 'robot'\n" + EVERY, tmp_path / "panel")
 
 
 def test_stores_of_two_fleets_are_one_fleet_in_a_mixture(fleet, tmp_path):

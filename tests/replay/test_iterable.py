@@ -12,7 +12,6 @@ import torch
 from support.panels import panel_of
 from torch.utils.data import DataLoader
 
-from restock.errors import MixtureError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.iterable import PanelDataset
 from restock.replay.panel.panel import Panel
@@ -144,10 +143,3 @@ def test_a_worker_is_sent_the_path_not_the_rows(panel: Panel) -> None:
     assert len(sent) < 2000
     again = batches(pickle.loads(sent), 0)
     assert torch.equal(again[1]["row"], batches(dataset, 0)[1]["row"])
-
-
-def test_sizes_below_one_are_refused(panel: Panel) -> None:
-    with pytest.raises(MixtureError, match="must be at least 1"):
-        PanelDataset(panel, 0, seed=0)
-    with pytest.raises(MixtureError, match="must be at least 1"):
-        PanelDataset(panel, 8, batches=0, seed=0)

@@ -110,13 +110,6 @@ def test_an_unknown_key_is_named_with_its_path(tmp_path: Path) -> None:
         load_mixture("coverag")
 
 
-def test_a_mixture_that_is_no_text_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "my.toml"
-    file.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match=r"my\.toml: is not TOML"):
-        load_mixture(file)
-
-
 def test_a_stratum_nobody_knows_is_refused(transitions: pa.Table) -> None:
     with pytest.raises(ConfigError, match="wheel_slip"):
         planned(transitions, "[[strata]]\nname = 'ice'\n")
@@ -492,9 +485,7 @@ def test_the_verb_says_what_replays_are_counted_over(
     ("words", "said"),
     [
         (["STORE", "--verify", "PANEL"], "the store has no effect with --verify"),
-        (["STORE", "--schema"], "the store has no effect with --schema"),
         (["--verify", "PANEL", "--out", "x"], "--out: has no effect with --verify"),
-        (["--schema", "--verify", "PANEL"], "--verify: has no effect with --schema"),
     ],
 )
 def test_what_the_verb_would_not_read_is_refused(

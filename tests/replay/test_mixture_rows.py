@@ -12,18 +12,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from support.panels import EVERY, NO_SPLIT, by_priority, moment, panel_of, planned
-from support.paths import ROOT
 from support.stores import CONDITIONS, recording_transitions, write_store
 
 from restock import cli
+from restock.cli.learning.schema import schema_of
 from restock.errors import MixtureError, StoreError
 from restock.replay.mixture.mixture import (
-    SCHEMA_FILE,
-    load_mixture,
-    mixture_schema,
     parse_mixture,
-    shipped_mixtures,
-    shipped_schema,
 )
 from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.build import build_panel
@@ -248,22 +243,6 @@ def test_a_missing_other_store_is_named(store_path: Path, tmp_path: Path) -> Non
             plan_panel(store.connection, mixture, store.conditions())
 
 
-def test_the_schema_is_what_the_structs_say(capsys: pytest.CaptureFixture[str]) -> None:
-    remedy = "write it with `python -m restock.replay.mixture.mixture`"
-    assert shipped_schema() == mixture_schema(), remedy
-    assert cli.main(["mix", "--schema"]) == 0
-    assert capsys.readouterr().out == shipped_schema()
-
-
-@pytest.mark.parametrize("name", shipped_mixtures())
-def test_shipped_mixtures_are_valid_by_the_schema(name: str) -> None:
-    folder = ROOT / "replay" / "mixture" / "mixtures"
-    text = (folder / f"{name}.toml").read_text(encoding="utf-8")
-    jsonschema.validate(tomllib.loads(text), json.loads(shipped_schema()))
-    load_mixture(name)
-    assert (folder / SCHEMA_FILE).is_file()
-
-
 @pytest.mark.parametrize(
     ("text", "ok"),
     [
@@ -277,7 +256,7 @@ def test_shipped_mixtures_are_valid_by_the_schema(name: str) -> None:
     ],
 )
 def test_the_schema_accepts_and_refuses_as_the_reader_does(text: str, ok: bool) -> None:
-    schema = json.loads(shipped_schema())
+    schema = json.loads(schema_of("mixture"))
     if ok:
         jsonschema.validate(tomllib.loads(text), schema)
         parse_mixture(text if "strata" in text or "each" in text else text + EVERY)

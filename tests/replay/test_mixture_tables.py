@@ -11,9 +11,7 @@ from support.long import one_in
 from support.panels import EVERY, NO_SPLIT
 from support.stores import recording_transitions, write_store
 
-import restock
 from restock import cli
-from restock.errors import ConfigError
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.mixture_tables import ROWS, STRATA
@@ -132,13 +130,3 @@ def test_what_cannot_be_mixed_is_refused_as_by_mix(
         said = capsys.readouterr().err
         assert message in said
         assert "UDF" not in said
-
-
-@pytest.mark.parametrize("table", ["mixture", "MIXTURE_ROWS", "gaps"])
-def test_an_unknown_mixture_is_refused_before_the_query_runs(folder: Path, table: str) -> None:
-    with restock.open(str(folder / "store")) as store:
-        with pytest.raises(ConfigError, match="no mixture 'nope'") as caught:
-            store.sql(f"SELECT count(*) FROM {table}( 'nope')")
-        assert "coverage" in str(caught.value.remedy)
-        assert store.sql("SELECT 'mixture of nope'").fetchall()
-        assert store.sql("FROM mixture('uniform')").fetchall()

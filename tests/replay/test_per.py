@@ -107,19 +107,6 @@ def test_weighted_draws_have_the_mean_of_uniform_ones() -> None:
     assert (plain / count > 1.5 * truth).all()
 
 
-@pytest.mark.parametrize("beta", [0.4, 1.0])
-def test_weights_leave_each_stratum_its_share_of_the_gradient(beta: float) -> None:
-    drawing, td = sampler(block=64, per_beta=beta), errors()
-    td[1::2] *= 50  # of the second stratum
-    for rows in STRATA:
-        drawing.update(rows, td[rows])
-    total = np.zeros(2)
-    for _ in range(2000):
-        _, stratum = drawing.draw()
-        total += np.bincount(stratum, drawing.drawn_weights)
-    np.testing.assert_allclose(total / total.sum(), SHARES, rtol=0.01)
-
-
 def test_beta_grows_to_one() -> None:
     numbers = Prioritised(per_beta=0.4)
     grown = [numbers.beta_after(part * BETA_BATCHES // 2) for part in (0, 1, 2, 9)]

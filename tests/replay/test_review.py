@@ -281,18 +281,6 @@ def test_a_file_that_cannot_be_taken_is_refused(
         read_verdicts(file, store)
 
 
-def test_a_review_whose_verdicts_are_empty_says_so(
-    reviewed: tuple[Path, list[DoubtfulEvent]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    file = tmp_path / "file.csv"
-    file.write_text(HEADER + f"{1:016x}/0,wheel_slip,0,3,\n")
-    main(["store", "label", str(reviewed[0]), "--corrections", str(file), "--dry-run"])
-    shown = capsys.readouterr()
-    assert "contains no verdict" in shown.out + shown.err
-
-
 def test_wrong_usage_writes_nothing(
     reviewed: tuple[Path, list[DoubtfulEvent]], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -172,15 +172,6 @@ def test_labels_put_rows_in_their_strata_and_eviction_takes_them_out() -> None:
         assert sorted(ring.by_condition.members(code)) == np.flatnonzero(codes == code).tolist()
 
 
-def test_uniform_draws_cover_every_row() -> None:
-    ring, _ = filled(capacity=25, steps=100)
-    drawn = ring.sample(5000, np.random.default_rng(0))
-    counts = np.bincount(drawn, minlength=25)
-    assert counts.min() > 100
-    with pytest.raises(MixtureError, match="empty"):
-        FreshRing(5, 1, SIZE, discount=0.9).sample(4, np.random.default_rng(0))
-
-
 def assert_alike(one: FreshRing, other: FreshRing) -> None:
     pairs = zip(leaves(one.state_dict()), leaves(other.state_dict()), strict=True)
     for (path, value), (same_path, same) in pairs:
@@ -225,11 +216,6 @@ def test_wrong_labels_are_refused() -> None:
         ring.set_labels(key, np.array([0, 1, 3]))
     with pytest.raises(MixtureError, match="2 labels"):
         ring.set_labels(key, np.array([0, 1]))
-
-
-def test_a_ring_too_small_for_its_environments_is_refused() -> None:
-    with pytest.raises(MixtureError, match="at least 48 rows"):
-        FreshRing(47, 16, SIZE, discount=0.9, n_step=3)
 
 
 def reserving(

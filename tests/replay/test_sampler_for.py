@@ -13,7 +13,7 @@ import torch
 from support.stores import CONDITIONS, recording_transitions
 from torch.utils.data import DataLoader
 
-from restock.errors import MixtureError, PanelError
+from restock.errors import MixtureError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
@@ -281,26 +281,3 @@ def test_signed_errors_and_those_of_other_rows_are_refused(
         sampler.update(batch.rows, batch.strata, -np.ones(BATCH))
     with pytest.raises(MixtureError, match=r"TD errors of shape \(3,\) for rows of shape"):
         sampler.update(batch.rows, batch.strata, np.ones(3))
-
-
-def test_seeds_and_batch_sizes_of_numpy_are_those_of_python(panels: Callable[[str], Panel]) -> None:
-    panel = panels("in turns")
-    one = sampler_for(panel, BATCH, seed=3).draw().rows
-    for seed in (np.int64(3), np.array([3])):
-        other = sampler_for(panel, np.int64(BATCH), seed=seed).draw().rows  # type: ignore[arg-type]
-        assert other.tolist() == one.tolist()
-    assert len(next(iter(PanelDataset(panel, BATCH, seed=np.int64(3), batches=1)))["row"]) == BATCH  # type: ignore[arg-type]
-    wrong: Any
-    for wrong in (-1, 1.5, None, "3", [1, -1]):
-        with pytest.raises(MixtureError, match="seed must be an integer of at least 0"):
-            sampler_for(panel, BATCH, seed=wrong)
-    for wrong in (0, 2.5, "8", None):
-        with pytest.raises(MixtureError, match="batch_size must be an integer of at least 1"):
-            sampler_for(panel, wrong, seed=0)
-
-
-def test_a_column_that_a_panel_has_not_is_named(panels: Callable[[str], Panel]) -> None:
-    with pytest.raises(
-        PanelError, match=r"no column 'rewards'\n  it has transition_id, .*, reward"
-    ):
-        panels("uniform").meta_column("rewards")

@@ -210,15 +210,6 @@ def test_a_share_too_small_for_one_batch_is_met_exactly_over_time() -> None:
     assert sum(int(quotas.next()[1]) for _ in range(1000)) == 384  # 0.003 * 128 * 1000
 
 
-def test_a_quota_of_twelve_is_twelve_in_every_batch() -> None:
-    rows = [np.arange(1000), np.arange(1000, 1050)]
-    sampler = QuotaSampler(rows, [116 / 128, 12 / 128], 128, np.random.default_rng(0))
-    for _ in range(200):
-        drawn, stratum = sampler.draw()
-        assert (drawn >= 1000).sum() == 12
-        assert ((drawn >= 1000) == (stratum == 1)).all()
-
-
 @settings(max_examples=60)
 @given(
     sizes=st.lists(st.integers(1, 30), min_size=1, max_size=5),
@@ -280,11 +271,3 @@ def test_what_is_owed_stays_within_rows_when_shares_change(
 def test_shares_that_are_no_distribution_are_refused(shares: list[float], message: str) -> None:
     with pytest.raises(MixtureError, match=message):
         Quotas(shares, 8)
-
-
-def test_a_share_on_an_empty_stratum_is_refused() -> None:
-    with pytest.raises(MixtureError, match="no rows"):
-        QuotaSampler([np.arange(3), np.arange(0)], [0.5, 0.5], 8, np.random.default_rng(0))
-    rng = np.random.default_rng(0)
-    sampler = QuotaSampler([np.arange(3), np.arange(0)], [1.0, 0.0], 8, rng)
-    assert set(sampler.draw()[0]) <= {0, 1, 2}

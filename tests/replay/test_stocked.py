@@ -19,7 +19,7 @@ from support.stores import CONDITIONS
 
 from restock import cli
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import StratumRule, load_mixture, parse_mixture
+from restock.replay.mixture.mixture import StratumRule, parse_mixture
 from restock.replay.mixture.shares import missing_rows, plan_shares
 from restock.replay.places import open_place
 from restock.replay.plan.source_plan import _refuse_below_natural, below_natural
@@ -158,20 +158,6 @@ def test_by_priority_and_a_priority_of_its_own(transitions: pa.Table) -> None:
     labels = transitions.select(["episode_id", "conditions"]).to_pylist()
     slipped = {row["episode_id"] for row in labels if "wheel_slip" in row["conditions"]}
     assert kept["wheel_slip"] == sum(row["episode_id"] in slipped for row in labels)
-
-
-def test_the_default_mixture_gives_every_condition_its_rows_and_corrects_nothing(
-    transitions: pa.Table,
-) -> None:
-    mixture = load_mixture("coverage")
-    assert mixture.each_condition is not None
-    assert mixture.each_condition.unit == "episode"
-    plan = planned(transitions, "[each_condition]\nunit = 'episode'\n")
-    assert min(line.rows for line in plan.strata if line.name != "nominal") > 0
-    assert {line.correction for line in plan.strata} == {"none"}
-    assert [line.effective_share for line in plan.strata] == pytest.approx(
-        [line.share for line in plan.strata]
-    )
 
 
 def test_what_a_stratum_misses_is_what_would_fill_it() -> None:

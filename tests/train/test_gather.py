@@ -54,23 +54,6 @@ def test_gives_the_rows_in_order(table: np.ndarray, data: st.DataObject) -> None
     assert same(given, rows, index)
 
 
-def test_rows_of_a_batch_are_its_own() -> None:
-    rows = torch.arange(12.0).view(4, 3)
-    batch = gather_rows(rows, torch.tensor([2, 0]))
-    batch.zero_()
-    assert rows[2].tolist() == [6.0, 7.0, 8.0]
-
-
-@pytest.mark.parametrize(
-    "index",
-    [torch.tensor([1, 0], dtype=torch.int32), torch.tensor([1, 5, 0, 5])[::2]],
-    ids=["int32", "strided"],
-)
-def test_other_row_numbers(index: torch.Tensor) -> None:
-    rows = torch.arange(12.0).view(4, 3)
-    assert same(gather_rows(rows, index), rows, index)
-
-
 def test_a_compiled_gather_keeps_every_bit(way: str) -> None:
     bits = np.array([0x80000000, 0x7FC00001, 0x00000001, 0xFF800000], np.uint32)
     rows, index = torch.from_numpy(bits.view(np.float32).reshape(4, 1)), torch.tensor([3, 0, 1, 2])

@@ -56,8 +56,6 @@ class MixCommand:
     """Memory limit of DuckDB, e.g. 1GB. Packing needs little more, whatever the panel's size."""
     verify: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """Check every byte of an existing panel; do nothing else."""
-    schema: bool = False
-    """Print the JSON Schema of mixture files, for editors, and nothing else."""
     json: bool = False
     """Print the plan as one JSON document."""
 
@@ -66,23 +64,17 @@ class MixCommand:
         from restock.cli import output
         from restock.cli.command_line import refuse
         from restock.ingest.store.version import given_version
-        from restock.replay.mixture.mixture import load_mixture, shipped_schema
+        from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import check_free, open_source, write_panel
         from restock.replay.plan.plan import plan_panel
         from restock.replay.store.store import Store
 
-        if self.schema or self.verify is not None:
-            alone = "--schema" if self.schema else "--verify"
-            why, remedy = f"has no effect with {alone}", "leave out one of them"
+        if self.verify is not None:
+            why, remedy = "has no effect with --verify", "leave out one of them"
             if self.store is not None:
                 raise MixtureError(f"the store {why}", where=self.store, remedy=remedy)
-            other = ("verify", "json") if self.schema else ()
-            planning = ("mixture", "out", "dry_run", "force", "version", "memory_limit", *other)
+            planning = ("mixture", "out", "dry_run", "force", "version", "memory_limit")
             refuse(self, planning, why, remedy=remedy)
-        if self.schema:
-            sys.stdout.write(shipped_schema())
-            return
-        if self.verify is not None:
             self._verify(self.verify)
             return
         if self.store is None:
