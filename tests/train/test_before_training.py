@@ -283,6 +283,7 @@ def test_rows_that_say_little_are_not_called_healthy(logs: FedRows, twin: FedRow
     assert diagnose_rows(few, twin).verdict != "HEALTHY"
 
 
+@pytest.mark.long
 def test_rows_of_which_some_episodes_never_change_can_be_judged(
     logs: FedRows, twin: FedRows
 ) -> None:

@@ -17,10 +17,8 @@ from support.toy_run import config, run_to_end
 from support.toy_run import logs as toy_logs
 
 from restock.cli import main
-from restock.errors import RunError
 from restock.train.feed.logs import Coded, Logs
-from restock.train.judge.compare import compare, diff_runs
-from restock.train.judge.diagnose import diagnose
+from restock.train.judge.compare import diff_runs
 from restock.train.run.run import FORMAT, Run
 
 EXTRA = ("update_path",)
@@ -267,18 +265,6 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     ):
         assert main(["compare", *words]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
-
-
-def test_a_comparison_without_runs_or_of_an_unknown_treatment_is_refused(tmp_path) -> None:
-    first, second = arm(tmp_path, "a", range(2)), arm(tmp_path, "b", range(2))
-    paths = [[Path(text) for text in texts] for texts in (first, second)]
-    assert compare(first, second).verdict == compare(*paths).verdict
-    with pytest.raises(RunError, match="no run was given\n  give at least one of each"):
-        compare([], second)
-    with pytest.raises(RunError, match="no run was given"):
-        diagnose([])
-    with pytest.raises(RunError, match="no treatment 'algorithms'\n  choose from algorithm, "):
-        compare(first, second, treatment="algorithms")
 
 
 def test_runs_that_are_not_independent_seeds_are_refused(tmp_path, capsys) -> None:
