@@ -16,7 +16,7 @@ from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.ingest.task.task import Rewards, Task
 from restock.train.twin.env.drivers import PlannerFollower
-from restock.train.twin.env.truth import EXPOSURES, Truth
+from restock.train.twin.env.navigation import EXPOSURES, Truth
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec

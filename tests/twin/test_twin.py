@@ -15,7 +15,6 @@ from gymnasium.vector import AutoresetMode
 
 import restock  # noqa: F401 - registers the environment
 from restock.errors import ConfigError, RunError
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import SIGNALS
 from restock.ingest.task.task import observe, reward
 from restock.ingest.task.task import terminated as is_terminated
@@ -226,11 +225,6 @@ def test_a_new_plan_makes_no_jump_in_progress() -> None:
     assert largest < 0.4  # no more than .2 s of driving
 
 
-def test_a_fixed_episode_that_is_no_spec_is_refused_at_once(env: WarehouseVectorEnv) -> None:
-    with pytest.raises(ConfigError, match="an episode must be an EpisodeSpec, got 'nominal'"):
-        env.set_episodes(["nominal"])  # type: ignore[list-item]
-
-
 def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
     made = WarehouseVectorEnv(2)
     made.set_episodes([EpisodeSpec("nominal", seed) for seed in range(3)])
@@ -317,15 +311,6 @@ def test_every_shipped_perturbation_drives(name: str) -> None:
     assert made.diverged == 0
 
 
-def test_perturbations_can_differ_between_episodes() -> None:
-    made = WarehouseVectorEnv(2)
-    heavy = PERTURBATIONS["payload"]
-    made.set_episodes([EpisodeSpec("nominal", 1), EpisodeSpec("nominal", 1, heavy)])
-    made.reset(seed=0)
-    mass = made.simulation.batch.expand("body_mass")[:, made.simulation.handles.chassis_body]
-    assert mass[1] - mass[0] == pytest.approx(60.0, rel=0.05)
-
-
 def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text('name = "fleet"\n[ranges]\npayload_kg = [0, 50]\nlatency_s = [0.05, 0.2]\n')
@@ -388,11 +373,6 @@ def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: A
         ({"seed": -1}, "seed must be 0 or more, got -1"),
         ({"render_mode": "human"}, "unknown render_mode 'human'"),
         ({"perturbation": Perturbation(timestep_s=0.003)}, "does not divide"),
-        ({"seed": "a"}, "seed must be 0 or more, got 'a'"),
-        ({"seed": 1.5}, "seed must be 0 or more, got 1.5"),
-        ({"task": "warehouse_amr"}, "task must be a Task, got 'warehouse_amr'"),
-        ({"robot": "mine.toml"}, "robot must be a Robot, got 'mine.toml'"),
-        ({"perturbation": 0.5}, "perturbation must be a Perturbation or Schedule, got 0.5"),
         ({"perturbation": "ice"}, "there is no perturbation 'ice'"),
         ({"perturbation": {"friction": 0.5}}, "unknown key `friction`"),
         ({"conditions": ["nominal"]}, r"conditions \['nominal'\] are not shares"),
@@ -422,11 +402,6 @@ def test_the_seed_of_a_single_environment_is_that_of_its_first_reset() -> None:
     assert len(unseeded) == 2
 
 
-def test_an_unknown_kind_of_episode_is_refused() -> None:
-    with pytest.raises(ConfigError, match="unknown kind of episode: 'fog'"):
-        EpisodeSpec("fog", 1)
-
-
 def test_perturbations_and_floors_may_be_given_by_name() -> None:
     made = gymnasium.make(
         "restock/Warehouse-v0", perturbation="friction", layouts=["generated:3"], seed=None
@@ -437,10 +412,10 @@ def test_perturbations_and_floors_may_be_given_by_name() -> None:
     assert heavy.perturbation == Perturbation(payload_kg=40.0)
 
 
-@pytest.mark.parametrize("seed", [-1, 2**63])
-def test_a_seed_that_no_generator_takes_is_refused(seed: int) -> None:
-    with pytest.raises(ConfigError, match=r"seed must be from 0 to 2\^63 - 1"):
-        EpisodeSpec("nominal", seed)
+@pytest.mark.parametrize(("kind", "seed"), [("fog", 1), ("nominal", -1), ("nominal", 2**63)])
+def test_an_episode_of_no_kind_or_seed_is_refused(kind: str, seed: int) -> None:
+    with pytest.raises(ConfigError):
+        EpisodeSpec(kind, seed)
 
 
 def test_the_map_is_drawn_with_its_robot() -> None:
@@ -451,7 +426,3 @@ def test_the_map_is_drawn_with_its_robot() -> None:
     x, y, _ = made.simulation.pose()[0]
     row, column = 400 - 1 - int(y * 40), int(x * 40)
     assert frame[row, column].tolist() == [240, 130, 30]  # orange, where the robot is
-
-
-def test_the_task_is_the_profiles() -> None:
-    assert WarehouseVectorEnv(1).task == load_profile("warehouse_amr").task

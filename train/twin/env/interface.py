@@ -14,7 +14,6 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.arrays import F32, Bools, Ints
-from restock.errors import ConfigError
 from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
@@ -122,16 +121,3 @@ class MadeAgain:
 
 def _make_again(kind: type[Any], given: tuple[Any, ...], named: dict[str, Any]) -> Any:
     return kind(*given, **named)
-
-
-def refuse_other_type(
-    name: str, given: object, kind: type | tuple[type, ...], such_as: str
-) -> None:
-    """Raise ConfigError if an environment's argument is neither None nor of its type."""
-    if given is not None and not isinstance(given, kind):
-        kinds = kind if isinstance(kind, tuple) else (kind,)
-        raise ConfigError(
-            f"{name} must be a {' or '.join(each.__name__ for each in kinds)}, got {given!r}",
-            where="the twin",
-            remedy=f"such as {name}={such_as}",
-        )

@@ -14,8 +14,8 @@ Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` i
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
 termination.
 
-`restock.train.twin.env.truth` lists what `info` holds. `WarehouseEnv` is one warehouse as a plain
-Gymnasium environment, without autoreset.
+`restock.train.twin.env.navigation` lists what `info` holds. `WarehouseEnv` is one warehouse as a
+plain Gymnasium environment, without autoreset.
 """
 
 from __future__ import annotations
@@ -41,10 +41,9 @@ from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
-from restock.train.twin.env.interface import Info, MadeAgain, Step, refuse_other_type
-from restock.train.twin.env.navigation import Navigation
+from restock.train.twin.env.interface import Info, MadeAgain, Step
+from restock.train.twin.env.navigation import Navigation, Truth, info_after, info_now
 from restock.train.twin.env.render import Renderer, View
-from restock.train.twin.env.truth import Truth, info_after, info_now
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS
@@ -220,18 +219,15 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
                 a condition's episodes, a robot that cannot be built or is wider than an aisle, no
-                environments, a seed below 0, an unknown action space or render mode, an argument
-                of another type, or an autoreset mode other than SAME_STEP and DISABLED.
+                environments, a seed below 0, an unknown action space or render mode, or an
+                autoreset mode other than SAME_STEP and DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
         if not isinstance(seed, int | np.integer) or seed < 0:
             raise ConfigError(f"seed must be 0 or more, got {seed!r}", where="the twin")
-        refuse_other_type("task", task, Task, "load_profile(FILE).task")
-        refuse_other_type("robot", robot, Robot, "load_profile(FILE).robot")
         if isinstance(perturbation, str | Mapping):
             perturbation = find_perturbation(perturbation, where="the twin")
-        refuse_other_type("perturbation", perturbation, (Perturbation, Schedule), '"friction"')
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(
                 f"unknown render_mode {render_mode!r}", where="the twin", remedy="give rgb_array"
