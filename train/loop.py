@@ -292,10 +292,8 @@ def _note(
     phase: str,
 ) -> None:
     """Record the update just counted; `last_sync` is the target's, before it."""
-    steps, interval = session.steps, session.interval
-    session.feed.batch(
-        steps["gradient_steps"], steps["env_steps"], batch, loss, last_sync, tail=tail
-    )
+    interval, update = session.interval, session.learner.gradient_steps
+    session.feed.batch(update, session.progress.env_steps, batch, loss, last_sync, tail=tail)
     value = float(loss.value.detach())
     _check_loss(session, batch, loss, value, phase)
     session.batches.note_errors(batch, loss.td)
@@ -309,7 +307,7 @@ def _follow(session: Session, phase: str, notify: Notify) -> None:
     step, every = learner.gradient_steps, session.config.record.every_updates
     rule = learner.target.rule
     last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
-    if isinstance(rule, Hard) and rule.syncs_at(step) and last_of_interval:
+    if isinstance(rule, Hard) and learner.target.is_due(step) and last_of_interval:
         # At a hard sync the distance is 0 by definition: what it was just before is what counts.
         interval.distance_before_sync = learner.target.distance()
         if session.probe is not None:

@@ -24,7 +24,7 @@ from restock.replay.sampling.ring import META
 from restock.replay.store.audit import capacity_of_rows
 from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught
-from restock.train.feed.logs import check_terms
+from restock.train.feed.batches import check_terms
 from restock.train.feed.practice import mission_orders
 from restock.train.feed.teacher import cloned
 from restock.train.twin.env.interface import AFTER_LOGS

@@ -27,9 +27,9 @@ from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EvaluationBuffer, Score, fixed_episodes
 from restock.train.evaluation.policies import kept_one, load_kept, save_agent
 from restock.train.feed.batch_record import FeedRecord
-from restock.train.feed.batches import Batches
+from restock.train.feed.batches import Batches, LogTerms
 from restock.train.feed.collector import Collector, FreshStrata, ring_conditions
-from restock.train.feed.logs import LogFidelity, Logs, LogTerms, Probe
+from restock.train.feed.logs import LogFidelity, Logs, Probe
 from restock.train.feed.practice import Practice
 from restock.train.feed.teacher import AskedTeacher, Imitation
 from restock.train.feed.update_blocks import UpdateBlocks

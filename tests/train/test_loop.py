@@ -22,7 +22,8 @@ from restock.ingest.task.conditions import Condition
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, EvaluationBuffer, fixed_episodes
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
-from restock.train.feed.logs import Coded, Logs, LogTerms
+from restock.train.feed.batches import LogTerms
+from restock.train.feed.logs import Coded, Logs
 from restock.train.loop import TrainingInterrupted, nothing_to_do, train
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import earlier, go_back

@@ -70,10 +70,6 @@ class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
         """The mean age of the target in updates: C / 2."""
         return self.every / 2
 
-    def syncs_at(self, gradient_step: int) -> bool:
-        """Return whether the target is copied after update number `gradient_step` (from 1)."""
-        return gradient_step % self.every == 0
-
     def __str__(self) -> str:
         return f"hard every {self.every}"
 
@@ -87,9 +83,6 @@ class Polyak(Checked, frozen=True, tag_field="rule", tag="polyak"):
     def effective_lag(self) -> float:
         """The mean age of what the target holds, in updates: 1 / tau."""
         return 1 / self.tau
-
-    def syncs_at(self, gradient_step: int) -> bool:
-        return True
 
     def __str__(self) -> str:
         return f"polyak tau {self.tau:g}"

@@ -255,13 +255,17 @@ class TargetUpdate(Stateful):
         self._online = list(online)
         self._target = list(target)
 
+    def is_due(self, gradient_step: int) -> bool:
+        """Return whether the target moves after update number `gradient_step` (from 1)."""
+        return isinstance(self.rule, Polyak) or gradient_step % self.rule.every == 0
+
     @torch.no_grad()
     def after(self, gradient_step: int) -> bool:
         """Call after update number `gradient_step` (from 1); returns whether the target moved.
 
         It does not again for an update that it has followed, as in `Learner.move`.
         """
-        if gradient_step == self.last_sync or not self.rule.syncs_at(gradient_step):
+        if gradient_step == self.last_sync or not self.is_due(gradient_step):
             return False
         self.pull()
         self.last_sync = gradient_step

@@ -30,10 +30,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.arrays import F32, Bools, Ints
-from restock.errors import ConfigError
 from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
-from restock.train.dqn.config import LossConfig
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
@@ -178,80 +176,6 @@ class Logs:
             logs_share=logs_share,
             fresh=fresh,
         )
-
-
-@dataclass(frozen=True)
-class LogTerms:
-    """Masks over the panel's rows on the learner's device; None if no loss term needs one."""
-
-    expert: Tensor | None  # (n,) bool: DQfD's margin applies
-
-    @classmethod
-    def of(cls, loss: LossConfig, logs: Logs | None, device: torch.device) -> LogTerms:
-        """Make the terms of `loss` on these logs.
-
-        Raises:
-            ConfigError: it names a behaviour policy or stratum that they do not have, or there are
-                no logs.
-        """
-        if logs is None:
-            _refuse_without_logs(loss)
-            return cls(None)
-        expert = None
-        if loss.margin:
-            expert = torch.from_numpy(_expert(loss, logs)).to(device)
-        return cls(expert)
-
-    def expert_rows(self, log_rows: Ints) -> Tensor | None:
-        """Return `expert` of some rows of the panel."""
-        if self.expert is None:
-            return None
-        return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
-
-
-def check_terms(loss: LossConfig, panel: Panel | None) -> None:
-    """Refuse what `LogTerms.of` would, from the panel's columns alone."""
-    if panel is None:
-        _refuse_without_logs(loss)
-        return
-    if loss.margin:
-        policy = Coded.of(panel.meta["behaviour_policy"])
-        _refuse_unknown(loss, policy.names, [stratum.name for stratum in panel.strata])
-
-
-def _refuse_without_logs(loss: LossConfig) -> None:
-    if loss.margin:
-        raise ConfigError(
-            "loss.margin applies to logged rows, but this run has no logs",
-            remedy="give --panel, or leave it out",
-        )
-
-
-def _refuse_unknown(loss: LossConfig, policies: list[str], strata: list[str]) -> None:
-    _known("loss.margin_policies", loss.margin_policies, policies)
-    _known("loss.margin_strata", loss.margin_strata, strata)
-
-
-def _expert(loss: LossConfig, logs: Logs) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Select the rows (n,) of `margin_policies` in `margin_strata`."""
-    policy = logs.behaviour_policy
-    _refuse_unknown(loss, policy.names, logs.strata)
-    chosen = np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])
-    if loss.margin_strata:
-        inside = np.zeros(len(chosen), np.bool_)
-        for name, rows in zip(logs.strata, logs.stratum_rows, strict=True):
-            inside[rows] = name in loss.margin_strata
-        chosen &= inside
-    return chosen
-
-
-def _known(key: str, names: tuple[str, ...], known: list[str]) -> None:
-    for name in names:
-        if name not in known:
-            raise ConfigError(
-                f"{key}: the logs have no {name!r}",
-                remedy=f"choose from what they have: {', '.join(dict.fromkeys(known))}",
-            )
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.behaviour import Labelled
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner, Terms
-from restock.train.feed.batches import Batches, ReplayBatch
-from restock.train.feed.logs import LogTerms
+from restock.train.feed.batches import Batches, LogTerms, ReplayBatch
 from restock.train.feed.teacher import Imitation
 
 LONGEST = 16  # updates of a block
