@@ -30,13 +30,14 @@ from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batch_record import LEAVE_OUT, TRAIN_SLOWER, refuse
 from restock.train.feed.batches import ReplayBatch
-from restock.train.feed.logs import Probe
+from restock.train.feed.logs import PROBE_ROWS, Probe
 from restock.train.feed.teacher import TeacherFailed
 from restock.train.feed.update_blocks import Made
 from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 
+_CONSERVATIVE_STEPS = 20_000  # environment steps in which the CQL term's weight changes
 _OFFLINE_BLOCK = 64  # updates between two looks at the clock and at Ctrl-C
 # Of a budget in seconds, what may have passed when the teacher's rows are cloned, and when the
 # updates on the logs end: the other half is for the twin.
@@ -322,7 +323,7 @@ def _conservative_weight(session: Session, phase: str) -> float:
     loss, progress = session.config.loss, session.progress
     if phase == "offline" or progress.online_from is None:
         return loss.conservative
-    part = min((progress.env_steps - progress.online_from) / loss.conservative_steps, 1.0)
+    part = min((progress.env_steps - progress.online_from) / _CONSERVATIVE_STEPS, 1.0)
     return loss.conservative + part * (loss.conservative_online - loss.conservative)
 
 
@@ -332,7 +333,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     progress, learner, interval = session.progress, session.learner, session.interval
     means = session.feed.flush(progress.env_steps, learner.gradient_steps, phase)
     if session.probe is None and phase == "online":
-        session.probe = Probe.of_ring(session.ring, session.config.record.probe_rows)
+        session.probe = Probe.of_ring(session.ring, PROBE_ROWS)
     lag = None
     if session.probe is not None:
         measured, lag = session.probe.measure(learner)

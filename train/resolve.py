@@ -169,7 +169,6 @@ def row_bytes(observation_size: int) -> int:
 
 _NATURAL = ("floor", "warmup_episodes")
 _CRITICS = 6  # copies of the network: online, target, averaged, a gradient, Adam's two
-_BEHAVIOURS = 4  # online, a gradient, Adam's two
 
 
 def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
@@ -202,11 +201,9 @@ def _refuse_no_effect(config: TrainConfig) -> None:
 def _refuse_too_large(config: TrainConfig, task: Task) -> None:
     """Raise ConfigError if the run's largest arrays exceed the machine's memory."""
     critic = _parameters(task.observation_size, config.network.hidden, len(task.actions))
-    behaviour = _parameters(task.observation_size, config.teacher.hidden, len(task.actions))
     taken = {
         "replay.ring_capacity": config.replay.ring_rows * row_bytes(task.observation_size),
         "network.hidden": 4 * _CRITICS * critic,
-        "teacher.hidden": 4 * _BEHAVIOURS * behaviour if config.teacher.filters else 0,
     }
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     needed, largest = sum(taken.values()), max(taken, key=taken.__getitem__)

@@ -29,7 +29,7 @@ from restock.train.evaluation.policies import kept_one, load_kept, save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches, LogTerms
 from restock.train.feed.collector import Collector, FreshStrata, ring_conditions
-from restock.train.feed.logs import LogFidelity, Logs, Probe
+from restock.train.feed.logs import PROBE_ROWS, LogFidelity, Logs, Probe
 from restock.train.feed.practice import Practice
 from restock.train.feed.teacher import AskedTeacher, Imitation
 from restock.train.feed.update_blocks import UpdateBlocks
@@ -41,6 +41,7 @@ from restock.train.run.run import Run, RunLock
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
+KEPT_CHECKPOINTS = 3  # the latest and those before it; the best policy is kept besides
 _MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # as `train --resume` may
 
 
@@ -176,8 +177,7 @@ class Session(Stateful):
     def save(self) -> None:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
         if self.progress.env_steps != self.progress.checkpointed_at:
-            count = self.config.record.keep_checkpoints
-            keep(self.run.latest, self.progress.checkpointed_at, count)
+            keep(self.run.latest, self.progress.checkpointed_at, KEPT_CHECKPOINTS)
         self.progress.checkpointed_at = self.progress.env_steps
         self.progress.wall_s, self._started = self.wall_s, time.monotonic()
         self.run.flush()
@@ -353,7 +353,7 @@ def open_session(
             quotas=None if strata is None else batches.controller,
         ),
         events=Events(),
-        probe=Probe.of_logs(logs, config.record.probe_rows) if logs is not None else None,
+        probe=Probe.of_logs(logs, PROBE_ROWS) if logs is not None else None,
         exploration=np.random.default_rng([seed, 5]),
         executor=executor,
         logs=logs,

@@ -14,6 +14,7 @@ def _fixed(value: str) -> str:
 _CAP = "it was removed: set it for the whole mixture"
 _LEAST = "it was removed: leave the stratum out, or give it a smaller share"
 _GONE = "it was removed, as it gained nothing (docs/evidence.md): leave it out"
+_FIXED = "it was removed: its default always applies; leave it out"
 
 TRAINING_KEYS = {
     "guard": _GONE,
@@ -30,9 +31,18 @@ TRAINING_KEYS = {
     "network.ensemble": _GONE,
     "network.quantiles": _GONE,
     "loss.calibrated": _GONE,
+    "loss.conservative_steps": _FIXED,
+    "loss.margin_size": _FIXED,
+    "loss.margin_strata": _GONE,
     "loss.munchausen": _GONE,
     "loss.munchausen_floor": _GONE,
     "loss.munchausen_temperature": _GONE,
+    "record.keep_checkpoints": _FIXED,
+    "record.probe_rows": _FIXED,
+    "teacher.hidden": _FIXED,
+    "teacher.learning_rate": _FIXED,
+    "teacher.logs_share": _FIXED,
+    "teacher.target": "it was removed: the target's maximum is always over plausible actions",
 }
 PROFILE_KEYS = {
     "clock.jump_s": _fixed("1 s"),

@@ -38,7 +38,6 @@ SMALL: dict[str, Any] = {
     "record": {
         "every_updates": 50,
         "audit_share": 0.1,
-        "probe_rows": 8,
         "checkpoint_every_env_steps": 400,
         "tensorboard": False,
     },

@@ -70,7 +70,7 @@ def test_a_run_interrupted_before_it_learned_in_the_twin(
 
 
 def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
-    settings = config(record={"checkpoint_every_env_steps": 700, "keep_checkpoints": 3})
+    settings = config(record={"checkpoint_every_env_steps": 700})
     live = run_to_end(tmp_path / "a", settings)
     folder = live.run.latest.parent
     shutil.copy(folder / "env_steps_000000700.safetensors", live.run.latest)
@@ -88,7 +88,7 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(
         *("network.hidden=[16]", "env.num_envs=4", "replay.batch_size=16", "schedule.env_steps=80"),
         *("schedule.warmup_env_steps=20", "schedule.updates_per_env_step=1"),
         *("evaluation.every_env_steps=80", "evaluation.episodes=1", "record.every_updates=10"),
-        *("record.tensorboard=false", "record.probe_rows=8"),
+        "record.tensorboard=false",
     ]
     live = prepare_new(path, None, None, settings).open()
     interrupted(live, lambda: live.progress.env_steps >= 60)

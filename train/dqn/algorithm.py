@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
 
 
+MARGIN = 0.8  # how much better an expert's action must be (arXiv:1704.03732)
+
+
 @dataclass(frozen=True)
 class TrainingBatch:
     """What one update learns from. Rows from logs come first."""
@@ -134,7 +137,7 @@ class DQN:
             term = conservative_penalty(q[:logged], action, batch.conservative)
             terms.append(term * share)
         if batch.expert is not None:
-            term = margin_penalty(q[:logged], action, batch.expert, self.settings.margin_size)
+            term = margin_penalty(q[:logged], action, batch.expert, MARGIN)
             terms.append(self.settings.margin * term * share)
         return sum(terms[1:], terms[0]) if terms else None
 

@@ -32,6 +32,8 @@ from restock.train.dqn.network import (
 )
 
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
+HIDDEN = (256, 256)  # widths of the behaviour network's layers
+_LEARNING_RATE = 1e-3
 _SEED = 1 << 32  # apart from that of Q, which may be as large
 
 
@@ -82,13 +84,12 @@ PolicyNetwork = QNetwork | FilteredNetwork
 
 
 def make_behaviour(
-    config: TeacherConfig,
     observation_size: int,
     actions: int,
     generator: torch.Generator | None = None,
 ) -> QNetwork:
     """Return the network whose softmax is G."""
-    return QNetwork(observation_size, actions, hidden=config.hidden, generator=generator)
+    return QNetwork(observation_size, actions, hidden=HIDDEN, generator=generator)
 
 
 def make_policy(config: TrainConfig, observation_size: int, actions: int) -> PolicyNetwork:
@@ -96,7 +97,7 @@ def make_policy(config: TrainConfig, observation_size: int, actions: int) -> Pol
     values = make_network(config, observation_size, actions)
     if not config.teacher.filters:
         return values
-    return FilteredNetwork(values, make_behaviour(config.teacher, observation_size, actions))
+    return FilteredNetwork(values, make_behaviour(observation_size, actions))
 
 
 class Behaviour(Stateful):
@@ -122,9 +123,9 @@ class Behaviour(Stateful):
     ) -> None:
         self.config, self._averaging = config, averaging
         generator = torch.Generator().manual_seed(_SEED + seed)
-        self.network = make_behaviour(config, observation_size, actions, generator).to(device)
+        self.network = make_behaviour(observation_size, actions, generator).to(device)
         self.average = clone(self.network)
-        self.optimizer = FlatAdam(self.network, config.learning_rate, compiled=path == "native")
+        self.optimizer = FlatAdam(self.network, _LEARNING_RATE, compiled=path == "native")
         self._slow = FlatParameters(self.average, learns=False).values
         learns = self.optimizer
         self._logits = differentiable(path, self.network, learns.values, learns.gradient)

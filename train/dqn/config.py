@@ -53,11 +53,8 @@ class LossConfig(Checked, frozen=True):
     huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
     conservative: NonNegative = 0.1  # weight of the CQL term on rows from logs, while offline
     conservative_online: NonNegative = 0.0  # weight that it changes to, linearly, when online
-    conservative_steps: Count = 20_000  # environment steps of that change
     margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
-    margin_size: NonNegative = 0.8  # the margin: how much better their action must be
     margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin
-    margin_strata: tuple[str, ...] = ()  # only in these strata of the logs; empty: all
 
 
 class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
@@ -137,18 +134,14 @@ class TeacherConfig(Checked, frozen=True):
     # None: the operator where the task has a goal, else none.
     source: str | None = None
     ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; or a schedule
-    target: Literal["filtered", "all"] = "filtered"  # actions over which the target maximises
     policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
     # And rows of other drivers' episodes that reached their goal without one of `policies`: before
     # the first environment step, and for good where nobody is asked. None: where goals are logged
     # and nobody is asked in the twin.
     successes: bool | None = None
-    logs_share: Share = 0.25  # share of cloned rows in its online batch
-    # Of it on those rows, before any of the critic's; None: as many as the critic's will be, and
+    # Updates on those rows, before any of the critic's; None: as many as the critic's will be, and
     # of more than 5,000 rows in proportion, up to ten times as many.
     offline_updates: NonNegativeInt | None = None
-    learning_rate: Positive = 1e-3
-    hidden: tuple[Count, ...] = (256, 256)  # widths of the behaviour network
     # It learns from each row's mirror image as often as from the row: of a teacher who keeps to no
     # side. None: where the twin's operator is asked and each action has its opposite.
     mirror: bool | None = None
@@ -170,8 +163,6 @@ class TeacherConfig(Checked, frozen=True):
                 "source must be none, operator, logs, or your own teacher as module:name,"
                 f" got {self.source!r}"
             )
-        if not self.hidden:
-            raise ValueError("hidden must name the width of at least one layer, got []")
 
 
 class EnvConfig(Checked, frozen=True):
@@ -223,9 +214,7 @@ class EvaluationConfig(Checked, frozen=True):
 class RecordConfig(Checked, frozen=True):
     every_updates: Count = 500  # length of a logging interval
     audit_share: Share = 0.01  # share of batches whose rows are all recorded
-    probe_rows: NonNegativeInt = 64  # rows per condition, fixed for the whole run
     checkpoint_every_env_steps: Count = 40_000
-    keep_checkpoints: Count = 3  # number of latest ones; the best is always kept
     tensorboard: bool = True
     trackers: tuple[Literal["wandb", "mlflow"], ...] = ()  # trackers that also get the curves
 

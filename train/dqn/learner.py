@@ -110,7 +110,6 @@ class Learner(Stateful):
             ratio = self.behaviour.ratio
             self._acting = FilteredNetwork(self.network, self.behaviour.network, ratio)
             self.policy = FilteredNetwork(self.policy_network, self.behaviour.average, ratio)
-        self._filters_target = config.teacher.target == "filtered"
 
     def update(
         self,
@@ -201,7 +200,7 @@ class Learner(Stateful):
 
     def _plausible(self, next_observation: Tensor) -> Tensor | None:
         """Return the actions (B, A) that the target's maximum may look at; None: all."""
-        if self.behaviour is None or not self._filters_target:
+        if self.behaviour is None:
             return None
         return self.behaviour.plausible(next_observation)
 

@@ -244,15 +244,14 @@ class LogTerms:
         """Make the terms of `loss` on these logs.
 
         Raises:
-            ConfigError: it names a behaviour policy or stratum that they do not have, or there are
-                no logs.
+            ConfigError: it names a behaviour policy that they do not have, or there are no logs.
         """
         if logs is None:
             _refuse_without_logs(loss)
             return cls(None)
         expert = None
         if loss.margin:
-            expert = torch.from_numpy(_expert(loss, logs)).to(device)
+            expert = torch.from_numpy(_expert(loss, logs.behaviour_policy)).to(device)
         return cls(expert)
 
     def expert_rows(self, log_rows: Ints) -> Tensor | None:
@@ -266,10 +265,8 @@ def check_terms(loss: LossConfig, panel: Panel | None) -> None:
     """Refuse what `LogTerms.of` would, from the panel's columns alone."""
     if panel is None:
         _refuse_without_logs(loss)
-        return
-    if loss.margin:
-        policy = Coded.of(panel.meta["behaviour_policy"])
-        _refuse_unknown(loss, policy.names, [stratum.name for stratum in panel.strata])
+    elif loss.margin:
+        _refuse_unknown(loss, Coded.of(panel.meta["behaviour_policy"]).names)
 
 
 def _refuse_without_logs(loss: LossConfig) -> None:
@@ -280,30 +277,18 @@ def _refuse_without_logs(loss: LossConfig) -> None:
         )
 
 
-def _refuse_unknown(loss: LossConfig, policies: list[str], strata: list[str]) -> None:
-    _known("loss.margin_policies", loss.margin_policies, policies)
-    _known("loss.margin_strata", loss.margin_strata, strata)
+def _expert(loss: LossConfig, policy: Coded) -> Bools:
+    """Select the rows (n,) of `margin_policies`."""
+    _refuse_unknown(loss, policy.names)
+    return np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])
 
 
-def _expert(loss: LossConfig, logs: Logs) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Select the rows (n,) of `margin_policies` in `margin_strata`."""
-    policy = logs.behaviour_policy
-    _refuse_unknown(loss, policy.names, logs.strata)
-    chosen = np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])
-    if loss.margin_strata:
-        inside = np.zeros(len(chosen), np.bool_)
-        for name, rows in zip(logs.strata, logs.stratum_rows, strict=True):
-            inside[rows] = name in loss.margin_strata
-        chosen &= inside
-    return chosen
-
-
-def _known(key: str, names: tuple[str, ...], known: list[str]) -> None:
-    for name in names:
-        if name not in known:
+def _refuse_unknown(loss: LossConfig, policies: list[str]) -> None:
+    for name in loss.margin_policies:
+        if name not in policies:
             raise ConfigError(
-                f"{key}: the logs have no {name!r}",
-                remedy=f"choose from what they have: {', '.join(dict.fromkeys(known))}",
+                f"loss.margin_policies: the logs have no {name!r}",
+                remedy=f"choose from what they have: {', '.join(dict.fromkeys(policies))}",
             )
 
 

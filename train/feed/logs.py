@@ -256,6 +256,7 @@ def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:
     return splitmix64(key.astype(np.uint64) + np.uint64(GOLDEN))
 
 
+PROBE_ROWS = 64  # of a probe, per condition, fixed for the whole run
 ROWS = 512  # of each condition, chosen by hash
 _MIN_ROWS = 50  # of a condition, to count
 _SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean

@@ -267,6 +267,7 @@ def _imported(source: str) -> Any:
 
 
 _MEASURED = 128  # rows a condition
+_LOGS_SHARE = 0.25  # of an online batch, where a teacher is asked
 
 
 def rows_of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
@@ -352,7 +353,7 @@ class Imitation(Stateful):
         self.offline_updates = (config.offline_updates or 0) if len(self._offline.rows) else 0
         self._logged = 0  # of an online batch
         if len(self._online.rows):
-            self._logged = round(batch_size * config.logs_share) if config.asks else batch_size
+            self._logged = round(batch_size * _LOGS_SHARE) if config.asks else batch_size
 
     @property
     def cloned(self) -> Ints:

@@ -53,8 +53,8 @@ class TrainCommand:
     resume: Path | None = None
     """Continue this run from its latest checkpoint."""
     from_env_steps: int | None = None
-    """With --resume: continue from the checkpoint taken after N environment steps
-    (record.keep_checkpoints sets how many are kept). Everything after it is discarded."""
+    """With --resume: continue from the checkpoint taken after N environment steps; the last three
+    are kept. Everything after it is discarded."""
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
@@ -284,7 +284,7 @@ def _print(
     )
 
 
-_OF_LOGS = ("policies", "successes", "logs_share", "offline_updates")  # of a teacher's settings
+_OF_LOGS = ("policies", "successes", "offline_updates")  # of a teacher's settings
 
 
 def describe_run(prepared: Prepared) -> str:
