@@ -84,7 +84,7 @@ def test_queried_teacher_learns_online_from_its_rows_alone(
         episode=coded(["alone"] * half + ["operators"] * half),
     )
     for source, online in (("logs", len(shelf)), ("operator", half)):
-        teacher = {"source": source, "successes": True, "hidden": [16]}
+        teacher = {"source": source, "successes": True}
         live = session(
             tmp_path / source,
             config(teacher=teacher, schedule={"env_steps": 4}),

@@ -46,6 +46,8 @@ def test_the_target_rule_is_written_with_its_name() -> None:
         ("target.tau=2", r"target\.tau must be in \(0, 1\], got 2"),
         ("seed=-1", r"seed must be in \[0, 2147483647\], got -1"),
         ("evaluation.seed=-5", r"evaluation\.seed must be in \[0, 2147483647\], got -5"),
+        ("teacher.source='the planner'", "source must be none, operator, logs"),
+        ("teacher.ratio=1.5", "ratio"),
         ("threads=0", r"threads must be in \[1, 1024\], got 0"),
         (
             "loss.n_step=1000000",

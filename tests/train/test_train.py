@@ -140,23 +140,6 @@ def test_quota_that_nothing_can_fill_is_named_first(
 
 
 @pytest.mark.long  # test_loop shows it on the corridor
-def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    # Random driving for longer than an episode, so that several end.
-    argv = ["train", "--out", str(path), "--env-steps", "2400", *TINY]
-    assert main([*argv, "--set", "schedule.warmup_env_steps=2400", "--set", "env.num_envs=8"]) == 0
-    document = json.loads((path / "config.json").read_text())
-    assert document["panel"] is None
-    assert document["config"]["epsilon"]["start"] == 1.0
-    episodes = pq.read_table(path / "episodes.parquet").to_pylist()
-    assert len(episodes) >= 8
-    found = {name for row in episodes for name in row["conditions"]}
-    assert found <= {condition.name for condition in load_profile("warehouse_amr").conditions}
-    assert "near_collision" in found  # random driving bumps into racks
-    assert all((row["bumps"] == 0) or not row["success"] for row in episodes)
-
-
-@pytest.mark.long  # test_loop shows it on the corridor
 def test_resuming_in_the_twin_is_bit_exact(
     tmp_path: Path, panel: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -284,36 +267,6 @@ def test_measures_on_fresh_steps_do_not_depend_on_a_kill(tmp_path: Path) -> None
     whole = trained(tmp_path / "whole", None)
     assert {row["env_steps"] for row in whole} == {40, 80, 120}
     assert trained(tmp_path / "killed", 80) == whole
-
-
-@pytest.mark.long  # test_eval_run has the shorter ones
-def test_eval_drives_everyone_through_the_same_episodes(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["eval", str(trained), "--episodes", "2", "--perturbations", "none,latency"]
-    assert main([*argv, "--policies", "agent,planner", "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
-    assert (
-        shown["perturbations"]["latency"]["latency_s"] > shown["perturbations"]["none"]["latency_s"]
-    )
-    rows = pq.read_table(trained / "eval" / "episodes.parquet").to_pylist()
-    seeds = {
-        (policy, perturbation): [
-            (row["condition"], row["episode_seed"], row["block"])
-            for row in rows
-            if (row["policy"], row["perturbation"]) == (policy, perturbation)
-        ]
-        for policy in ("agent", "planner")
-        for perturbation in ("none", "latency")
-    }
-    first = seeds["agent", "none"]
-    assert len(first) == 8
-    assert all(episodes == first for episodes in seeds.values())
-    assert all((row["failure"] is None) == row["success"] for row in rows)
-    for row in shown["results"]:
-        assert 0 <= row["success_low"] <= row["success"] <= row["success_high"] <= 1
-    nominal = [r for r in rows if r["policy"] == "planner" and r["condition"] == "nominal"]
-    assert any(row["success"] for row in nominal)
 
 
 @pytest.mark.long  # test_film and test_eval_run have the shorter ones

@@ -59,7 +59,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "hard target": {"target": {"rule": "hard", "every": 13}},
     "margin": {"loss": {"margin": 0.5, "margin_policies": ["operator"]}},
     "clipped": {"optimizer": {"learning_rate": 3e-3, "max_grad_norm": 0.1}},
-    "teacher": {"teacher": {"source": "logs", "hidden": [16], "offline_updates": 20}},
+    "teacher": {"teacher": {"source": "logs", "offline_updates": 20}},
 }
 
 
