@@ -65,7 +65,7 @@ class AddedFile:
 
 
 def add_action(file: AddedFile, now_ms: int) -> AddAction:
-    """What a commit says of a file."""
+    """Return what a commit says about a file."""
     stats = json.dumps({"numRecords": file.rows})
     return AddAction(file.path, file.size, {}, now_ms, True, stats)
 
@@ -81,12 +81,12 @@ def parquet_options(schema: pa.Schema) -> dict[str, Any]:
 
 
 def compacted_name() -> str:
-    """The path of a file of several ingests."""
+    """Return a new path for a file of several ingests."""
     return f"compacted/{uuid.uuid4().hex}.parquet"
 
 
 def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
-    """A compacted file of transitions without the ingests that are not kept."""
+    """Write a compacted file of transitions without the ingests that are not kept."""
     path = f"{TRANSITIONS}/{file.path}"
     with damage_named(place, path):
         schema = place.read_schema(path)
@@ -103,8 +103,7 @@ def merge(
     extra: Sequence[pa.Table] = (),
     summarised: bool = False,
 ) -> AddedFile:
-    """One file of what these files of a table hold of some ingests, in their order, and of `extra`
-    manifests.
+    """Write one file of some ingests in these files, in their order, and of `extra` manifests.
 
     What it holds is listed in it if the manifests describe these rows: Restock wrote the files, or
     all that others changed in them is `summarised` again. A row group at a time is in memory.
@@ -140,8 +139,9 @@ def merge(
 
 @contextmanager
 def written_whole(place: Location, path: str) -> Iterator[None]:
-    """Delete a file that the block writes where it fails or is interrupted: on a full disk its
-    part would keep the disk full.
+    """Delete a file that the block writes if it fails or is interrupted.
+
+    On a full disk its part would keep the disk full.
 
     Raises:
         StoreError: it cannot be written.
@@ -157,7 +157,7 @@ def written_whole(place: Location, path: str) -> Iterator[None]:
 
 
 def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
-    """What is wrong where a store cannot be written, and what to do."""
+    """Return the error of a store that cannot be written, with what to do."""
     said = str(error)
     if re.search(r"No space left|Disk quota exceeded|os error (28|122)\b", said):
         return StoreError(
@@ -173,7 +173,7 @@ def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
 
 
 def conformed(rows: pa.Table, schema: pa.Schema) -> pa.Table:
-    """A table with the columns of a schema, in its order; null where it has none."""
+    """Return a table with the columns of a schema, in its order; null if it has none."""
     columns = [
         rows[field.name].cast(field.type)
         if field.name in rows.column_names
@@ -252,7 +252,7 @@ class TableCommits(StoreReader):
         self.again_on_conflict(create)
 
     def expect_folder(self) -> None:
-        """Raises StoreError where there is a file, a panel or a run in place of the store."""
+        """Raise StoreError if there is a file, a panel or a run in place of the store."""
         folder = self.path.folder
         if folder is None or not folder.exists():
             return
@@ -266,8 +266,10 @@ class TableCommits(StoreReader):
             )
 
     def expect_store(self) -> None:
-        """Raises StoreError where there is no store, not all of it, or one that others' features
-        protect from what takes rows out."""
+        """Raise StoreError if there is no whole store, or if rows cannot be taken out of it.
+
+        Other tools' features can protect it from that.
+        """
         self.expect_folder()
         self.path.expect_both_tables()
         if not self.path.has_table(TRANSITIONS):
@@ -311,8 +313,9 @@ class TableCommits(StoreReader):
             return self.again_on_conflict(attempt), replaced
 
     def take_out(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
-        """Take recordings (with the ingests that they are there as) out of `transitions`, all or
-        none of them; their manifests are left to the caller.
+        """Take recordings out of `transitions` by their ingests, all or none of them.
+
+        Their manifests are left to the caller.
 
         Returns the table's version that they were read from, and the newest, without them.
 
@@ -349,8 +352,10 @@ class TableCommits(StoreReader):
         rewritten: list[AddedFile],
         now_ms: int,
     ) -> list[AddAction | RemoveAction]:
-        """What takes the rows of recordings out of `transitions`: their files, and of files that
-        hold others too, new ones without them, which are added to `rewritten`."""
+        """Return what takes the rows of recordings out of `transitions`: their files.
+
+        Of files that hold others too, new ones without them are added to `rewritten`.
+        """
         actions: list[AddAction | RemoveAction] = []
         for file in active:
             kept = [one for one in file.ingests if one.recording_id not in recordings]
@@ -513,12 +518,12 @@ def _turns(table: DeltaTable, recordings: Sequence[str]) -> list[Transaction]:
 
 
 def recording_columns() -> pa.Schema:
-    """The columns of `recordings`: the manifest's, and the summary's."""
+    """Return the columns of `recordings`: the manifest's, and the summary's."""
     return pa.schema([*recording_schema(), *SUMMARY_SCHEMA])
 
 
 def delta_columns(schema: pa.Schema) -> pa.Schema:
-    """The same columns without lists of fixed size, which Delta does not know."""
+    """Replace lists of fixed size, which Delta does not know, by plain lists."""
     return pa.schema(
         [
             field.with_type(pa.list_(field.type.value_type))
@@ -530,7 +535,7 @@ def delta_columns(schema: pa.Schema) -> pa.Schema:
 
 
 def plain_lists(rows: pa.Table) -> pa.Table:
-    """The same rows with `delta_columns`; the lists' values stay where they are."""
+    """Return the rows with `delta_columns`; the lists' values stay in their memory."""
     schema = delta_columns(rows.schema).with_metadata(rows.schema.metadata)
     columns = []
     for field, column in zip(schema, rows.columns, strict=True):

@@ -79,8 +79,9 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
 
 
 def fold(store: StoreWriter, done: Compacted | None = None, changed: Collection[str] = ()) -> None:
-    """Make one file of the manifests of all recordings, with new summaries of the ingests whose
-    rows another tool `changed`.
+    """Make one file of the manifests of all recordings.
+
+    Ingests whose rows another tool `changed` get new summaries.
 
     Manifests whose rows are not there yet, those of replaced rows, and files that have many already
     stay as they are.
@@ -175,8 +176,10 @@ def _of(manifests: pa.Table, one: Ingest) -> pa.Table:
 
 
 def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
-    """Manifests of replaced rows in compacted files, which older versions need, as files of their
-    own: they are found by their names until cleaning removes them."""
+    """Write manifests of replaced rows in compacted files as files of their own.
+
+    Older versions need them: they are found by their names until cleaning removes them.
+    """
     live = {one.ingest_id for one in plan.live}
     held = [one for file in plan.chosen for one in file.ingests]
     gone = [one for one in held if one.ingest_id not in live]
@@ -189,7 +192,7 @@ def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
 
 
 def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
-    """The ingests of these files whose rows are not those that their manifests describe."""
+    """Return the ingests of these files whose rows are not those that their manifests describe."""
     names = pa.schema([("ingest_id", pa.string()), ("transitions", pa.int64())])
     reported = store.manifests([one for file in files for one in file.ingests], names)
     written = dict(zip(*(reported[name].to_pylist() for name in names.names), strict=True))
@@ -197,8 +200,10 @@ def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
 
 
 def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
-    """Files of transitions to make one of, robot by robot in the order of their time; one that
-    another tool wrote may be alone."""
+    """Group files of transitions to join, robot by robot in the order of their time.
+
+    One that another tool wrote may be alone.
+    """
     files = store.files(TRANSITIONS)
     small = [file for file in files if file.rows < FILE_ROWS / 2 or not file.listed]
     names = ("ingest_id", "tags", "start_stamp_ns")

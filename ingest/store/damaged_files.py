@@ -179,7 +179,7 @@ def unverified_files(place: Location, paths: Iterable[str]) -> int:
 
 
 def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
-    """What is wrong with files of a store that `verify_files` found, and what to do."""
+    """Return the error of files that `verify_files` found damaged, with what to do."""
     more = ""
     if len(damaged) > 1:
         count = counted(len(damaged) - 1, "more file")
@@ -204,7 +204,7 @@ def _stamps(place: Location) -> dict[str, list[int]]:
 
 
 def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, list[int]]:
-    """The files that were found whole and have not changed since."""
+    """Return the files that were found whole and have not changed since."""
     try:
         with place.reading(VERIFIED) as source:
             reported = json.loads(source.read())
@@ -222,8 +222,7 @@ def _damaged(place: Location, paths: Sequence[str]) -> list[str]:
 
 
 def is_damaged(place: Location, path: str) -> bool:
-    """Whether a file of the store is missing, is no whole Parquet file, or has a page that does
-    not match its checksum.
+    """Return whether a file is missing, is no whole Parquet file, or fails its checksums.
 
     Raises:
         StoreError: it cannot be read for another reason: permissions, the disk, the network.
@@ -244,7 +243,7 @@ def is_damaged(place: Location, path: str) -> bool:
 
 
 def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:
-    """The files that a damaged one was joined from, with those ingests that are missing now.
+    """Return the files that a damaged one was joined from, with those ingests that are missing now.
 
     An empty list where they are gone, or do not have all that is missing.
     """
@@ -269,8 +268,10 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
 
 
 def _joined_from(place: Location, name: str, path: str) -> list[str]:
-    """The files that the commit which added a file took out, by Delta's log; none where the log
-    does not go back to it."""
+    """Return the files that the commit which added a file took out, by Delta's log.
+
+    There are none if the log does not go back to it.
+    """
     log = f"{name}/_delta_log"
     commits = [one for one in place.listing(log) if one.endswith(".json")]
     for commit in sorted(commits, reverse=True):
@@ -295,7 +296,7 @@ def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredF
 
 
 def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
-    """The recordings that have rows and no manifest, or a manifest and no rows.
+    """Return the recordings that have rows and no manifest, or a manifest and no rows.
 
     Of the latter, some may be those of a writer between its two commits: it does no harm to ingest
     them again.
@@ -326,7 +327,7 @@ def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[Lost
 
 
 def _source_files(place: Location, file: StoredFile) -> dict[str, str]:
-    """The recordings that rows are of, as the rows name them, by ingest."""
+    """Return the recordings that rows are of, as the rows name them, by ingest."""
     names = ["ingest_id", "source_file"]
     rows = place.read(f"{TRANSITIONS}/{file.path}", columns=names)
     return dict(zip(*(rows[name].to_pylist() for name in names), strict=True))

@@ -70,7 +70,7 @@ def own_path(recording_id: str, ingest_id: str) -> str:
 def stored_files(
     place: Location, name: str, table: DeltaTable, *, without: Collection[str] = ()
 ) -> list[StoredFile]:
-    """The active files of a store's table `name`, with what each holds; `without` those paths.
+    """Return the active files of table `name`, with what each holds; `without` those paths.
 
     Raises:
         StoreError: one is of another kind, or it cannot be read.
@@ -92,8 +92,9 @@ def stored_files(
 
 
 def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -> dict[str, int]:
-    """How many rows each ingest has whose rows need not be those that Restock wrote, which its
-    manifest describes: another tool wrote their file, or their number is another.
+    """Count the rows of each ingest that need not be those that its manifest describes.
+
+    Another tool wrote their file, or their number is another.
 
     `written` is the number of rows by ingest, as the manifests say.
     """
@@ -112,7 +113,7 @@ def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -
 
 
 def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, int | None]]:
-    """What Delta's log says of the active files: path, rows, bytes, when it was added in ms."""
+    """Return path, rows, bytes and time of addition (ms) of the active files, by Delta's log."""
     actions = table.get_add_actions(flatten=True)
     columns = [
         actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
@@ -129,7 +130,7 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
 
 
 def held_by(place: Location, name: str, path: str) -> StoredFile:
-    """A file of a table that need not be active, with what it holds. Raises as `stored_files`."""
+    """Return a file of a table, active or not, with what it holds. Raises as `stored_files`."""
     with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
         rows = open_parquet(source).metadata.num_rows
     if own := _named(path, rows):
@@ -139,7 +140,7 @@ def held_by(place: Location, name: str, path: str) -> StoredFile:
 
 @contextmanager
 def damage_named(place: Location, path: str) -> Iterator[None]:
-    """What goes wrong while a file of the store is read, as a StoreError that names the file."""
+    """Turn what goes wrong while a file of the store is read into a StoreError that names it."""
     try:
         yield
     except MemoryError:  # which one of Arrow's errors is, too
@@ -157,8 +158,10 @@ def damage_named(place: Location, path: str) -> Iterator[None]:
 
 
 def by_system(error: BaseException) -> bool:
-    """Whether a file could not be read for its permissions or the disk: Parquet's reader sets no
-    errno. What goes wrong on the way to S3 is a StoreError before."""
+    """Return whether a file could not be read because of its permissions or the disk.
+
+    Parquet's reader sets no errno. What goes wrong on the way to S3 is a StoreError before.
+    """
     return (
         isinstance(error, OSError)
         and error.errno is not None
@@ -167,7 +170,7 @@ def by_system(error: BaseException) -> bool:
 
 
 def damage_remedy(place: Location, path: str) -> str:
-    """What to do where a file of the store is damaged or missing."""
+    """Return what to do if a file of the store is damaged or missing."""
     name, _, file = path.partition("/")
     if name == FRAMES or (name == TRANSITIONS and OWN_PATH.fullmatch(file)):
         return "restore the file from a copy, or ingest its recording again with --force"
@@ -178,7 +181,7 @@ def damage_remedy(place: Location, path: str) -> str:
 
 
 def packed_ingests(ingests: Sequence[Ingest]) -> bytes:
-    """The list of what a compacted file holds, for its metadata."""
+    """Pack the list of what a compacted file holds, for its metadata."""
     return json.dumps(ingests, separators=(",", ":")).encode()
 
 
@@ -193,7 +196,7 @@ def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
 
 
 def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
-    """What a file holds by its name, where it says that."""
+    """Return what a file holds by its name, if that says it."""
     if rows is None or not OWN_PATH.fullmatch(path):
         return None
     recording_id, file = path.split("/")
@@ -202,7 +205,7 @@ def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
 
 @lru_cache(maxsize=4096)  # files never change
 def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bool]:
-    """What a file holds, and whether Restock listed it there."""
+    """Read what a file holds, and whether Restock listed it there."""
     where = f"{name}/{path}"
     with damage_named(place, where), place.reading(where) as source:
         file = open_parquet(source)
@@ -249,7 +252,7 @@ class StoreReader:
         self.path.expect_both_tables()
 
     def live(self, recording_id: str | None = None, version: Version | None = None) -> pa.Table:
-        """The manifest rows whose transitions are in the store (of one recording, or of all).
+        """Return the manifest rows whose transitions are in the store, of one recording or all.
 
         Of a version, or as it is now.
         """
@@ -335,8 +338,10 @@ class StoreReader:
         return with_ends(rows, reported.get(ingest_id))
 
     def _files_of(self, ingest_id: str) -> list[str]:
-        """The active files of transitions that hold rows of an ingest; the log is read again only
-        where it went on."""
+        """Return the active files of transitions that hold rows of an ingest.
+
+        The log is read again only if it went on.
+        """
         if self._opened is None and not self.path.has_table(TRANSITIONS):
             return []
         version = None
@@ -353,8 +358,10 @@ class StoreReader:
         return self._by_ingest.get(ingest_id, [])
 
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
-        """The recording of each of these ingests and the ends of its episodes, as `episode_ends`
-        gives them; without those that have none."""
+        """Yield the recording of each of these ingests and the ends of its episodes.
+
+        They are as `episode_ends` gives them; ingests that have none are left out.
+        """
         from restock.ingest.store.transitions import episode_ends
 
         reported = self._packed_ends(ingests)
@@ -364,17 +371,17 @@ class StoreReader:
                 yield one.recording_id, ends
 
     def _packed_ends(self, ingests: Sequence[Ingest]) -> dict[str, str | None]:
-        """What manifests keep of the ends of episodes, by ingest."""
+        """Return what manifests keep of the ends of episodes, by ingest."""
         schema = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
         reported = self.manifests(ingests, schema)
         return dict(zip(*(reported[name].to_pylist() for name in schema.names), strict=True))
 
     def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
-        """The active files of one of its tables, and which ingests they hold."""
+        """Return the active files of one of its tables, and which ingests they hold."""
         return stored_files(self.path, name, self.path.open_table(name, version))
 
     def shown(self, version: Version | None = None) -> list[Ingest]:
-        """The ingests whose transitions are in the store."""
+        """Return the ingests whose transitions are in the store."""
         held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
         return list({one.ingest_id: one for one in held}.values())
 
@@ -397,6 +404,6 @@ class StoreReader:
 
 
 def frame_files(manifests: pa.Table) -> list[str]:
-    """The files of `frames` that manifests name."""
+    """Return the files of `frames` that manifests name."""
     rows = manifests["cameras"].to_pylist() if "cameras" in manifests.column_names else []
     return sorted({camera["file"] for cameras in rows for camera in cameras or ()} - {""})

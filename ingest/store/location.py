@@ -87,7 +87,7 @@ class Location:
 
     @classmethod
     def of(cls, place: str | Path | Location) -> Location:
-        """The place that a path or an address names.
+        """Return the place that a path or an address names.
 
         Raises:
             StoreError: an address of another kind or with a secret in it, or a path where Delta
@@ -148,7 +148,7 @@ class Location:
         }
 
     def table(self, name: str) -> str:
-        """The address of one of its tables."""
+        """Return the address of one of its tables."""
         return str(self.folder / name) if self.folder is not None else f"{self.text}/{name}"
 
     def has_table(self, name: str) -> bool:
@@ -183,14 +183,14 @@ class Location:
             )
 
     def other(self) -> str | None:
-        """What else of Restock's the folder is: a panel, or a run's."""
+        """Return what else of Restock's the folder is: a panel, or a run's."""
         for file, kind in _OTHERS.items():
             if self.folder is not None and (self.folder / file).is_file():
                 return kind
         return None
 
     def absent(self) -> StoreError:
-        """The error where there is no store. Raises StoreError as `has_table` does."""
+        """Return the error of a store that is absent. Raises StoreError as `has_table` does."""
         what, remedy = "no such store", self.remedy_if_absent()
         if self.folder is not None and self.folder.exists():
             what = "not a store"
@@ -202,7 +202,7 @@ class Location:
         return StoreError(what, where=self.text, remedy=remedy)
 
     def remedy_if_absent(self) -> str:
-        """What to do where there is nothing. Raises StoreError as `has_table` does."""
+        """Return what to do if there is nothing. Raises StoreError as `has_table` does."""
         path, version = split_version(self.text)
         if version is not None and Location.of(path).has_table(TRANSITIONS):
             return (
@@ -273,7 +273,7 @@ class Location:
 
     @contextmanager
     def writing(self, path: str) -> Iterator[Any]:
-        """A new file, open for writing; whole and on disks flushed when the block ends."""
+        """Open a new file for writing; it is whole and flushed to disk when the block ends."""
         if self.folder is None:
             with self.translate_errors(), self.files.open_output_stream(path) as out:
                 yield out
@@ -287,7 +287,7 @@ class Location:
 
     @contextmanager
     def reading(self, path: str) -> Iterator[pa.NativeFile]:
-        """A file, open for reading. Raises as `read` does."""
+        """Open a file for reading. Raises as `read` does."""
         with self.translate_errors(), self.files.open_input_file(path) as file:
             yield file
 
@@ -299,8 +299,9 @@ class Location:
         where: pc.Expression | None = None,
         repeated: Sequence[str] = (),
     ) -> pa.Table:
-        """A Parquet file's rows, as they were written: of these columns, those that it has; text
-        that other tools wrote as views as plain text.
+        """Read a Parquet file's rows, of the named columns that it has.
+
+        Text that other tools wrote as views comes as plain text.
 
         Text of `repeated` columns comes as Arrow's dictionaries, once for all rows that have it.
 
@@ -324,8 +325,10 @@ class Location:
             return with_plain_text(whole.read(read))
 
     def row_groups(self, path: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """A Parquet file's rows, a row group at a time: of these columns, those that it has. One
-        named `list.field` has structs of that field alone. Raises as `read` does."""
+        """Yield a Parquet file's rows, one row group at a time, of the columns it has.
+
+        One named `list.field` has structs of that field alone. Raises as `read` does.
+        """
 
         def is_asked(leaf: str) -> bool:
             # Between a list and its field lies what each writer names otherwise.
@@ -340,17 +343,19 @@ class Location:
                 yield with_plain_text(whole.read_row_group(group, read))
 
     def read_schema(self, path: str) -> pa.Schema:
-        """A Parquet file's schema, with its metadata. Raises as `read` does."""
+        """Read a Parquet file's schema, with its metadata. Raises as `read` does."""
         with self.translate_errors(), self.files.open_input_file(path) as file:
             return plain_text(pq.read_schema(file))
 
     def listing(self, folder: str) -> set[str]:
-        """The files below a folder of the store, by their paths in that folder."""
+        """Return the files below a folder of the store, by their paths in that folder."""
         return set(self.times(folder))
 
     def times(self, folder: str) -> dict[str, float]:
-        """The files below a folder of the store, by their paths in it, and when each was written:
-        seconds since 1970; infinity where that is not known."""
+        """Return the files below a folder by their paths in it, and when each was written.
+
+        Times are seconds since 1970; infinity if unknown.
+        """
         with self.translate_errors():
             infos = self.files.get_file_info(
                 pa.fs.FileSelector(folder, recursive=True, allow_not_found=True)
@@ -375,8 +380,9 @@ class Location:
 
     @contextmanager
     def translate_errors(self) -> Iterator[None]:
-        """Turn what goes wrong on the way to S3 into a StoreError that says what to do; likewise
-        of a folder, where delta-rs may not read it.
+        """Turn what goes wrong on the way to S3, or in a folder, into a StoreError with a remedy.
+
+        A folder may be one that delta-rs may not read.
 
         What Delta says of its tables passes, and so do conflicts of writers and missing files.
         """
@@ -404,8 +410,10 @@ class Location:
 
 
 def open_parquet(source: pa.NativeFile, **options: Any) -> pq.ParquetFile:
-    """A Parquet file, to be read with the checksums of its pages verified: bytes that changed are
-    an OSError. Files of other tools may have none, and are read as they are."""
+    """Open a Parquet file so that the checksums of its pages are verified.
+
+    Bytes that changed are an OSError. Files of other tools may have none, and are read as they are.
+    """
     return pq.ParquetFile(source, page_checksum_verification=True, **options)
 
 
@@ -416,7 +424,7 @@ def with_plain_text(rows: pa.Table) -> pa.Table:
 
 
 def plain_text(schema: pa.Schema) -> pa.Schema:
-    """The same columns with text as strings, where another tool wrote it as views."""
+    """Return the columns with text as strings if another tool wrote it as views."""
     fields = [field.with_type(_plain(field.type)) for field in schema]
     return pa.schema(fields, metadata=schema.metadata)
 

@@ -51,7 +51,7 @@ def software_version() -> str:
 
 
 def definitions(profile: Profile) -> dict[str, str]:
-    """What rows depend on beside the recording."""
+    """Return what rows depend on beside the recording."""
     return {
         "profile_hash": profile.hash,
         "task_hash": profile.task.hash,
@@ -68,7 +68,7 @@ def manifest_row(
     dropped: Mapping[str, int],
     **recorded: Any,
 ) -> dict[str, Any]:
-    """The row of `recordings` for these transitions, by `restock.ingest.task.schema`.
+    """Build the row of `recordings` for these transitions, by `restock.ingest.task.schema`.
 
     `dropped` are ticks in no episode by reason; `recorded` is what only who made the steps knows:
     format, clock, counts and tags.
@@ -130,7 +130,7 @@ def recorded_facts(
     episodes: Split,
     rows: EpisodeRows,
 ) -> dict[str, Any]:
-    """What `manifest_row` needs to know of a recording."""
+    """Return what `manifest_row` needs to know of a recording."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
     fallbacks = fallbacks_used(profile, columns) | steps.stand_ins
     return {
@@ -197,7 +197,7 @@ def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
 
 
 def count_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
-    """The counts of scores, which add up over recordings, as the manifest holds them."""
+    """Return the counts of scores, which add up over recordings, as the manifest holds them."""
     return [asdict(score) for score in scores]
 
 
@@ -241,7 +241,7 @@ class Moments:
         return cls(rows["episode_index"].to_numpy(), logged)
 
     def covered(self, correction: Correction) -> Bools:
-        """The rows (N,) that a correction is about."""
+        """Return the rows (N,) that a correction is about."""
         inside = (self.logged_ns >= correction.first_ns) & (self.logged_ns <= correction.last_ns)
         same = inside & (self.episode_index == correction.episode_index)
         return np.asarray(same if same.any() else inside, np.bool_)
@@ -264,7 +264,7 @@ def correction_rows(corrections: Iterable[Correction]) -> list[dict[str, Any]]:
 
 
 def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
-    """The version of labels that rules of this version made, and corrections changed."""
+    """Return the version of labels of these rules after these corrections."""
     if not corrections:
         return rules
     said = sorted(
@@ -275,14 +275,14 @@ def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
 
 
 def rules_of(version: str) -> str:
-    """The rules' part of the version of labels."""
+    """Return the rules' part of the version of labels."""
     return version.partition("+")[0]
 
 
 def merged(
     before: Sequence[Correction], given: Sequence[Correction], moments: Moments
 ) -> list[Correction]:
-    """What was said before and what is said now; where both speak of a row, the latter counts."""
+    """Merge what was said before with what is said now; now counts if both speak of a row."""
     kept: list[Correction] = []
     for old in before:
         covered = moments.covered(old)
@@ -307,8 +307,9 @@ def lay_over(
     conditions: Sequence[Condition],
     clock_offset_ns: int | None,
 ) -> tuple[pa.Table, list[Correction]]:
-    """A recording's rows with these corrections in their labels, and the corrections with the
-    number of rows that each is about now.
+    """Apply corrections to the labels of a recording's rows.
+
+    Return the rows, and the corrections with the number of rows that each is about now.
 
     A correction of a condition that is not among `conditions`, or whose stretch has no row any
     more, is about none: it changes nothing, and is kept.
@@ -349,7 +350,7 @@ def _with_labels(
 
 
 def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArray:
-    """The probabilities with 1 and 0 where somebody said so, of conditions that have one."""
+    """Set the probabilities of corrected conditions that have one to 1 or 0."""
     ends = np.asarray(probabilities.offsets)
     first, count = int(ends[0]), int(ends[-1] - ends[0])
     row = np.repeat(np.arange(len(probabilities)), np.diff(ends))

@@ -126,7 +126,7 @@ SUMMARY_SCHEMA = pa.schema(
 
 
 def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
-    """A manifest row with the summary of its recording's rows, and their number."""
+    """Return a manifest row with the summary of its recording's rows, and their number."""
     place = manifest.schema.get_field_index("transitions")
     count = pa.array([len(rows)], manifest.schema.field(place).type)
     manifest = manifest.set_column(place, manifest.schema.field(place), count)
@@ -165,8 +165,11 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
 def _of_episodes(
     connection: duckdb.DuckDBPyConnection, rows: pa.Table, *, custom: bool
 ) -> dict[str, pa.Table]:
-    """The tables BY_EPISODE, which are made some whole episodes at a time: an episode's rows of
-    them depend on its own steps alone. A window over all steps would hold them all twice."""
+    """Make the tables BY_EPISODE, some whole episodes at a time.
+
+    An episode's rows of them depend on its own steps alone. A window over all steps would hold them
+    all twice.
+    """
     for number, (first, stop) in enumerate(_whole_episodes(rows)):
         connection.register("transitions", _unchunked(rows.slice(first, stop - first)))
         for name in BY_EPISODE:
@@ -183,8 +186,10 @@ def _of_episodes(
 
 
 def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
-    """Where to cut the rows, as first and one past the last, some STRETCH_ROWS apart: no episode
-    lies in two parts. All at once where an episode's rows do not lie together."""
+    """Return where to cut the rows, as first and one past the last, some STRETCH_ROWS apart.
+
+    No episode lies in two parts. All rows are one part if an episode's do not lie together.
+    """
     coded = rows["episode_id"].combine_chunks().dictionary_encode()
     codes = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
     begins = np.flatnonzero(np.diff(codes)) + 1
@@ -194,8 +199,7 @@ def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
 
 
 def _unchunked(rows: pa.Table) -> pa.Table:
-    """The rows with the chunks of their WIDE columns, one an episode, put together: for DuckDB
-    each is a batch."""
+    """Join the chunks of WIDE columns, one per episode: for DuckDB each is a batch."""
     for name in WIDE:
         place = rows.schema.get_field_index(name)
         rows = rows.set_column(place, name, rows[name].combine_chunks())
@@ -203,7 +207,7 @@ def _unchunked(rows: pa.Table) -> pa.Table:
 
 
 def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
-    """A recording's rows with the ends of their episodes, from its manifest, in their metadata."""
+    """Return a recording's rows with the ends of episodes from its manifest in their metadata."""
     metadata = {ENDS: packed_ends.encode()} if packed_ends else None
     return rows.replace_schema_metadata(metadata)
 
@@ -226,8 +230,10 @@ def _query(name: str) -> str:
 
 
 def with_included(text: str, beside: Traversable | None = None) -> str:
-    """SQL with the files that it names: definitions which several statements share, in this folder
-    or else in the one `beside`."""
+    """Insert into SQL the files that it names: definitions which several statements share.
+
+    They are in this folder or else in the one `beside`.
+    """
 
     def included(named: re.Match[str]) -> str:
         folder = files("restock.ingest.store")
@@ -297,7 +303,7 @@ class Sketch:
 
     @classmethod
     def of(cls, recording_id: str, ingest_id: str, hashes: Hashes) -> Sketch:
-        """That of a recording with these `distinctive` hashes."""
+        """Return the sketch of a recording with these `distinctive` hashes."""
         return cls(recording_id, ingest_id, hashes[:SKETCH_HASHES])
 
 
@@ -312,7 +318,7 @@ def read_sketch(text: str) -> Hashes:
 
 
 def row_hashes(rows: pa.Table) -> Hashes:
-    """A hash of each row's task, action, observation and pose, (N,), to a thousandth."""
+    """Hash each row's task, action, observation and pose, (N,), to a thousandth."""
     parts = [_hashes(rows.slice(first, PART_ROWS)) for first in range(0, len(rows), PART_ROWS)]
     return np.concatenate([np.zeros(0, np.uint64), *parts])
 
@@ -347,7 +353,7 @@ def looks_alike(mine: Hashes, other: Sketch) -> bool:
 
 
 def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive | None:
-    """What the new rows have in common with those of another recording, if they largely do.
+    """Return what the new rows share with those of another recording, if they largely do.
 
     One constant shift between the stamps of the two is taken out; rows further apart than half a
     control period do not count.
@@ -380,7 +386,7 @@ def find_repeat(
     read: Callable[[str, str], pa.Table],
     period_s: float,
 ) -> RepeatedDrive | None:
-    """The recording that holds the most of the rows, of those that `compare` finds the same.
+    """Return the recording with the most of the rows, of those that `compare` finds the same.
 
     `mine` are the rows' `distinctive` hashes; `rows()`, and `read(recording_id, ingest_id)` of one
     whose sketch looks alike, are asked for where there is one.
@@ -399,8 +405,10 @@ def find_repeat(
 
 
 def distinctive(rows: pa.Table) -> tuple[Hashes, Ints]:
-    """The hashes of the rows that look like no other of their recording, ascending, and which rows
-    they are of. A robot that stands proves nothing."""
+    """Return the hashes of rows that look like no other of their recording, ascending.
+
+    Also return which rows they are of. A robot that stands proves nothing.
+    """
     found, first, counts = np.unique(row_hashes(rows), return_index=True, return_counts=True)
     once: Bools = counts == 1
     return found[once], first[once].astype(np.int64)

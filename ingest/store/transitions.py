@@ -58,19 +58,19 @@ class EpisodeRows:
         return np.flatnonzero(~self.is_end)
 
     def ends_table(self) -> pa.Table:
-        """The ends of the episodes, as `label_table` has them."""
+        """Return the ends of the episodes, as `label_table` has them."""
         ends = np.flatnonzero(self.is_end)
         signals = {name: column[ends] for name, column in self.signals.items()}
         custom = self.custom.take(pa.array(ends))
         return label_table(signals, self.episode[ends], self.step[ends], custom)
 
     def without_signals(self) -> EpisodeRows:
-        """The same steps and labels; their signals, which take most of the memory, gone."""
+        """Return the same steps and labels without signals, which take most of the memory."""
         return replace(self, signals={}, custom=self.custom.select([]))
 
     @classmethod
     def join(cls, parts: Sequence[EpisodeRows]) -> EpisodeRows:
-        """Steps of several groups of episodes, without their signals."""
+        """Join steps of several groups of episodes, without their signals."""
         none: Signals = {}
         labels, exposures = (
             {name: np.concatenate([getattr(p, kind)[name] for p in parts]) for name in first}
@@ -93,7 +93,7 @@ class EpisodeRows:
 
 
 def groups(episodes: Split) -> Iterator[range]:
-    """The episodes by their numbers, some GROUP_ROWS steps at a time."""
+    """Yield the episodes by their numbers, some GROUP_ROWS steps at a time."""
     first = count = 0
     for number, episode in enumerate(episodes.episodes):
         count += episode.last - episode.first + 1
@@ -142,14 +142,14 @@ def episode_rows(
 
 
 def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -> pa.Table:
-    """The steps as conditions see them: stored signals and custom ones, as they are stored."""
+    """Return the steps as conditions see them: stored signals and custom ones."""
     columns = signal_columns(signals)
     columns |= dict(zip(custom.column_names, custom.columns, strict=True))
     return pa.table({"episode_index": episode, "step_index": step, **columns})
 
 
 def episode_ends(table: pa.Table) -> pa.Table | None:
-    """The steps that only end an episode, as conditions see them, of a recording's rows.
+    """Return the steps of a recording's rows that only end an episode, as conditions see them.
 
     They are no transitions, but conditions that look ahead see them; they lie in the rows'
     metadata (and so in that of their Parquet file). None where the rows carry none.
@@ -161,7 +161,7 @@ def episode_ends(table: pa.Table) -> pa.Table | None:
 
 
 def packed(table: pa.Table) -> bytes:
-    """A table of episode ends as metadata holds it."""
+    """Pack a table of episode ends for metadata."""
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, table.schema) as writer:
         writer.write_table(table)
@@ -235,7 +235,7 @@ def recording_table(
 
 
 def _joined(tables: list[pa.Table]) -> pa.Table:
-    """The groups' rows as one table, and `tables` empty.
+    """Join the groups' rows to one table, and empty `tables`.
 
     Column by column each gets memory of its own: a group's columns lie between much that is gone
     by now, which Arrow can only give back together with them.
@@ -254,7 +254,7 @@ def _joined(tables: list[pa.Table]) -> pa.Table:
 
 
 def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
-    """The rows with their columns of one value, the same in every group, over one memory."""
+    """Store columns of one value, the same in every group, in one memory."""
     for name in _OF_ONE_VALUE:
         longest = same.setdefault(name, rows[name])
         if len(longest) < len(rows):
@@ -387,7 +387,7 @@ def _sorted_truths(truth: Sequence[str | None], tick: Ints) -> list[str | None]:
 def _vectors(
     observation: NDArray[np.float32], begin: Ints
 ) -> tuple[pa.ChunkedArray, pa.ChunkedArray]:
-    """What is observed (R, D) at the steps that begin a transition (N,), and at those after them.
+    """Return what is observed (R, D) at steps that begin a transition (N,), and at those after.
 
     Two columns of fixed-size lists over the same memory, a chunk an episode: all but the first and
     the last observation of an episode are in both.
@@ -429,7 +429,7 @@ def replaced(rows: pa.Table, columns: Mapping[str, Any]) -> pa.Table:
 
 
 def by_name(values: Mapping[str, F32], rows: Ints) -> pa.Array:
-    """The values of these rows by their names, as a map array; without those that are NaN."""
+    """Return the values of these rows by their names as a map array, without NaN."""
     table = np.stack([column[rows] for column in values.values()], axis=1) if values else None
     if table is None:
         table = np.zeros((len(rows), 0), np.float32)
@@ -442,7 +442,7 @@ def by_name(values: Mapping[str, F32], rows: Ints) -> pa.Array:
 
 
 def names_of(labels: Mapping[str, Bools], rows: Ints) -> pa.Array:
-    """The labels that hold in each of these rows, in their order, as a list array."""
+    """Return the labels that hold in each of these rows, in their order, as a list array."""
     table = np.zeros((len(rows), len(labels)), np.bool_)
     for column, holds in zip(table.T, labels.values(), strict=True):
         column[:] = holds[rows]

@@ -57,7 +57,7 @@ def parse_version(text: str) -> Version:
 
 
 def given_version(text: str | None) -> Version | None:
-    """What `--version` was given. Raises StoreError as `parse_version` does."""
+    """Parse what `--version` was given. Raises StoreError as `parse_version` does."""
     return None if text is None else parse_version(text)
 
 
@@ -73,7 +73,7 @@ def split_version(place: str) -> tuple[str, Version | None]:
 
 
 def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
-    """The newest version of a table that was there at a moment; of UTC where it names no zone.
+    """Return the newest version of a table at a moment; in UTC if it names no zone.
 
     Raises:
         StoreError: it was made later.
@@ -116,8 +116,7 @@ def expect_whole(log: Path, version: int, *, where: str) -> None:
 
 
 def log_damage(log: Path, *, where: str) -> StoreError | None:
-    """The newest file of a log that is missing or cannot be read, as an error that says what to do;
-    None where there is none."""
+    """Return an error for the newest file of a log that is missing or unreadable, or None."""
     try:
         found = [match for one in log.iterdir() if (match := _LOGGED.fullmatch(one.name))]
         hinted = _hinted_checkpoint(log)
@@ -139,7 +138,7 @@ def log_damage(log: Path, *, where: str) -> StoreError | None:
 
 
 def _hinted_checkpoint(log: Path) -> int | None:
-    """The version of the checkpoint that a reader looks for first."""
+    """Return the version of the checkpoint that a reader looks for first."""
     try:
         return int(json.loads((log / "_last_checkpoint").read_bytes())["version"])
     except (FileNotFoundError, ValueError, KeyError, TypeError):
@@ -178,8 +177,10 @@ def _problem_of_checkpoint(file: Path) -> str | None:
 def _damaged(
     file: Path, problem: str, where: str, *, newest: int | None = None, needless: bool = False
 ) -> StoreError:
-    """`newest` is the number of the last commit; a checkpoint is `needless` where all commits
-    before it are there."""
+    """Return the error of a damaged log, whose last commit has the number `newest`.
+
+    A checkpoint is `needless` if all commits before it are there.
+    """
     remedy = "where there is none, ingest the recordings into a new store"
     if newest is not None and file.stem == f"{newest:020}":
         remedy = (
@@ -272,8 +273,10 @@ def _asked(
     by_version: Mapping[int, tuple[str, ...]],
     key: str,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what the protocol of a table asks of a program: features in use, and each in words; ""
-    for a `version` that is newer than the `newest` known, the one that lists its features."""
+    """Yield what the protocol of a table asks of a program: features in use, and each in words.
+
+    They are "" for a `version` newer than the `newest` known, which lists its features.
+    """
     if version > newest:
         yield "", f"version {version} of the protocol ({key})"
     features = listed if version == newest else None
@@ -288,8 +291,10 @@ def _name(table: DeltaTable) -> str:
 
 
 def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None:
-    """The refusal of table `name` for a feature that Delta's library could not open, if that is
-    the error."""
+    """Return the refusal of table `name` for a feature that Delta's library cannot open.
+
+    None if that is not the error.
+    """
     named = _UNSUPPORTED.search(str(error))
     if named is None:
         return None

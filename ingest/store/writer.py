@@ -83,7 +83,7 @@ class StoreWriter(TableCommits):
         ahead: Sequence[Staged] = (),
         aside: Collection[str] = (),
     ) -> RepeatedDrive | None:
-        """The recording that holds most of one's rows under other ids, if one largely does.
+        """Return the recording that holds most of one's rows under other ids, if one largely does.
 
         `period_s` is the control period: rows further apart than half of it do not count. Those
         `ahead` of it are looked at as if they were in the store, ingests `aside` are not.
@@ -216,8 +216,9 @@ class StoreWriter(TableCommits):
         return version
 
     def remove_recordings(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
-        """Take recordings, by the ingests that they are there as (recording -> ingest), out of the
-        store in one commit. Their files stay for as long as those of replaced ones.
+        """Take recordings out of the store in one commit, by their ingests (recording -> ingest).
+
+        Their files stay for as long as those of replaced ones.
 
         Returns the version of `transitions` that they were read from, and the newest, without
         them.
@@ -253,8 +254,9 @@ class StoreWriter(TableCommits):
                 self.path.delete(f"{name}/{file.path}" for file in files)
 
     def take_back(self, staged: Sequence[Staged]) -> None:
-        """Delete the files of recordings whose commit failed or was interrupted, of those whose
-        rows are in no commit, as far as that is possible.
+        """Delete the files of recordings whose commit failed or was interrupted.
+
+        That is as far as possible, and only of those whose rows are in no commit.
 
         On S3 nothing is: a commit whose answer was lost may be there later. `clean` deletes what
         is left when it is older than its window.
@@ -297,7 +299,7 @@ class StoreWriter(TableCommits):
         return deleted + frames
 
     def _written_before(self, name: str, retention_hours: int) -> set[str]:
-        """The files in a folder that are older than the window.
+        """Return the files in a folder that are older than the window.
 
         A manifest may be younger than its removal in the log: compaction writes it again where a
         version within the window needs it.
