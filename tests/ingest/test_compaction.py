@@ -10,10 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.long import one_in
-from support.stores import manifest, one, shown, views_over, write_store
+from support.stores import manifest, one, shown, views_over
 
 from restock.cli import main
 from restock.errors import StoreError
@@ -228,36 +226,6 @@ def test_a_replacing_ingest_is_not_undone_by_a_compaction_that_was_faster(tmp_pa
     same_as_scanned(tmp_path / "s")
 
 
-steps = st.lists(
-    st.tuples(st.sampled_from(["ingest", "compact", "fold", "clean"]), st.integers(1, 3)),
-    min_size=2,
-    max_size=6,
-)
-
-
-@pytest.mark.long  # each step has a test of its own above
-@settings(max_examples=5)
-@given(steps)
-def test_whatever_comes_first_the_summaries_are_true(tmp_path_factory, steps):
-    path = tmp_path_factory.mktemp("store") / "s"
-    writer = StoreWriter(path)
-    writer.write(*one(1))
-    expected = {1: len(one(1)[1])}
-    for number, (step, recording) in enumerate(steps):
-        if step == "ingest":
-            writer.write(*(drawn := one(recording, f"i{number}", seed=number)))
-            expected[recording] = len(drawn[1])
-        elif step == "compact":
-            compact(writer)
-        elif step == "fold":
-            fold(writer)
-        else:
-            writer.clean(retention_hours=0)
-    found = shown(path)
-    assert {int(name[:16], 16): count for name, count in found.items()} == expected
-    same_as_scanned(path)
-
-
 def test_a_damaged_manifest_does_not_hide_a_repeated_drive_in_another(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write_all([one(1), one(2)])
@@ -427,15 +395,6 @@ def test_what_the_command_says(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "nothing to join: 1 file of transitions, 1 of manifests" in said
     assert "wrote" not in said
-
-
-def test_a_dry_run_tells_of_summaries_what_the_run_does(tmp_path):
-    write_store(tmp_path / "s", [one(1)[1], one(2)[1]])
-    planned = compact(StoreWriter(tmp_path / "s"), dry_run=True)
-    done = compact(StoreWriter(tmp_path / "s"))
-    done.version = None
-    assert planned == done
-    assert (planned.manifests_before, planned.manifests_after, planned.summaries) == (2, 1, 2)
 
 
 @pytest.mark.parametrize(

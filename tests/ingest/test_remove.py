@@ -5,8 +5,6 @@ from __future__ import annotations
 import datetime as dt
 import json
 import os
-import re
-import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -272,20 +270,6 @@ def test_what_names_no_recording_exits_2(tmp_path, capsys):
     assert "names no recording" in capsys.readouterr().err
     assert main(["store", "remove", str(tmp_path / "none"), name_of(1)]) == 2
     assert len(shown(place)) == 3
-
-
-def test_commands_that_messages_suggest_can_be_typed_where_a_path_has_a_space(tmp_path, capsys):
-    place, nowhere = tmp_path / "my store", tmp_path / "no store"
-    three(place)
-    for arguments, suggested, path in (
-        (["store", "remove", place, "nowhere.mcap"], "sql", place),
-        (["store", "remove", place], "sql", place),
-        (["sql", nowhere, "FROM coverage"], "ingest", nowhere),
-    ):
-        assert main([str(argument) for argument in arguments]) == 2
-        commands = re.findall(r"`restock ([^`]*)`", capsys.readouterr().err)
-        words = [shlex.split(command) for command in commands]
-        assert any(each[0] == suggested and str(path) in each for each in words), commands
 
 
 def test_corrected_labels_of_a_removed_recording_are_in_no_ones_way(tmp_path, capsys):

@@ -298,12 +298,6 @@ def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
     assert found == [("1", False), ("2", True)]
 
 
-def test_a_file_in_the_way_is_said_so(tmp_path):
-    (tmp_path / "s").write_text("hello")
-    with pytest.raises(StoreError, match="is a file, not a store"):
-        StoreWriter(tmp_path / "s").write(*one(1))
-
-
 @pytest.mark.parametrize(
     ("file", "said"),
     [("panel.json", "is a panel, not a store"), ("config.json", "is the folder of a run")],
