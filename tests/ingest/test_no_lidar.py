@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from rosbags.highlevel import AnyReader
 from support.driven_robot import Drive, write_bag
@@ -23,12 +22,9 @@ from restock.ingest.prepared import IngestResult
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.episodes import steps_of
-from restock.ingest.store.commits import delta_columns, recording_columns
-from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import reported, shipped, unseen
 from restock.ingest.task.robot import NONE, SPEED, Limits, limit
-from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.plan.plan import plan_panel
@@ -208,21 +204,6 @@ def test_a_quota_on_an_unknown_condition_says_why_it_is_empty(blind):
         refusing = parse_mixture(MIXTURE.format(more='shortfall = "refuse"'), where="mix.toml")
         with pytest.raises(MixtureError, match=r"near_collision wants 40\.0%, and is unknown in"):
             plan_panel(store.connection, refusing, known)
-
-
-def test_a_store_of_an_older_restock_takes_them(drives, tmp_path):
-    """Its tables say that clearance is never null."""
-    writer = StoreWriter(tmp_path / "store")
-    schema = delta_columns(transition_schema(BLIND.task.observation_size))
-    strict = [f.with_nullable(f.nullable and f.name not in LIDAR_SIGNALS) for f in schema]
-    writer.create(RECORDINGS, recording_columns())
-    writer.create(TRANSITIONS, pa.schema(strict))
-    ingest(drives / "blind", BLIND, store=writer)
-    fields = writer.path.open_table(TRANSITIONS).schema().fields
-    assert {field.name for field in fields if not field.nullable}.isdisjoint(LIDAR_SIGNALS)
-    with Store(tmp_path / "store") as store:
-        counted = store.sql("SELECT count(*) > 20, count(clearance_m) FROM transitions")
-        assert counted.fetchall() == [(True, 0)]
 
 
 def test_labels_made_again_stay_unknown(drives, tmp_path):

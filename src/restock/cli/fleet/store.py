@@ -23,11 +23,11 @@ class CompactCommand:
         restock store compact s3://warehouse/store --dry-run
 
     Ingest writes one file per recording. This joins the files, to about half a million transitions
-    per file, ordered by robot and time, and joins the manifests. Recordings from an older Restock
-    get the summaries that answer coverage queries without a scan. No row changes: recordings can be
-    ingested again, relabelled and corrected as before, also while this runs. Older versions stay
-    readable for 7 days. Until then the disk holds both the old and the new files; afterwards
-    `restock ingest` removes the old ones.
+    per file, ordered by robot and time, and joins the manifests. Rows that another tool changed get
+    new summaries, which answer coverage queries. No row changes: recordings can be ingested again,
+    relabelled and corrected as before, also while this runs. Older versions stay readable for 7
+    days. Until then the disk holds both the old and the new files; afterwards `restock ingest`
+    removes the old ones.
 
     Exit codes: 0 done, 2 refused or stopped at a damaged file (what was joined before it stays
     joined), 3 --drop-damaged lost rows or manifests.
