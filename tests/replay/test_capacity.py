@@ -139,3 +139,11 @@ def test_a_ring_that_is_chosen_stays_in_memory(
     prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
     assert prepared.config.replay.ring_rows == 40
     assert "GiB hold 40" in prepared.document["ring_capacity"]["reason"]
+
+
+@pytest.mark.parametrize(("share", "episodes"), [(2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)])
+def test_wrong_shares_and_numbers_of_episodes_are_refused(
+    store_path: Path, share: float, episodes: float
+) -> None:
+    with Store(store_path) as store, pytest.raises(ConfigError, match=r"cells_share must be in"):
+        recommend_capacity(store.connection, share, episodes)

@@ -19,10 +19,9 @@ from restock.errors import ConfigError
 from restock.replay.fleet.gaps import Gap, Yields, find_gaps
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_toml, read_missions
 from restock.replay.fleet.shopping_list import shopping_list
-from restock.replay.mixture.mixture import load_mixture, parse_mixture
+from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.places import add_computed_tables
 from restock.replay.plan.source_plan import forecast, missions_to_see_one, probability_to_close
-from restock.replay.store.audit import recommend_capacity
 from restock.replay.store.store import Store
 from restock.words import figure
 
@@ -121,31 +120,27 @@ def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store
             assert one.see_one[1] >= 1
 
 
-def test_unknown_kinds_and_thresholds_are_refused_with_what_is_near(tmp_path: Path) -> None:
-    def refused(match: str, **given: Any) -> None:
-        with pytest.raises(ConfigError, match=match):
-            find_gaps(store, parse_mixture(ASKING), name="mine", **given)
+@pytest.mark.parametrize(
+    ("given", "near"),
+    [
+        ({"kinds": ["wheel_slips"]}, "'wheel_slip'"),
+        ({"thresholds": {"rare_conditions": {"min_rows": 3}}}, "'rare_condition'"),
+        ({"thresholds": {"rare_condition": {"min_row": 3}}}, "'min_rows'"),
+        ({"thresholds": {"rare_condition": {"min_rows": "x"}}}, "rare_condition.min_rows"),
+        ({"min_rows": 3, "by": ["aisle"]}, "'?aisle'?"),
+    ],
+)
+def test_unknown_kinds_and_thresholds_are_refused_with_what_is_near(
+    given: dict[str, Any], near: str, store: Path
+) -> None:
+    with Store(store) as opened, pytest.raises(ConfigError, match=near):
+        find_gaps(opened, parse_mixture(ASKING), name="mine", **given)
 
-    with Store(write_store(tmp_path / "store", [recording_transitions(0)])) as store:
-        refused("'wheel_slips'\n.*mean 'wheel_slip'", kinds=["wheel_slips"])
-        refused(r"must be a list.*\n.*\['wheel_slip'\]", kinds="wheel_slip")
-        refused(
-            "no audit named 'rare_conditions'\n.*mean 'rare_condition'",
-            thresholds={"rare_conditions": {"min_rows": 3}},
-        )
-        refused(
-            "rare_condition.min_row is not a threshold.*\n.*mean 'min_rows'",
-            thresholds={"rare_condition": {"min_row": 3}},
-        )
-        refused(
-            "rare_condition.min_rows must be a number, got 'x'",
-            thresholds={"rare_condition": {"min_rows": "x"}},
-        )
-        refused(
-            r"thresholds\['rare_condition'\] must be a Mapping", thresholds={"rare_condition": 3}
-        )
-        own = {"my_own_audit": {"least": 3.0}}  # of the same file as for `restock audit --audits`
-        find_gaps(store, parse_mixture(ASKING), name="mine", kinds=["nominal"], thresholds=own)
+
+def test_thresholds_of_ones_own_audits_are_allowed(store: Path) -> None:
+    own = {"my_own_audit": {"least": 3.0}}  # of the same file as for `restock audit --audits`
+    with Store(store) as opened:
+        find_gaps(opened, parse_mixture(ASKING), name="mine", thresholds=own)
 
 
 def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path: Path) -> None:
@@ -370,23 +365,6 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
         (tmp_path / "bad.toml").write_text(text)
         with pytest.raises(ConfigError, match=message):
             read_missions(tmp_path / "bad.toml")
-
-
-def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["coverage", "gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
-    assert "'aisle' cannot define a cell" in capsys.readouterr().err
-    mixture: Any = load_mixture("uniform")
-    with Store(store) as opened:
-        by: Any
-        for by in (["aisle"], "zone", [], ["zone", "zone"]):
-            with pytest.raises(ConfigError, match="cannot define a cell\n  name one"):
-                find_gaps(opened, mixture, name="steps", min_rows=3, by=by)
-        found: Any = find_gaps(opened, mixture, name="steps")
-        with pytest.raises(ConfigError, match="no unit 'days'\n  give missions, hours"):
-            shopping_list(*found, unit="days")
-        for share, episodes in ((2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)):
-            with pytest.raises(ConfigError, match=r"cells_share must be in \[0, 1\]"):
-                recommend_capacity(opened.connection, share, episodes)
 
 
 def test_gaps_are_a_table_of_sql(store: Path, tmp_path: Path) -> None:

@@ -437,30 +437,17 @@ def test_a_file_of_rows_that_is_missing_is_said_with_what_to_do(tmp_path: Path) 
         Store(tmp_path / "s").sql("FROM transitions")
 
 
-@pytest.mark.parametrize(
-    ("limit", "said"),
-    [("lots", "no memory limit 'lots'"), ("5", "no memory limit '5'")]
-    + [
-        (limit, f"memory limit '{limit}' is not a positive size")
-        for limit in ("0GB", "0.0 kib", "0%", "-1", " -5GB", "none", "None", "null")
-    ],
-)
-def test_a_memory_limit_that_is_none_is_refused(store_path: Path, limit: str, said: str) -> None:
-    with pytest.raises(StoreError, match=said) as error:
+@pytest.mark.parametrize("limit", ["lots", "5", "0 kib", "0%", "-1", "none"])
+def test_a_memory_limit_that_is_none_is_refused(store_path: Path, limit: str) -> None:
+    with pytest.raises(StoreError, match="4GB"):
         Store(store_path, memory_limit=limit)
-    assert "4GB" in str(error.value)
 
 
-@pytest.mark.parametrize("limit", ["2GB", "0.5 GB", ".5gb", "50%", "2 GiB"])
-def test_other_ways_to_write_a_memory_limit_are_taken(store_path: Path, limit: str) -> None:
+@pytest.mark.parametrize(("limit", "kept"), [("300MB", "286"), ("0.5 GB", "476"), ("2 GiB", "2.0")])
+def test_a_memory_limit_is_kept(store_path: Path, limit: str, kept: str) -> None:
     with Store(store_path, memory_limit=limit) as store:
-        assert len(store.sql("SELECT 1"))
-
-
-def test_a_memory_limit_is_kept(store_path: Path) -> None:
-    with Store(store_path, memory_limit="300MB") as store:
-        ((limit,),) = store.sql("SELECT current_setting('memory_limit')").fetchall()
-    assert limit.startswith("286")  # MiB
+        ((held,),) = store.sql("SELECT current_setting('memory_limit')").fetchall()
+    assert held.startswith(kept)  # MiB, GiB
 
 
 def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:

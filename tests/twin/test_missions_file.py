@@ -167,7 +167,7 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
 
     store, requested = str(tmp_path / "store"), tmp_path / "asked.toml"
     requested.write_text(
-        'max_replays_per_row = 20\nplanned = {updates = 1000, batch_size = 64}\n'
+        'max_replays_per_row = 20\nplanned_draws = 64000\n'
         '[[strata]]\nname = "nominal"\nunit = "episode"\nshare = 0.5\n'
         '[[strata]]\nname = "wheel_slip"\nunit = "episode"\nshare = 0.5\n'
         '[[strata]]\nname = "rest"\nwhere = "true"\nshare = 0.0\npriority = 5000\n'
