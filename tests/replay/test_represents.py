@@ -221,12 +221,12 @@ def weighed_share(panel: Panel, stratum: str, other: str) -> float:
 
 CAPPED = """
 unlisted = "drop"
+{cap}
 [evaluation_split]
 by = "none"
 [[strata]]
 name = "nominal"
 {nominal}
-{cap}
 [[strata]]
 name = "near_collision"
 where = "list_contains(conditions, 'near_collision')"
