@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from support.driven_robot import Drive, write_bag
-from support.paths import ROOT
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -248,20 +247,6 @@ def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path, capsys
     assert main(["sql", str(store), "FROM coverage_by_condition", "--json"]) == 0
     rows = {row["condition"]: row for row in json.loads(capsys.readouterr().out)}
     assert rows["near_collision"]["rows_held"] is None
-
-
-HUSKY = ROOT.parent / "shared" / "bags" / "sim-time-husky"
-
-
-@pytest.mark.skipif(not HUSKY.exists(), reason="recordings of others are not there")
-def test_a_husky_with_odometry_alone(tmp_path, capsys):
-    profile = tmp_path / "husky.toml"
-    assert main(["profile", "new", str(HUSKY), "--out", str(profile)]) in (0, 3)
-    outcome = ingest(HUSKY, load_profile(profile), store=None)
-    assert outcome.manifest["transitions"] > 50
-    assert [one["condition"] for one in outcome.manifest["unknown_conditions"]] == [
-        *("recovery", "near_collision", "blocked_aisle")
-    ]
 
 
 def test_a_robot_with_a_point_cloud_alone_is_told_what_to_do(

@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 from support.driven_robot import columns, pose, write_topics
-from support.paths import SHARED
 
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
@@ -147,9 +146,3 @@ def test_start_says_so_and_leaves_no_profile_to_edit(tmp_path, capsys):
         assert stopped["why"].startswith("this looks like a")
         assert stopped["remedies"] == ["give recordings of a robot on wheels"]
         assert not (out / "profile.toml").exists()
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_base_with_an_arm_is_on_wheels(capsys):
-    assert main(["profile", "new", str(SHARED / "sim-time-husky"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["problems"] == []

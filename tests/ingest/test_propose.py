@@ -216,6 +216,7 @@ def test_every_type_of_a_bag_without_a_robot_is_gone_through(tmp_path, capsys):
     parse_profile(with_all_signals(said["toml"]), where="p")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 @pytest.mark.parametrize("name", ROBOTS)
 def test_of_others_robots_and_with_all_its_signals(name, tmp_path, capsys):
@@ -245,15 +246,6 @@ def test_what_others_recordings_lack_is_named(name, missing, tmp_path, capsys):
     assert [word for word in ("command", "pose") if f"no topic for {word}" in said] == (missing)
     assert main(["profile", "check", str(file), str(SHARED / name)]) == 2
     assert f"`inputs.{missing[0]}`" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-@pytest.mark.parametrize("kind", ["test_bag_mcap", "test_bag_sqlite3"])
-def test_every_common_type_can_be_gone_through(kind, capsys):
-    assert main(["profile", "new", str(SHARED / "every-common-type" / kind), "--json"]) == 3
-    said = json.loads(capsys.readouterr().out)
-    assert said["transitions"] == 0 != len(said["problems"])  # two messages a topic
-    parse_profile(with_all_signals(said["toml"]), where="p")
 
 
 class Utm(Drive):

@@ -243,6 +243,7 @@ def test_log_time_where_stamps_cannot_be_followed(tmp_path, capsys):
     assert "Log time, as header stamps do not work: " in said["toml"]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 @pytest.mark.parametrize(
     ("bag", "transitions", "options"),
@@ -261,6 +262,7 @@ def test_of_simulations(bag, transitions, options, capsys):
     assert said["transitions"] == transitions
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 def test_a_small_robots_rows_are_not_all_recovery(tmp_path, capsys):
     file = tmp_path / "p.toml"

@@ -173,6 +173,7 @@ REAL = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", REAL)
 def test_real_robots_that_steer_are_taken_as_such(name: str, tmp_path: Path) -> None:
     if not (SHARED / name).exists():
