@@ -206,10 +206,9 @@ def sample_rows(tmp_path):
 @pytest.mark.parametrize(
     "words",
     [
-        ["eval", "run", "--on-logs", "own", "--check", "--baseline", "main"],
+        ["eval", "run", "--on-logs", "own", "--baseline", "main"],
         ["eval", "run", "--on-logs", "own", "--no-drive"],
         ["eval", "run", "--horizon", "5"],
-        ["eval", "run", "--margin", "0.2"],
         ["eval", "run", "--no-drive", "--seed", "3"],
         ["diagnose", "run", "--seed", "3"],
         ["diagnose", "run", "--profile", "p"],

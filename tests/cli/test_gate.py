@@ -8,10 +8,12 @@ from xml.etree import ElementTree
 
 import pytest
 from support.driven_robot import Drive, write_bag
+from support.kept_run import kept_run
 
 from restock.cli import main
-from restock.cli.data.audit import Part, markdown, of_regression
-from restock.train.evaluation.regression import Evaluated, regression
+from restock.cli.data.audit import Part, markdown, of_gate
+from restock.train.judge.gate import passed_gate
+from restock.train.run.run import Run, kept_policy
 
 ONLY = "-- severity: error\n-- advice: Record more.\n-- doc: Stores of few rows.\n"
 
@@ -92,11 +94,6 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
     assert "no such store" in capsys.readouterr().err
     assert main(["audit", str(stores["one"]), "--baseline", "released"]) == 2
     assert "--run" in capsys.readouterr().err
-    assert main(["audit", str(stores["one"]), "--margin", "0.1"]) == 2
-    assert "--margin: has no effect without --baseline" in capsys.readouterr().err
-    gate = ["audit", str(stores["one"]), "--run", str(tmp_path), "--baseline", "released"]
-    assert main([*gate, "--margin", "5"]) == 2
-    assert "--margin: must be from 0 to 1, got 5.0" in capsys.readouterr().err
     assert main(["audit", str(stores["one"]), "--run", str(tmp_path)]) == 2
     assert "is not a run directory" in capsys.readouterr().err
 
@@ -131,20 +128,44 @@ def test_a_folder_as_output_file_is_refused_early(
     assert ".tmp" not in error
 
 
-def evaluated(name: str, successes: int) -> Evaluated:
-    """40 episodes of one condition, so many of them at the goal."""
-    episodes = {
-        (seed, ""): (float(seed < successes), float(seed < successes)) for seed in range(40)
+def gated(run: Path, **changes: object) -> None:
+    """Write a gate of one test, as `restock gate` leaves it."""
+    origin = kept_policy(Run.open(run))
+    cell = {"measure": "success", "perturbation": "none", "condition": "nominal"}
+    document = {
+        "baseline": "planner",
+        "policy": None if origin is None else origin.document,
+        "cells": [{**cell, "verdict": "not worse"}],
     }
-    return Evaluated(name, "task", {("none", "nominal"): episodes})
+    (run / "gate").mkdir(exist_ok=True)
+    (run / "gate" / "gate.json").write_text(json.dumps(document | changes))
 
 
-@pytest.mark.parametrize(("successes", "status"), [(10, "fail"), (40, "pass"), (39, "pass")])
-def test_a_run_that_is_worse_than_the_baseline_fails(successes: int, status: str) -> None:
-    """By `restock eval --baseline`'s own verdicts."""
-    rows = regression(evaluated("released", 40), evaluated("nightly", successes))
-    (finding,) = of_regression(rows, baseline="released")
+@pytest.mark.parametrize(("verdict", "status"), [("not worse", "pass"), ("not shown", "fail")])
+def test_a_run_must_have_passed_its_gate(tmp_path: Path, verdict: str, status: str) -> None:
+    run = kept_run(tmp_path / "run")
+    cell = {"measure": "success", "perturbation": "none", "condition": "nominal"}
+    gated(run, cells=[{**cell, "verdict": verdict}])
+    (finding,) = of_gate(passed_gate(run, "planner"))
     assert finding.status == status
-    page = markdown("a", [Part("regression", [finding])], failing={"fail"})
-    assert ("❌" in page) == (status == "fail")
-    assert ("none.nominal" in page) == (status == "fail")
+    page = markdown("a", [Part("gate", [finding])], failing={"fail"})
+    assert ("success.none.nominal" in page) == (status == "fail")
+
+
+def test_a_gate_of_something_else_fails_the_check(
+    stores: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "run")
+    capsys.readouterr()
+
+    def status() -> str | None:
+        options = ("--run", run, "--baseline", "planner")
+        return check(capsys, stores["both"], *options)[1].get("gate.comparable")
+
+    assert status() == "fail"  # never gated
+    gated(run)
+    assert status() is None
+    gated(run, baseline="operator")
+    assert status() == "fail"
+    gated(run, policy={"env_steps": 3})
+    assert status() == "fail"

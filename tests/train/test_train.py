@@ -28,7 +28,6 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.train.dqn.config import ScheduleConfig, TrainConfig
-from restock.train.evaluation.regression import compare_with_baseline, regressed
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
 from restock.train.run.run import RunLock
@@ -290,10 +289,6 @@ def test_python_trains_and_evaluates_like_the_commands(
     argv += ["--episodes", "nominal=1", "--perturbations", "none", "--json"]
     assert main(argv) == 0
     assert json.loads(capsys.readouterr().out)["results"] == json.loads(json.dumps(rows))
-
-    compared = compare_with_baseline(tmp_path / "a", str(tmp_path / "a"))
-    assert {row["difference"] for row in compared} == {0.0}
-    assert not regressed(compared)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import pyarrow as pa
@@ -61,6 +61,9 @@ from restock.train.twin.physics.perturbation import (
     is_schedule,
 )
 from restock.words import quoted
+
+if TYPE_CHECKING:
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 REFERENCES = ("planner", "operator", "random")
 FIRST_SEED = 10_000
@@ -430,21 +433,7 @@ def drive_evaluation(
     plan: EvaluationPlan, progress: Callable[[int], None] | None = None
 ) -> list[dict[str, Any]]:
     """Drive all episodes, and add them to the run's `eval/episodes.parquet`: those rows."""
-    from restock.train.twin.env.vector_env import WarehouseVectorEnv
-    from restock.train.twin.missions import DEFAULT_CONDITIONS
-
-    profile = profile_of_run(plan.run)
-    task = profile.task
-    env = WarehouseVectorEnv(
-        plan.num_envs,
-        nthread=plan.nthread,
-        task=task,
-        robot=profile.robot,
-        seed=plan.first_seed,
-        layouts=plan.layouts,
-        conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},
-        nav_command=profile.inputs.nav_command is not None,
-    )
+    env = evaluation_env(plan)
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
     episodes = [
         (name, msgspec.structs.replace(spec, perturbation=perturbation))
@@ -460,22 +449,51 @@ def drive_evaluation(
         versions[policy] = driver.version
         if env.limits is not None:
             versions[policy] += f" limits {env.limits.hash}"
-        with torch_threads(plan.config.threads):
-            driven = run_episodes(
-                env,
-                driver,
-                [spec for _, spec in episodes],
-                control_period_s=task.control_period_s,
-                time_limit_steps=task.time_limit_steps,
-                goal=task.goal != "none",
-                discount=plan.config.loss.discount,
-                progress=progress,
-            )
+        driven = run_policy(plan, env, driver, [spec for _, spec in episodes], progress)
         for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
     table = episodes_table(results, plan, versions)
     added: list[dict[str, Any]] = add_evaluation(plan.run.path, table).to_pylist()
     return added
+
+
+def evaluation_env(plan: EvaluationPlan) -> WarehouseVectorEnv:
+    """Make the twin in which a plan's episodes are driven."""
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
+    from restock.train.twin.missions import DEFAULT_CONDITIONS
+
+    profile = profile_of_run(plan.run)
+    return WarehouseVectorEnv(
+        plan.num_envs,
+        nthread=plan.nthread,
+        task=profile.task,
+        robot=profile.robot,
+        seed=plan.first_seed,
+        layouts=plan.layouts,
+        conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},
+        nav_command=profile.inputs.nav_command is not None,
+    )
+
+
+def run_policy(
+    plan: EvaluationPlan,
+    env: WarehouseVectorEnv,
+    driver: Policy,
+    specs: Sequence[EpisodeSpec],
+    progress: Callable[[int], None] | None = None,
+) -> list[EpisodeResult]:
+    """Drive episodes by a policy, in the twin of a plan; results in the order of `specs`."""
+    with torch_threads(plan.config.threads):
+        return run_episodes(
+            env,
+            driver,
+            specs,
+            control_period_s=env.task.control_period_s,
+            time_limit_steps=env.task.time_limit_steps,
+            goal=env.task.goal != "none",
+            discount=plan.config.loss.discount,
+            progress=progress,
+        )
 
 
 def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:

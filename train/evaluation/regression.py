@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.errors import ConfigError, RunError
+from restock.errors import RunError
 from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.run.kept_evaluations import cell_name, shown_evaluation
@@ -30,6 +30,7 @@ AGENT = "agent"
 FOLDER = Path("baselines")  # in the working directory: names are looked up there
 EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive", "refused"]
+MARGIN = 0.05  # of success: a difference of no more is none
 MIN_EPISODES = 10  # of a row; fewer give no interval and no verdict
 MIN_OF_A_KIND = 5  # … and of each condition in the row of all, whose spreads are added up
 _KEY = b"restock-baseline"
@@ -55,12 +56,6 @@ def read_run_evaluation(path: Path, policy: str = AGENT) -> Evaluated:
     run = Run.open(path)
     name = str(path) if policy == AGENT else policy
     return Evaluated(name, str(run.document.get("task_hash")), _cells(_driven(run, policy)))
-
-
-def check_margin(margin: float) -> None:
-    """Raise ConfigError if nothing could be worse by this margin, or an improvement would be."""
-    if not 0 <= margin <= 1:  # NaN is neither
-        raise ConfigError(f"must be from 0 to 1, got {margin}", where="--margin")
 
 
 def read_baseline(name: str) -> Evaluated:
@@ -109,7 +104,7 @@ def baseline_file(name: str) -> Path:
 
 
 def regression(
-    baseline: Evaluated, candidate: Evaluated, *, margin: float = 0.05, seed: int = 0
+    baseline: Evaluated, candidate: Evaluated, *, margin: float = MARGIN, seed: int = 0
 ) -> list[dict[str, Any]]:
     """Compare with a baseline: a row per perturbation and condition, and one over all conditions.
 
@@ -142,32 +137,6 @@ def regression(
         if len(pairs) > 1:
             rows.append(_row((perturbation, EVERY), pairs, margin, rng))
     return rows
-
-
-def compare_with_baseline(
-    run: Path | str, baseline: str, *, margin: float = 0.05, seed: int = 0
-) -> list[dict[str, Any]]:
-    """Compare a run with a baseline on the same episodes, as `restock eval --baseline`.
-
-    Returns a row a perturbation and condition, with the difference in success, its 95 % interval
-    and a verdict. `regressed` says whether one of them should stop a pipeline.
-
-    Args:
-        run: an evaluated run.
-        baseline: a run, a file, or the name that it was saved under.
-        margin: a success lower by more than this, and surely lower, is worse.
-
-    Raises:
-        RunError: one of them was not evaluated, or is not there.
-    """
-    return regression(
-        read_baseline(baseline), read_run_evaluation(Path(run)), margin=margin, seed=seed
-    )
-
-
-def regressed(rows: Sequence[dict[str, Any]]) -> bool:
-    """Tell whether a pipeline should stop: a row is worse, or could not be compared."""
-    return any(row["verdict"] in ("worse", "refused") for row in rows)
 
 
 def _row(
@@ -268,10 +237,8 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
 
 __all__ = [
     "Evaluated",
-    "compare_with_baseline",
     "read_baseline",
     "read_run_evaluation",
-    "regressed",
     "regression",
     "save_baseline",
 ]

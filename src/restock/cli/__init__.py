@@ -33,6 +33,7 @@ VERBS = {
     "export": "write transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
     "train": "offline warm-up on the panel, then online in the twin; or a study of many runs",
     "eval": "success per condition, clean and perturbed",
+    "gate": "is a policy shown not to be worse than what drives today? exit 1 if not",
     "compare": "compare methods; refused if their critics were fed differently",
     "diagnose": "buffer failure or target failure?",
     "trace": "trace a sampled row to its source, down to the messages",
@@ -70,7 +71,7 @@ FOLDERS = {
         *(f"store {job}" for job in JOBS["store"]),
     ),
     "learning": (
-        *("train", "study", "eval", "compare", "diagnose", "trace", "report"),
+        *("train", "study", "eval", "gate", "compare", "diagnose", "trace", "report"),
         "profile schema",
     ),
     "twin": tuple(f"twin {job}" for job in JOBS["twin"]),

@@ -38,10 +38,10 @@ class AuditCommand:
     The thresholds are in replay/store/audits.toml; docs/audit.md lists all audits.
 
     With --against, everything that an earlier store or version held must still be there; with
-    --baseline, the run must not be worse than another one. A comparison that is not possible fails,
+    --baseline, the run must have passed `restock gate`. A comparison that is not possible fails,
     too. docs/audit.md has a workflow to copy.
 
-    Example: `restock audit store/ --against store@41 --run runs/a --baseline nightly`
+    Example: `restock audit store/ --against store@41 --run runs/a --baseline runs/main`
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
@@ -53,10 +53,8 @@ class AuditCommand:
     against: Annotated[str | None, tyro.conf.arg(metavar="OLD")] = None
     """The earlier store, or an earlier version (store@41): everything it held must still be
     there."""
-    baseline: Annotated[str | None, tyro.conf.arg(metavar="RUN|NAME")] = None
-    """The run must not be worse than this: another run, or a saved baseline's name or file."""
-    margin: float = 0.05
-    """The run is worse if its success is lower by more than this, with the interval below 0."""
+    baseline: Annotated[str | None, tyro.conf.arg(metavar="planner|RUN|FILE.onnx")] = None
+    """The run must have passed `restock gate` against this, as it named it."""
     audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """A folder of your own audits (*.sql). An audit with the name of a shipped one replaces it."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -80,7 +78,7 @@ class AuditCommand:
     json: bool = False
     """Print one JSON document: {"store", "failed", "audits": [{"part", "audit", "status", …}]}."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write JUnit XML: one suite each for audits, difference and regression."""
+    """Also write JUnit XML: one suite each for audits, difference and gate."""
     summary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Append a Markdown summary to this file, for example $GITHUB_STEP_SUMMARY."""
 
@@ -140,7 +138,6 @@ class AuditCommand:
             ConfigError: there is one.
             RunError: --run is not a run.
         """
-        from restock.cli.command_line import refuse
         from restock.files import expect_file_place
         from restock.replay.places import RUN_CONFIG
 
@@ -156,17 +153,10 @@ class AuditCommand:
             _refuse_with(self, "--reward", "panel", "run_dir", "against", "baseline")
             if (Path(self.store) / RUN_CONFIG).is_file():
                 _refuse_with(self, "the --reward of a run", "memory_limit")
-        if self.baseline is None:
-            why = "has no effect without --baseline"
-            refuse(self, ("margin",), why, remedy="name the run or the saved baseline")
-        else:
-            from restock.train.evaluation.regression import check_margin
-
-            check_margin(self.margin)
-            if self.run_dir is None:
-                raise ConfigError(
-                    "applies only to a run", where="--baseline", remedy="also give --run RUN"
-                )
+        if self.baseline is not None and self.run_dir is None:
+            raise ConfigError(
+                "applies only to a run", where="--baseline", remedy="also give --run RUN"
+            )
         expect_file_place(self.junit, "--junit", run=self.run_dir or Path(self.store))
         expect_file_place(self.summary, "--summary", run=self.run_dir or Path(self.store))
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
@@ -201,14 +191,13 @@ class AuditCommand:
         if self.against is not None:
             parts.append(Part("diff", self._difference(self.against)))
         if self.run_dir is not None and self.baseline is not None:
-            from restock.train.evaluation.regression import compare_with_baseline
+            from restock.train.judge.gate import passed_gate
 
             try:
-                rows = compare_with_baseline(self.run_dir, self.baseline, margin=self.margin)
-                found = of_regression(rows, baseline=self.baseline)
+                found = of_gate(passed_gate(self.run_dir, self.baseline))
             except RestockError as error:
                 found = refused("comparable", error, option=f"--baseline {self.baseline}")
-            parts.append(Part("regression", found))
+            parts.append(Part("gate", found))
         return parts
 
     def _difference(self, old: str) -> list[Finding]:
@@ -396,7 +385,7 @@ SHOWN = 5  # rows of a finding on a terminal and in a summary
 
 
 class Part(NamedTuple):
-    """The findings of one part of a check: the audits, the difference or the regression."""
+    """The findings of one part of a check: the audits, the difference or the gate."""
 
     name: str
     findings: list[Finding]
@@ -465,21 +454,20 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
     ]
 
 
-def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Finding]:
-    """Return a finding for each row of a run's regression against a baseline."""
+def of_gate(document: Mapping[str, Any]) -> list[Finding]:
+    """Return a finding for each test of a run's gate: it fails unless shown not to be worse."""
+    from restock.train.judge.gate import NOT_WORSE, describe
+
     found = []
-    for row in rows:
-        severity: Severity = "error" if row["verdict"] in ("worse", "refused") else "warning"
-        bad = row["verdict"] in ("worse", "refused", "inconclusive")
-        reported = f"Success in {row['condition']}, {row['perturbation']}, against {baseline}"
-        shown = {key: value for key, value in row.items() if value is not None}
+    for cell in document["cells"]:
+        shown = {key: value for key, value in cell.items() if key != "curve" and value is not None}
         found.append(
             _as_finding(
-                f"{row['perturbation']}.{row['condition']}",
-                severity,
-                reported,
-                row["reason"] or "`restock compare` and `restock diagnose` help to find out why",
-                [shown] if bad else [],
+                f"{cell['measure']}.{cell['perturbation']}.{cell['condition']}",
+                "error",
+                f"{describe(cell)}: not worse than {document['baseline']}",
+                "`restock compare` and `restock diagnose` help to find out why",
+                [] if cell["verdict"] == NOT_WORSE else [shown],
             )
         )
     return found

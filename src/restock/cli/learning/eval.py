@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 # Options that say what is driven, and what becomes of it.
 _DRIVES = (
     *("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "missions"),
-    *("baseline", "margin", "check", "save_as_baseline", "drive", "video"),
+    *("baseline", "save_as_baseline", "drive", "video"),
 )
 
 
@@ -52,12 +52,7 @@ class EvalCommand:
     """Seed of the first episode. All policies drive the same seeds."""
     baseline: str | None = None
     """Compare with this run, a saved baseline, or another one of the --policies (cloned, planner),
-    per condition, on the same episodes."""
-    margin: float = 0.05
-    """With --baseline: the policy is worse where its success is lower by more than this, with the
-    interval below 0."""
-    check: bool = False
-    """With --baseline: exit 1 if a condition is worse or cannot be compared."""
+    per condition, on the same episodes. `restock gate` decides whether it may take its place."""
     save_as_baseline: str | None = None
     """Save the evaluation as baselines/NAME.parquet (or as the .parquet file given)."""
     drive: bool = True
@@ -108,26 +103,16 @@ class EvalCommand:
             settings,
         )
         from restock.train.evaluation.regression import (
-            check_margin,
             read_baseline,
             read_run_evaluation,
-            regressed,
             regression,
         )
         from restock.train.evaluation.regression import save_baseline as save
         from restock.train.run.kept_evaluations import summary_rows
 
-        if self.baseline is None:
-            refuse(
-                self,
-                ("check", "margin"),
-                "has no effect without --baseline",
-                remedy="name the run or the saved baseline to compare with",
-            )
         if not self.drive:
             names = ("episodes", "perturbations", "seed", "limiter")
             refuse(self, names, "has no effect with --no-drive", remedy="leave out one of them")
-        check_margin(self.margin)
         beside = self.baseline if self.baseline in _names(self.policies) else None
         baseline = None
         if self.baseline is not None and beside is None:
@@ -168,20 +153,18 @@ class EvalCommand:
             with progress("filming", None) as advance:
                 films, missing = film_evaluation(plan, advance)
             document |= {"films": [str(path) for path in films], "not_filmed": missing}
-        compared = None
         if beside is not None:
             baseline = read_run_evaluation(self.run_path, beside)
         if baseline is not None:
-            compared = regression(baseline, read_run_evaluation(self.run_path), margin=self.margin)
-            document |= {"baseline": baseline.name, "margin": self.margin, "regression": compared}
+            rows = regression(baseline, read_run_evaluation(self.run_path))
+            document |= {"baseline": baseline.name, "regression": rows}
         if self.save_as_baseline is not None:
             document["saved"] = str(save(self.run_path, self.save_as_baseline))
         if self.json:
             print_json(document)
         else:
             self._show(document)
-        failed = self.check and compared is not None and regressed(compared)
-        return int(ExitCode.FAILED if failed else ExitCode.OK)
+        return int(ExitCode.OK)
 
     def _show(self, document: dict[str, Any]) -> None:
         from restock.cli.output import say
@@ -200,7 +183,7 @@ class EvalCommand:
         for why in document.get("not_filmed", ()):
             say(f"not filmed: {why}")
         if "regression" in document:
-            show_regression(document["regression"], document["baseline"], self.margin)
+            show_regression(document["regression"], document["baseline"])
         if "saved" in document:
             say(f"baseline saved as {document['saved']}")
 
@@ -344,7 +327,7 @@ def _value(row: dict[str, Any]) -> str:
     return interval_text(row["value"], row["low"], row["high"])
 
 
-def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) -> None:
+def show_regression(rows: list[dict[str, Any]], baseline: str) -> None:
     """Print a row per perturbation and condition, and one line with the result."""
     from restock.cli.output import print_table, say
 
@@ -357,9 +340,6 @@ def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) ->
             say(f"{row['perturbation']}, {row['condition']}: {row['reason']}")
     if any(row["verdict"] == "refused" for row in rows):
         say("drive both with the same --episodes, --perturbations and --seed")
-    worse = [f"{r['condition']} ({r['perturbation']})" for r in rows if r["verdict"] == "worse"]
-    if worse:
-        say(f"WORSE by more than {margin:g}, with the interval below 0: {', '.join(worse)}")
 
 
 def _regression_row(row: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,136 @@
+"""`restock gate`: show that a policy is not worse than what drives today, or say where not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+
+@dataclass
+class GateCommand:
+    """Show that a run's policy is not worse than what drives today, in every condition.
+
+    Both drive the same missions in the twin, until every condition is decided or the budget ends.
+    The policy passes if it is shown in every condition to be worse by less than the margin. A
+    policy that is worse by the margin in any of them passes with a probability of at most 5 %.
+
+    Exits with 0 if it is shown not to be worse, with 1 if that is not shown or it is shown to be
+    worse, and with 2 if a verdict would mean nothing. Writes RUN/gate: gate.json, gate.html and the
+    episodes.
+
+    Example: `restock gate runs/a --baseline planner --margins success=0.05,bumps_per_km=1`
+    """
+
+    run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run directory."""
+    baseline: Annotated[str, tyro.conf.arg(metavar="planner|RUN|FILE.onnx")]
+    """What drives today: planner, operator, random, cloned, another run, or an exported policy."""
+    margins: Annotated[str, tyro.conf.arg(metavar="NAME=X,...")] = "success=0.05"
+    """By how much the policy may be worse, for each measure that is asked: success (a share),
+    bumps_per_km, closest_person_m, stopped_s (with --limiter) and time_lost_s."""
+    conditions: str = ""
+    """Comma-separated kinds of missions. Default: those that the run was trained on."""
+    perturbations: str = "none"
+    """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml. Each is
+    judged by itself."""
+    layouts: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Floors to drive on, e.g. generated:test. May be given several times: each is judged by
+    itself. Default: the run's own floors."""
+    limiter: Annotated[str | None, tyro.conf.arg(metavar="profile|FILE.toml")] = None
+    """Drive both with a limiter after them: the profile's, or that of a file (docs/deploy.md)."""
+    budget: int = 1000
+    """Pairs of episodes of each condition, at most."""
+    seed: int = 1_000_000
+    """Seed of the first mission."""
+    junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write the verdicts as JUnit XML, for pipelines."""
+    json: bool = False
+    """Print the document as JSON: claim, evidence and limits."""
+
+    def run(self) -> int:
+        from restock.cli.output import print_json, progress, say
+        from restock.errors import ExitCode
+        from restock.files import write_text
+        from restock.report.run.gate import write_gate_page
+        from restock.train.judge.gate import FOLDER, NOT_WORSE, drive_gate, junit, plan_gate
+
+        plan = plan_gate(
+            self.run_path,
+            self.baseline,
+            margins=_margins(self.margins),
+            conditions=_names(self.conditions),
+            perturbations=_names(self.perturbations),
+            layouts=self.layouts,
+            limiter=self.limiter,
+            budget=self.budget,
+            first_seed=self.seed,
+        )
+        if self.junit is not None:
+            from restock.files import expect_file_place
+
+            expect_file_place(self.junit, "--junit", run=self.run_path)
+        with progress("driving", None) as advance:
+            document = drive_gate(plan, lambda text: advance(note=text))
+        page = write_gate_page(document, self.run_path / FOLDER / "gate.html")
+        if self.junit is not None:
+            write_text(self.junit, junit(document))
+        if self.json:
+            print_json(document)
+        else:
+            _show(document)
+            say(f"wrote {page}")
+        passed = document["verdict"] == NOT_WORSE
+        return int(ExitCode.OK if passed else ExitCode.FAILED)
+
+
+def _show(document: dict[str, Any]) -> None:
+    """Print the claim, a line a cell, and the limits."""
+    import sys
+
+    from restock.cli.output import print_table, reported
+    from restock.stats import interval_text
+
+    rows = [
+        {
+            "condition": cell["condition"],
+            "perturbation": cell["perturbation"].replace("none", ""),
+            "floors": cell["layouts"] if len({c["layouts"] for c in document["cells"]}) > 1 else "",
+            "measure": cell["measure"],
+            "pairs": cell["pairs"],
+            "better by [95 %]": ""
+            if cell["difference"] is None
+            else interval_text(cell["difference"], cell["low"], cell["high"], "+.3f"),
+            "margin": cell["margin"],
+            "verdict": cell["verdict"],
+        }
+        for cell in document["cells"]
+    ]
+    print_table(rows, reported(rows), title=document["claim"])
+    sys.stdout.writelines(f"{line}\n" for line in ("", *document["limits"]))
+
+
+def _margins(text: str) -> dict[str, float]:
+    """Read `success=0.05,bumps_per_km=1`.
+
+    Raises:
+        ConfigError: a part is no name and number.
+    """
+    from restock.errors import ConfigError
+
+    found = {}
+    for part in _names(text):
+        name, _, value = part.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            raise ConfigError(
+                f"{part!r} is not NAME=NUMBER", where="--margins", remedy="write success=0.05"
+            ) from None
+    return found
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]

@@ -1,0 +1,197 @@
+"""`restock gate`: passes what is shown not to be worse, names where it is, refuses the rest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.kept_run import kept_run
+
+from restock.cli import main
+from restock.train.evaluation.evaluate import EpisodeResult
+from restock.train.evaluation.policies import GreedyPolicy
+from restock.train.judge import gate
+from restock.train.judge.gate import NOT_SHOWN, NOT_WORSE, WORSE, drive_gate, plan_gate
+from restock.train.twin.physics.episode import EpisodeSpec
+
+Outcome = Callable[[EpisodeSpec, bool], bool]  # (mission, by the policy) -> success
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return kept_run(tmp_path / "a")
+
+
+@pytest.fixture
+def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[[Outcome], None]:
+    """Let the twin's episodes end as a function says."""
+
+    def install(outcome: Outcome) -> None:
+        def run_policy(
+            plan: Any, env: Any, driver: Any, specs: list[EpisodeSpec], progress: Any = None
+        ) -> list[EpisodeResult]:
+            own = isinstance(driver, GreedyPolicy)
+            return [result(spec, outcome(spec, own)) for spec in specs]
+
+        monkeypatch.setattr(gate, "run_policy", run_policy)
+
+    return install
+
+
+def result(spec: EpisodeSpec, success: bool) -> EpisodeResult:
+    block = ("partial", "full")[spec.seed % 2] if spec.condition == "blocked_aisle" else "none"
+    return EpisodeResult(
+        condition=spec.condition,
+        block=block,
+        episode_seed=spec.seed,
+        success=success,
+        bumps=int(not success),
+        time_s=10.0,
+        undiscounted_return=0.0,
+        end_x_m=0.0,
+        end_y_m=0.0,
+        failure=None if success else "bump",
+        distance_m=30.0,
+    )
+
+
+def often(spec: EpisodeSpec, own: bool) -> bool:
+    """Nine of ten missions succeed, by either."""
+    return bool(np.random.default_rng(spec.seed).random() < 0.9)
+
+
+def spoilt(spec: EpisodeSpec, own: bool) -> bool:
+    return often(spec, own) and not (own and spec.condition == "wheel_slip" and spec.seed % 2)
+
+
+def test_equal_policies_pass_before_the_budget(run: Path, driven: Any, tmp_path: Path) -> None:
+    driven(often)
+    file = tmp_path / "gate.xml"
+    assert main(["gate", str(run), "--baseline", "planner", "--junit", str(file)]) == 0
+    document = json.loads((run / "gate" / "gate.json").read_text())
+    assert document["verdict"] == NOT_WORSE
+    assert {cell["verdict"] for cell in document["cells"]} == {NOT_WORSE}
+    assert all(cell["pairs"] < 250 for cell in document["cells"])
+    conditions = [cell["condition"] for cell in document["cells"]]
+    assert {"nominal", "blocked_aisle (partial)", "blocked_aisle (full)"} <= {*conditions}
+    episodes = pq.read_table(run / "gate" / "episodes.parquet").to_pylist()
+    assert {row["policy"] for row in episodes} == {"agent", "planner"}
+    suite = ElementTree.parse(file).getroot()[0]
+    assert (suite.get("tests"), suite.get("failures")) == (str(len(conditions)), "0")
+    page = (run / "gate" / "gate.html").read_text()
+    assert "shown not worse" in page
+    assert "<svg" in page
+    assert "was not measured" in page  # the twin's gap
+
+
+def test_a_policy_spoilt_in_one_condition_is_named(
+    run: Path, driven: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    driven(spoilt)
+    assert main(["gate", str(run), "--baseline", "planner", "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    verdicts = {cell["condition"]: cell["verdict"] for cell in document["cells"]}
+    assert document["verdict"] == WORSE
+    assert [name for name, verdict in verdicts.items() if verdict != NOT_WORSE] == ["wheel_slip"]
+    assert "worse in wheel slip" in document["claim"]
+
+
+def test_a_spent_budget_shows_nothing(run: Path, driven: Any) -> None:
+    driven(
+        lambda spec, own: bool(
+            np.random.default_rng(2 * spec.seed + own).random() < 0.6 - 0.1 * own
+        )
+    )
+    plan = plan_gate(run, "planner", conditions=("nominal",), budget=160)
+    document = drive_gate(plan)
+    (cell,) = document["cells"]
+    assert (document["verdict"], cell["verdict"]) == (NOT_SHOWN, NOT_SHOWN)
+    assert 160 <= cell["pairs"] < 160 + gate.ROUND
+
+
+def test_each_measure_that_is_asked_is_judged(run: Path, driven: Any) -> None:
+    """A policy that arrives as often but bumps more fails by bumps alone."""
+    driven(often)
+    margins = {"bumps_per_km": 5.0, "time_lost_s": 2.0, "closest_person_m": 0.2}
+    plan = plan_gate(run, "planner", margins=margins, conditions=("nominal",), budget=400)
+    cells = {cell["measure"]: cell for cell in drive_gate(plan)["cells"]}
+    assert cells.keys() == {"success", *margins}
+    assert cells["bumps_per_km"]["verdict"] == NOT_WORSE
+    assert cells["time_lost_s"]["verdict"] == NOT_WORSE
+    nobody = cells["closest_person_m"]
+    assert (nobody["verdict"], nobody["pairs"]) == (NOT_SHOWN, 0)
+    assert nobody["pairs_unknown"] == nobody["pairs_driven"]
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        (["--margins", "success=0"], "--margins success"),
+        (["--margins", "success=1.5"], "--margins success"),
+        (["--margins", "success=much"], "--margins"),
+        (["--margins", "speed=1"], "--margins"),
+        (["--margins", "stopped_s=1"], "--margins stopped_s"),
+        (["--budget", "20"], "--budget"),
+        (["--conditions", "nominal,fire"], "--conditions"),
+        (["--seed", "90000"], "--seed"),  # by which the policy was chosen
+        (["--baseline", "nobody"], "--policies"),
+    ],
+)
+def test_what_cannot_give_a_verdict_is_refused(
+    run: Path, options: list[str], where: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = [] if "--baseline" in options else ["--baseline", "planner"]
+    assert main(["gate", str(run), *base, *options]) == 2
+    assert capsys.readouterr().err.startswith(f"restock: {where}: ")
+    assert not (run / "gate").exists()
+
+
+def test_a_baseline_of_another_task_is_refused(run: Path, tmp_path: Path) -> None:
+    other = kept_run(tmp_path / "b", profile="turtlebot3")
+    assert main(["gate", str(run), "--baseline", str(other)]) == 2
+
+
+def test_a_floor_without_room_for_a_condition_is_refused(run: Path, tmp_path: Path) -> None:
+    hall = tmp_path / "hall.toml"
+    hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
+    assert main(["gate", str(run), "--baseline", "planner", "--layouts", str(hall)]) == 2
+
+
+def test_a_twin_that_is_not_trusted_gives_no_verdict(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Gap:
+        untrusted = ("wheel_slip",)
+        verdicts = ()
+
+    monkeypatch.setattr(gate, "find_gap", lambda run: Gap())
+    assert main(["gate", str(run), "--baseline", "planner"]) == 2
+    assert "not to be trusted in wheel_slip" in capsys.readouterr().err
+    assert plan_gate(run, "planner", conditions=("nominal",)).gap is not None
+
+
+def test_an_interrupted_run_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Origin:
+        env_steps, run_env_steps, text = 20_000, 50_000, "policy of step 20,000 of 50,000"
+
+    monkeypatch.setattr(gate, "kept_policy", lambda run: Origin())
+    monkeypatch.setattr(gate, "run_clocks", lambda run: {"env_steps": 50_000, "wall_s": 9.0})
+    assert main(["gate", str(run), "--baseline", "planner"]) == 2
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_the_planner_is_not_worse_than_itself_in_the_twin(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from restock.train.evaluation.eval_run import reference
+
+    monkeypatch.setattr(gate, "make_policy", lambda name, plan: reference("planner"))
+    plan = plan_gate(run, "planner", conditions=("nominal",), budget=200)
+    assert drive_gate(plan)["verdict"] == NOT_WORSE

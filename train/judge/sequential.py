@@ -1,0 +1,125 @@
+"""Decide whether a mean difference is above a limit, at any time while pairs come in.
+
+A gambler bets that the mean is above a value c. After each difference x the wealth is multiplied by
+1 + bet * (x - c), with a bet that is chosen before x is seen. If the mean is c or less, the wealth
+grows in no bet on average, so it ever reaches 1/error with a probability of at most `error`
+(Ville's inequality). One may therefore look after every pair, and stop as soon as it does.
+
+Source: Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting",
+arXiv:2010.09686. The bets are theirs, for the alternative that matters here: that both policies
+are equally good.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from restock.arrays import F64
+
+CANDIDATES = 400  # values between the bounds for which bets are made
+PRIOR_PAIRS = 50  # so many pairs count as much as the variance that is assumed before the first
+CAUTION = 0.8  # of the bet by which wealth grows fastest: chance then passes fewer worse policies
+MAX_STAKE = 0.9  # share of the wealth that a bet may lose
+
+
+class ConfidenceSequence:
+    """Bounds of the mean of differences in [-bound, bound], valid after every pair at once.
+
+    Attributes:
+        low, high: the bounds after each pair, lists of n. The mean is below a `low` with a
+            probability of at most `error_low`, and above a `high` of at most `error_high`.
+        above_at: after how many pairs the mean was shown to be above `limit`, or None.
+        below_at: the same for below.
+    """
+
+    def __init__(
+        self,
+        bound: float,
+        limit: float,
+        *,
+        variance: float,
+        error_low: float = 0.05,
+        error_high: float = 0.05,
+    ) -> None:
+        self.bound, self.limit = bound, limit
+        grid = np.linspace(-bound, bound, CANDIDATES + 1)
+        self.candidates: F64 = np.unique(np.append(grid, limit))
+        self._limit_at = int(np.searchsorted(self.candidates, limit))
+        self._variance = variance
+        self._needed = math.log(1 / error_low), math.log(1 / error_high)
+        self._wealth = np.zeros((2, len(self.candidates)))  # log; that it is above, below
+        self._most = np.zeros_like(self._wealth)  # the largest so far
+        self.pairs, self._sum, self._squares = 0, 0.0, 0.0
+        self.low: list[float] = []
+        self.high: list[float] = []
+        self.above_at: int | None = None
+        self.below_at: int | None = None
+
+    @property
+    def mean(self) -> float | None:
+        """Return the mean difference so far; None before the first pair."""
+        return self._sum / self.pairs if self.pairs else None
+
+    def add(self, difference: float) -> None:
+        """Take one more difference into account."""
+        above, below = bets(
+            self.candidates,
+            self.pairs,
+            self._sum,
+            self._squares,
+            bound=self.bound,
+            variance=self._variance,
+        )
+        step = difference - self.candidates
+        self._wealth[0] += np.log1p(above * step)
+        self._wealth[1] += np.log1p(-below * step)
+        np.maximum(self._most, self._wealth, out=self._most)
+        self.pairs += 1
+        self._sum += difference
+        self._squares += difference**2
+        not_below = self._most[0] < self._needed[0]  # values that the mean may still have
+        not_above = self._most[1] < self._needed[1]
+        self.low.append(float(self.candidates[not_below][0]) if not_below.any() else self.bound)
+        self.high.append(float(self.candidates[not_above][-1]) if not_above.any() else -self.bound)
+        if self.above_at is None and not not_below[self._limit_at]:
+            self.above_at = self.pairs
+        if self.below_at is None and not not_above[self._limit_at]:
+            self.below_at = self.pairs
+
+
+def bets(
+    at: F64, pairs: int, total: F64 | float, squares: F64 | float, *, bound: float, variance: float
+) -> tuple[F64, F64]:
+    """Return the next bets that the mean is above, and below, each value `at`.
+
+    The bet that makes wealth grow fastest is about gain / (variance + gain**2), where gain is
+    the mean above the value. The mean is taken to be what was seen so far, after `PRIOR_PAIRS`
+    equal ones, but no worse than half way from 0 to the value.
+
+    Args:
+        at: values, of any shape.
+        pairs: how many differences were seen.
+        total, squares: their sum and the sum of their squares; shapes that broadcast with `at`.
+        bound: the largest possible difference.
+        variance: what is assumed before the first difference.
+    """
+    mean = total / (PRIOR_PAIRS + pairs)
+    variance = (PRIOR_PAIRS * variance + squares) / (PRIOR_PAIRS + pairs)
+    gain = np.maximum(np.maximum(mean, np.minimum(at / 2, 0.0)) - at, 0.0)
+    above = np.minimum(CAUTION * gain / (variance + gain**2), MAX_STAKE / (bound + at + 1e-9))
+    gain = np.maximum(at - np.minimum(mean, np.maximum(at / 2, 0.0)), 0.0)
+    below = np.minimum(CAUTION * gain / (variance + gain**2), MAX_STAKE / (bound - at + 1e-9))
+    return above, below
+
+
+def pairs_needed(bound: float, limit: float, *, variance: float, error: float = 0.05) -> int:
+    """Return after how many pairs that never differ the mean is shown to be above `limit` < 0."""
+    sequence = ConfidenceSequence(bound, limit, variance=variance, error_low=error)
+    while sequence.above_at is None:
+        sequence.add(0.0)
+    return sequence.above_at
+
+
+__all__ = ["ConfidenceSequence", "bets", "pairs_needed"]
