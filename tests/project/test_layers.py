@@ -103,6 +103,7 @@ MAY_IMPORT = {
         "cli ingest ingest/containers ingest/decoding ingest/profile ingest/propose"
         " ingest/steps ingest/store ingest/task replay replay/export"
         " replay/fleet replay/mixture replay/panel replay/plan replay/store train/evaluation"
+        " train/judge"
     ),
     "cli/fleet": (
         "cli report ingest ingest/profile ingest/store ingest/task replay replay/fleet"
