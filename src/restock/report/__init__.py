@@ -20,6 +20,7 @@ from restock.report.look.write import write_page
 from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.comparison import comparison_page, study_page
 from restock.report.run.facts import gather
+from restock.report.run.gate import gate_page
 from restock.report.run.page import page
 from restock.report.run.twin_gap import gap_page
 from restock.train.twin.calibration.twin_gap import read_gap
@@ -91,6 +92,11 @@ def write_comparison_page(
 ) -> Path:
     """Write the page of a comparison (`restock compare --json`); returns its path."""
     return write_page(comparison_page(found), out, figures)
+
+
+def write_gate_page(document: dict[str, Any], out: Path | str) -> Path:
+    """Write the page of a gate (`restock gate --json`); returns its path."""
+    return write_page(gate_page(document), out)
 
 
 def write_card(run: Path | str) -> tuple[dict[str, Any], str]:

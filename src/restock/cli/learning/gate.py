@@ -54,7 +54,7 @@ class GateCommand:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ExitCode
         from restock.files import write_text
-        from restock.report.run.gate import write_gate_page
+        from restock.report import write_gate_page
         from restock.train.judge.gate import FOLDER, NOT_WORSE, drive_gate, junit, plan_gate
 
         plan = plan_gate(

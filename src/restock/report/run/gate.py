@@ -11,7 +11,6 @@ import altair as alt
 from restock import __version__
 from restock.report.look.blocks import Drawing, Figure, Section, Table, count, words
 from restock.report.look.charts import FULL, draw, label_px, plot, side_by_side
-from restock.report.look.write import write_page
 from restock.stats import interval_text
 from restock.train.judge.gate import NOT_SHOWN, NOT_WORSE, SUCCESS, WORSE, describe
 
@@ -19,11 +18,6 @@ _KINDS = {NOT_WORSE: "good", NOT_SHOWN: "open", WORSE: "bad"}
 _WORDS = {NOT_WORSE: "shown not worse", NOT_SHOWN: "not shown", WORSE: "shown worse"}
 _COLOURS = {NOT_WORSE: "#0f766e", NOT_SHOWN: "#b58900", WORSE: "#be185d"}
 HEIGHT = 150
-
-
-def write_gate_page(document: dict[str, Any], out: Path) -> Path:
-    """Write the page of a gate's document (`restock.train.judge.gate`); return its path."""
-    return write_page(gate_page(document), out)
 
 
 def gate_page(document: dict[str, Any]) -> dict[str, Any]:
@@ -121,4 +115,4 @@ def _limits(document: dict[str, Any]) -> Section:
     return Section("limits", "What this does not say", tables=[Table(rows)])
 
 
-__all__ = ["gate_page", "write_gate_page"]
+__all__ = ["gate_page"]
