@@ -41,9 +41,8 @@ from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.calibration.twin_gap import DOCUMENT as GAP_DOCUMENT
 from restock.train.twin.calibration.twin_gap import FOLDER as GAP_FOLDER
 from restock.train.twin.calibration.twin_gap import TwinGap, read_gap
-from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS, MISSIONS
-from restock.train.twin.physics.episode import EpisodeSpec, refuse_unfit
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS
 from restock.words import counted, quoted
 
@@ -338,7 +337,12 @@ def _refuse_meaningless(plan: GatePlan, config: TrainConfig) -> None:
     first, where = plan.plans[0], str(plan.run.path)
     kinds = tuple(first.episodes)
     for one in plan.plans:
-        refuse_unfit(open_floors(one.layouts), kinds)
+        for kind in (kind for kind in kinds if kind in one.left_out):
+            raise ConfigError(
+                f"{', '.join(one.left_out[kind])} has no room for missions of {kind}",
+                where="--conditions",
+                remedy="leave it out, or give other floors: without missions, nothing is shown",
+            )
     last = first.first_seed + MAX_MISSIONS * plan.budget
     chosen = config.evaluation
     if chosen.seed < last and first.first_seed < chosen.seed + chosen.episodes:
