@@ -90,7 +90,7 @@ def test_a_panel_with_rows_of_a_robot_that_is_held_out_fails_its_audit(fleet, tm
 @pytest.mark.parametrize("by", ["episode", "recording", "time", "within_episode"])
 def test_only_episodes_that_the_mixture_admits_are_held_out(fleet, by):
     # The latest recording is of another robot: all that is held out was of it.
-    text = f"where = \"robot = 'a'\"\n[evaluation_split]\nby = '{by}'\ngap_s = 0\n" + EVERY
+    text = f"where = \"robot = 'a'\"\n[evaluation_split]\nby = '{by}'\n" + EVERY
     with Store(fleet) as store:
         plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
     robots = np.array(plan.rows["robot"].to_pylist())

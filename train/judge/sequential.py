@@ -94,7 +94,7 @@ def bets(
 ) -> tuple[F64, F64]:
     """Return the next bets that the mean is above, and below, each value `at`.
 
-    The bet that makes wealth grow fastest is about gain / (variance + gain**2), where gain is
+    The bet that makes wealth grow fastest is about gain / (spread + gain**2), where gain is
     the mean above the value. The mean is taken to be what was seen so far, after `PRIOR_PAIRS`
     equal ones, but no worse than half way from 0 to the value.
 
@@ -106,11 +106,11 @@ def bets(
         variance: what is assumed before the first difference.
     """
     mean = total / (PRIOR_PAIRS + pairs)
-    variance = (PRIOR_PAIRS * variance + squares) / (PRIOR_PAIRS + pairs)
+    spread = (PRIOR_PAIRS * variance + squares) / (PRIOR_PAIRS + pairs)
     gain = np.maximum(np.maximum(mean, np.minimum(at / 2, 0.0)) - at, 0.0)
-    above = np.minimum(CAUTION * gain / (variance + gain**2), MAX_STAKE / (bound + at + 1e-9))
+    above = np.minimum(CAUTION * gain / (spread + gain**2), MAX_STAKE / (bound + at + 1e-9))
     gain = np.maximum(at - np.minimum(mean, np.maximum(at / 2, 0.0)), 0.0)
-    below = np.minimum(CAUTION * gain / (variance + gain**2), MAX_STAKE / (bound - at + 1e-9))
+    below = np.minimum(CAUTION * gain / (spread + gain**2), MAX_STAKE / (bound - at + 1e-9))
     return above, below
 
 

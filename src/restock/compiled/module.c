@@ -5,7 +5,7 @@
  * `restock.ingest.task` with NumPy's and `restock.train.twin` with MuJoCo's rays, in fewer calls and
  * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/network.py`,
  * `train/feed/sampled_rows.py` and `batches.py`, `replay/sampling/rules.py`,
- * `train/twin/physics/scenery.py`, `ingest/task/route.py` and `surroundings.py`. Compiled with
+ * `train/twin/physics/scenery.py`, `ingest/task/surroundings.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
  * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
  * importing it fails, and these do the work. Stable ABI: one build serves Python 3.11 and later.

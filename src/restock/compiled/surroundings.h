@@ -3,12 +3,12 @@
 #include "buffers.h"
 #include <math.h>
 
-#define ROUNDING 1e-13 /* of squared distances: `route.ROUNDING` */
+#define ROUNDING 1e-13 /* of squared distances: `surroundings.ROUNDING` */
 
 PyDoc_STRVAR(
     view_plans_doc,
     "view_plans(plans, x, y, cosine, sine, ahead, look_ahead, remaining, offset)\n--\n\n"
-    "What robots see of their plans: `restock.ingest.task.route.view_route`, to the last bit.\n\n"
+    "What robots see of their plans: `restock.ingest.task.surroundings.view_route`, to the last bit.\n\n"
     "All are flat float64. `plans` (n, P, 2), P at least 2; poses `x`, `y`, `cosine` and `sine` of the\n"
     "heading (n,); `ahead` (L,) metres along the plan. Fills `look_ahead` (n, L, 2) in the body frame,\n"
     "`remaining` and `offset` (n,).");

@@ -83,7 +83,7 @@ class DemoCommand:
         for stage in plan:
             ended = work.do(stage)
             if not ended.good:
-                return ended.exit_code or int(ExitCode.ERROR)
+                return ended.exit_code or int(ExitCode.USAGE)
         report = to.run / "report.html"
         if self.json:
             print_json({"stages": work.summary(), "report": str(report)})
