@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from functools import partial
@@ -50,6 +51,7 @@ AS_WRITTEN = "join_order,build_side_probe_side"
 # DuckDB takes a negative limit, "none" or "null" for none at all, and fails at random with zero.
 _UNLIMITED_OR_ZERO = re.compile(r"\s*(?:-|none\b|null\b|[0.]+\s*[a-z%])", re.IGNORECASE)
 _MEMORY_REMEDY = 'write it like "4GB" or "512MB"'
+MAX_CLOSES = 500  # tries, .01 s apart
 T = TypeVar("T")
 
 
@@ -174,8 +176,19 @@ class Store:
         return unverified_files(self.path, self._paths())
 
     def close(self) -> None:
-        """Close the connection and remove its temporary files."""
-        self.bare.close()
+        """Close the connection and remove its temporary files.
+
+        An interrupt may leave a thread behind that still queries: it is ended first.
+        """
+        for left in reversed(range(MAX_CLOSES)):
+            try:
+                self.bare.close()
+                break
+            except duckdb.Error:
+                if not left:
+                    raise
+                self.bare.interrupt()
+                time.sleep(0.01)
         self._spill.cleanup()
 
     @interrupts_raised
