@@ -16,8 +16,6 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
-from restock.replay.fleet.shopping_list import install_gaps
-from restock.replay.panel.mixture_tables import install_mixtures
 from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import REMAKE, read_parquet
 from restock.replay.store.store import Store, is_store
@@ -84,8 +82,20 @@ def open_place(
 
 def add_computed_tables(store: Store) -> None:
     """Let a store's queries name the table macros that Python computes: they are made on demand."""
-    store.add_tables(("mixture", "mixture_rows"), install_mixtures)
-    store.add_tables(("gaps",), install_gaps)
+    store.add_tables(("mixture", "mixture_rows"), _install_mixtures)
+    store.add_tables(("gaps",), _install_gaps)
+
+
+def _install_mixtures(store: Store) -> None:
+    from restock.replay.panel.mixture_tables import install_mixtures  # few queries name these
+
+    install_mixtures(store)
+
+
+def _install_gaps(store: Store) -> None:
+    from restock.replay.fleet.shopping_list import install_gaps
+
+    install_gaps(store)
 
 
 def _add_all(

@@ -131,7 +131,7 @@ def test_a_folder_as_output_file_is_refused_early(
 def gated(run: Path, **changes: object) -> None:
     """Write a gate of one test, as `restock gate` leaves it."""
     origin = kept_policy(Run.open(run))
-    cell = {"measure": "success", "perturbation": "none", "condition": "nominal"}
+    cell = {"name": "nominal", "measure": "success", "perturbation": "none", "condition": "nominal"}
     document = {
         "baseline": "planner",
         "policy": None if origin is None else origin.document,
@@ -144,7 +144,7 @@ def gated(run: Path, **changes: object) -> None:
 @pytest.mark.parametrize(("verdict", "status"), [("not worse", "pass"), ("not shown", "fail")])
 def test_a_run_must_have_passed_its_gate(tmp_path: Path, verdict: str, status: str) -> None:
     run = kept_run(tmp_path / "run")
-    cell = {"measure": "success", "perturbation": "none", "condition": "nominal"}
+    cell = {"name": "nominal", "measure": "success", "perturbation": "none", "condition": "nominal"}
     gated(run, cells=[{**cell, "verdict": verdict}])
     (finding,) = of_gate(passed_gate(run, "planner"))
     assert finding.status == status

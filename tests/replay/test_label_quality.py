@@ -12,7 +12,7 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import QueryError
-from restock.replay.store.label_quality import label_quality
+from restock.replay.review import label_quality
 from restock.replay.store.store import Store
 
 

@@ -9,7 +9,7 @@ from support.stores import TASK
 
 from restock.replay.store.store import Store
 from restock.train.evaluation.ope import EssGate
-from restock.train.judge.evidence_needed import Evidence, policy_evidence
+from restock.train.judge.before_training import Evidence, policy_evidence
 
 PERIOD_S = TASK.control_period_s
 

@@ -17,7 +17,8 @@ from restock.cli import main
 from restock.train.evaluation.evaluate import EpisodeResult
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.judge import gate
-from restock.train.judge.gate import NOT_SHOWN, NOT_WORSE, WORSE, drive_gate, plan_gate
+from restock.train.judge.gate import drive_gate, plan_gate
+from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 from restock.train.twin.physics.episode import EpisodeSpec
 
 Outcome = Callable[[EpisodeSpec, bool], bool]  # (mission, by the policy) -> success

@@ -23,7 +23,7 @@ from restock.stats import (
     NOT_KNOWN,
     ConfidenceInterval,
 )
-from restock.train.judge.evidence_needed import twin_evidence
+from restock.train.judge.before_training import twin_evidence
 from restock.train.twin.calibration.gap import (
     AFTER,
     AGREES,

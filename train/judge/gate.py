@@ -34,7 +34,13 @@ from restock.train.evaluation.eval_run import (
     run_policy,
 )
 from restock.train.evaluation.evaluate import EpisodeResult
-from restock.train.judge.sequential import ConfidenceSequence, pairs_needed
+from restock.train.judge.sequential import (
+    NOT_SHOWN,
+    NOT_WORSE,
+    WORSE,
+    ConfidenceSequence,
+    pairs_needed,
+)
 from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run, kept_policy, run_clocks
 from restock.train.run.run_profile import profile_of_run, run_panel
@@ -54,7 +60,6 @@ FIRST_SEED = 1_000_000  # far from those of evaluations
 ROUND = 32  # pairs of a kind that are driven before what is decided is asked again
 MAX_POINTS = 120  # of a cell's curve in the document
 MAX_MISSIONS = 3  # a kind in two forms has two cells, and drives up to so many times the budget
-NOT_WORSE, WORSE, NOT_SHOWN = "not worse", "worse", "not shown"
 
 
 @dataclass(frozen=True)
@@ -158,6 +163,14 @@ class Cell:
         return self.verdict != NOT_SHOWN
 
     @property
+    def name(self) -> str:
+        """Return the condition as people read it, and what of the cell is not usual."""
+        parts = [_words(self.condition)]
+        parts += [self.perturbation] * (self.perturbation != CLEAN)
+        parts += [_words(self.measure.name)] * (self.measure.name != SUCCESS)
+        return ", ".join(parts)
+
+    @property
     def verdict(self) -> str:
         """Return what is shown here."""
         if self.sequence is None or (self.sequence.above_at or self.sequence.below_at) is None:
@@ -172,6 +185,7 @@ class Cell:
         every = max(len(low) // MAX_POINTS, 1)
         shown = sorted({*range(0, len(low), every), len(low) - 1} - {-1})
         return {
+            "name": self.name,
             "layouts": self.layouts,
             "perturbation": self.perturbation,
             "condition": self.condition,
@@ -477,7 +491,7 @@ def _claim(plan: GatePlan, cells: Sequence[Document], verdict: str) -> str:
     """Say in a sentence what was shown."""
     who = f"the policy of {plan.run.path.name} against {plan.baseline}"
     names = {
-        word: list(dict.fromkeys(describe(cell) for cell in cells if cell["verdict"] == word))
+        word: list(dict.fromkeys(cell["name"] for cell in cells if cell["verdict"] == word))
         for word in (WORSE, NOT_SHOWN)
     }
     if verdict == NOT_WORSE:
@@ -485,14 +499,6 @@ def _claim(plan: GatePlan, cells: Sequence[Document], verdict: str) -> str:
         return f"{who}: shown not to be worse by the margins, in all of {every}"
     parts = [f"{word} in {', '.join(of)}" for word, of in names.items() if of]
     return f"{who}: {'; '.join(parts)}".replace(NOT_SHOWN, "not shown to be no worse")
-
-
-def describe(cell: Document) -> str:
-    """Name a cell as people read it: condition, and what of it is not usual."""
-    parts = [_words(cell["condition"])]
-    parts += [cell["perturbation"]] * (cell["perturbation"] != CLEAN)
-    parts += [_words(cell["measure"])] * (cell["measure"] != SUCCESS)
-    return ", ".join(parts)
 
 
 def _words(name: str) -> str:
@@ -524,7 +530,7 @@ def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
     for cell in cells:
         if cell["pairs_unknown"]:
             yield (
-                f"{describe(cell)}: in {cell['pairs_unknown']:,} of {cell['pairs_driven']:,} pairs"
+                f"{cell['name']}: in {cell['pairs_unknown']:,} of {cell['pairs_driven']:,} pairs"
                 " the measure says nothing."
             )
 
@@ -563,7 +569,7 @@ def junit(document: Document) -> str:
         root, "testsuite", name="gate", tests=str(len(cells)), failures=str(failures), errors="0"
     )
     for cell in cells:
-        name = f"{describe(cell)} on {cell['layouts']}"
+        name = f"{cell['name']} on {cell['layouts']}"
         case = ElementTree.SubElement(suite, "testcase", classname="gate", name=name)
         if cell["verdict"] != NOT_WORSE:
             ElementTree.SubElement(case, "failure", message=cell["verdict"])
@@ -573,12 +579,8 @@ def junit(document: Document) -> str:
 
 __all__ = [
     "MEASURES",
-    "NOT_SHOWN",
-    "NOT_WORSE",
-    "WORSE",
     "drive_gate",
     "junit",
-    "describe",
     "passed_gate",
     "plan_gate",
 ]

@@ -18,6 +18,7 @@ import numpy as np
 
 from restock.arrays import F64
 
+NOT_WORSE, WORSE, NOT_SHOWN = "not worse", "worse", "not shown"  # verdicts on a limit
 CANDIDATES = 400  # values between the bounds for which bets are made
 PRIOR_PAIRS = 50  # so many pairs count as much as the variance that is assumed before the first
 CAUTION = 0.8  # of the bet by which wealth grows fastest: chance then passes fewer worse policies
@@ -122,4 +123,4 @@ def pairs_needed(bound: float, limit: float, *, variance: float, error: float = 
     return sequence.above_at
 
 
-__all__ = ["ConfidenceSequence", "bets", "pairs_needed"]
+__all__ = ["NOT_SHOWN", "NOT_WORSE", "WORSE", "ConfidenceSequence", "bets", "pairs_needed"]

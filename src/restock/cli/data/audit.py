@@ -456,7 +456,7 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
 
 def of_gate(document: Mapping[str, Any]) -> list[Finding]:
     """Return a finding for each test of a run's gate: it fails unless shown not to be worse."""
-    from restock.train.judge.gate import NOT_WORSE, describe
+    from restock.train.judge.sequential import NOT_WORSE
 
     found = []
     for cell in document["cells"]:
@@ -465,7 +465,7 @@ def of_gate(document: Mapping[str, Any]) -> list[Finding]:
             _as_finding(
                 f"{cell['measure']}.{cell['perturbation']}.{cell['condition']}",
                 "error",
-                f"{describe(cell)}: not worse than {document['baseline']}",
+                f"{cell['name']}: not worse than {document['baseline']}",
                 "`restock compare` and `restock diagnose` help to find out why",
                 [] if cell["verdict"] == NOT_WORSE else [shown],
             )

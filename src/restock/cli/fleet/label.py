@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from restock.ingest.relabel import Corrected, Relabelled
     from restock.ingest.store.writer import StoreWriter
     from restock.ingest.task.conditions import Condition
-    from restock.replay.store.label_quality import LabelQuality
+    from restock.replay.review import LabelQuality
     from restock.stats import ConfidenceInterval
 
 
@@ -186,7 +186,7 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
 def print_scores(path: Path, by: str | None, *, json: bool) -> int:
     """Print precision and recall of each condition, and how reliable the probabilities are."""
     from restock.cli import output
-    from restock.replay.store.label_quality import label_quality, reliability
+    from restock.replay.review import label_quality, reliability
     from restock.replay.store.store import Store
 
     with Store(path) as store:

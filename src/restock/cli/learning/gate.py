@@ -55,7 +55,8 @@ class GateCommand:
         from restock.errors import ExitCode
         from restock.files import write_text
         from restock.report import write_gate_page
-        from restock.train.judge.gate import FOLDER, NOT_WORSE, drive_gate, junit, plan_gate
+        from restock.train.judge.gate import FOLDER, drive_gate, junit, plan_gate
+        from restock.train.judge.sequential import NOT_WORSE
 
         plan = plan_gate(
             self.run_path,

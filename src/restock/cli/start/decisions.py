@@ -241,7 +241,7 @@ def evidence_lines(to: Settings) -> list[str]:
     from restock.replay.mixture.mixture import load_mixture
     from restock.replay.store.store import Store
     from restock.train.evaluation.ope import EssGate
-    from restock.train.judge.evidence_needed import policy_evidence, twin_evidence
+    from restock.train.judge.before_training import policy_evidence, twin_evidence
     from restock.train.twin.calibration.twin_gap import GapConfig, TrustLimits
 
     found, horizon_s = [], horizon(to.profile)

@@ -12,7 +12,7 @@ from restock import __version__
 from restock.report.look.blocks import Drawing, Figure, Section, Table, count, words
 from restock.report.look.charts import FULL, draw, label_px, plot, side_by_side
 from restock.stats import interval_text
-from restock.train.judge.gate import NOT_SHOWN, NOT_WORSE, SUCCESS, WORSE, describe
+from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 
 _KINDS = {NOT_WORSE: "good", NOT_SHOWN: "open", WORSE: "bad"}
 _WORDS = {NOT_WORSE: "shown not worse", NOT_SHOWN: "not shown", WORSE: "shown worse"}
@@ -45,7 +45,7 @@ def _evidence(cells: list[dict[str, Any]]) -> Section:
     floors = {cell["layouts"] for cell in cells}
     rows = [
         {
-            "test": describe(cell),
+            "test": cell["name"],
             **({"floors": cell["layouts"]} if len(floors) > 1 else {}),
             "verdict": _WORDS[cell["verdict"]],
             "better by": "nothing compared"
@@ -77,7 +77,7 @@ def _curves(cells: list[dict[str, Any]], *, several_floors: bool) -> Drawing:
     """Draw the bounds of each cell by pairs, with its margin."""
     rows = [
         {
-            "cell": describe(cell) + (f", {cell['layouts']}" if several_floors else ""),
+            "cell": cell["name"] + (f", {cell['layouts']}" if several_floors else ""),
             "limit": -cell["margin"],
             "verdict": cell["verdict"],
             **point,
@@ -93,7 +93,7 @@ def _curves(cells: list[dict[str, Any]], *, several_floors: bool) -> Drawing:
     )
     ends = [4 * cell["margin"] for cell in cells]
     shown = alt.Scale(domain=[-max(ends), max(ends)], clamp=True)
-    percent = alt.Axis(format="+.0%") if cells[0]["measure"] == SUCCESS else alt.Axis(format="~g")
+    percent = alt.Axis(format="+.0%") if cells[0]["unit"] == "" else alt.Axis(format="~g")
 
     def chart(width: int) -> Any:
         base = plot(rows).encode(x=alt.X("pairs:Q", title="pairs of episodes"))
