@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.driven_robot import START_NS, Drive, columns, typed_topics, without, write_topics
+from support.driven_robot import START_NS, Drive, columns
 from support.paths import ROOT, SHARED
 from support.profile_texts import framed
 
@@ -385,19 +385,3 @@ def test_a_message_may_hold_many_transforms_or_none():
     assert edges.parents == {"base_link": ["odom"], "odom": ["map"]}
     assert [len(columns) for columns in edges.topics.values()] == [1, 1]
     assert list(edges.only({"odom"}).parents) == ["odom"]
-
-
-def test_a_slow_localiser_beside_transforms_is_noted(tmp_path, capsys):
-    drive, said = Drive(20.0), {}
-    topics = drive_with_transforms(drive)
-    typed = typed_topics(drive) | {"/tf": ("tf2_msgs/msg/TFMessage", topics["/tf"])}
-    for name, every in (("often", 1), ("seldom", 10)):
-        poses = np.arange(len(topics["/amcl_pose"])) % every == 0
-        typed["/amcl_pose"] = (typed["/amcl_pose"][0], without(topics["/amcl_pose"], poses))
-        bag = write_topics(typed, tmp_path / name)
-        assert main(["profile", "new", str(bag), "--json"]) == 0
-        document = json.loads(capsys.readouterr().out)
-        said[name] = {one["key"]: one["text"] for one in document["advice"]}
-    assert "inputs.pose" not in said["often"]
-    assert "/amcl_pose comes every 1.0 s" in said["seldom"]["inputs.pose"]
-    assert "up to 0.4 m behind" in said["seldom"]["inputs.pose"]

@@ -16,7 +16,7 @@ from support.states import through_json
 
 from restock.errors import MixtureError
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.rules import Prioritised
+from restock.replay.sampling.rules import EPSILON, Prioritised
 from restock.replay.sampling.sampler import Quotas, QuotaSampler, uniform_sampler
 from restock.train.run import checkpoint
 
@@ -100,7 +100,7 @@ def errors() -> np.ndarray:
 
 def priority(rule: str, td_abs: np.ndarray) -> np.ndarray:
     """Return priorities as the paper has them; 1 for other rules."""
-    return (td_abs + PER.per_epsilon) ** PER.per_alpha if rule == "per" else np.ones_like(td_abs)
+    return (td_abs + EPSILON) ** PER.per_alpha if rule == "per" else np.ones_like(td_abs)
 
 
 def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make: Make, way: str) -> None:
