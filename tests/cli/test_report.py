@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import escape
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -476,7 +475,7 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     far = ConfidenceInterval(0.5, 0.4, 0.6)
     gap = TwinGap(
         about={
-            "limits": msgspec.structs.asdict(TrustLimits()),
+            "limits": asdict(TrustLimits()),
             "store_version": 7,
             "twins": {"nominal": {}},
         },
