@@ -101,7 +101,7 @@ def _show(document: dict[str, Any]) -> None:
             "floors": cell["layouts"] if len({c["layouts"] for c in document["cells"]}) > 1 else "",
             "measure": cell["measure"],
             "pairs": cell["pairs"],
-            "better by [95 %]": ""
+            "better by [bounds]": ""
             if cell["difference"] is None
             else interval_text(cell["difference"], cell["low"], cell["high"], "+.3f"),
             "margin": cell["margin"],
