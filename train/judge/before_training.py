@@ -38,12 +38,12 @@ from restock.train.run.run_profile import carried_profile, profile_of_panel
 from restock.train.twin.calibration.logged_steps import logged_steps
 from restock.train.twin.calibration.path_gap import overlapping_segments
 from restock.train.twin.calibration.twin_gap import (
-    DOCUMENT,
     FOLDER,
     TRUSTED,
     UNDECIDED,
     UNTRUSTED,
     GapConfig,
+    gap_folder,
     read_gap,
 )
 from restock.train.twin.env.drivers import Handover, Operator, PlannerFollower
@@ -58,7 +58,7 @@ _STATUS: dict[str, Status] = {TRUSTED: "ok", UNDECIDED: "undecided", UNTRUSTED: 
 def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
     """Yield a row for each condition of the first of `places` (a run, a store) that has a gap."""
     what = "where the twin ends when it drives what was logged"
-    folder = next((p / FOLDER for p in places if (p / FOLDER / DOCUMENT).is_file()), None)
+    folder = gap_folder(places)
     if folder is None:
         shown = places[0] / FOLDER if places else f"STORE/{FOLDER}"
         yield not_run(GAP_CHECK, what, f"`restock twin gap STORE --out {shown}` measures it")

@@ -44,9 +44,7 @@ from restock.train.judge.sequential import (
 from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run, kept_policy, run_clocks
 from restock.train.run.run_profile import profile_of_run, run_panel
-from restock.train.twin.calibration.twin_gap import DOCUMENT as GAP_DOCUMENT
-from restock.train.twin.calibration.twin_gap import FOLDER as GAP_FOLDER
-from restock.train.twin.calibration.twin_gap import TwinGap, read_gap
+from restock.train.twin.calibration.twin_gap import TwinGap, gap_folder, read_gap
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS, MISSIONS
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS
@@ -304,11 +302,11 @@ def policy_name(baseline: str) -> str:
 def find_gap(run: Run) -> TwinGap | None:
     """Return the twin's gap to the logs, as measured for the run or for its panel's store."""
     panel = run_panel(run.document)
-    places = [run.path / GAP_FOLDER]
+    places = [run.path]
     if panel is not None and "://" not in str(panel.header.store):
-        places.append(Path(panel.header.store) / GAP_FOLDER)
-    found = next((place for place in places if (place / GAP_DOCUMENT).is_file()), None)
-    return None if found is None else read_gap(found)
+        places.append(Path(panel.header.store))
+    folder = gap_folder(places)
+    return None if folder is None else read_gap(folder)
 
 
 def _check_margins(margins: Mapping[str, float], limiter: str | None) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -203,6 +204,11 @@ def write_gap(gap: TwinGap, folder: Path | str) -> None:
         "not_done": list(gap.not_done),
     }
     write_text(folder / DOCUMENT, json.dumps(document, indent=1) + "\n")
+
+
+def gap_folder(places: Iterable[Path]) -> Path | None:
+    """Return the folder of the first of these runs and stores for which a gap was measured."""
+    return next((place / FOLDER for place in places if (place / FOLDER / DOCUMENT).is_file()), None)
 
 
 def read_gap(folder: Path) -> TwinGap:
