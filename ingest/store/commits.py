@@ -500,7 +500,7 @@ class TableCommits(StoreReader):
 
 
 def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str]:
-    """Where the ingests of these recordings that the files hold have written their own."""
+    """Return where the ingests of these recordings that the files hold have written their own."""
     return [
         own_path(one.recording_id, one.ingest_id)
         for file in active

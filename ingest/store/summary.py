@@ -276,7 +276,7 @@ class RepeatedDrive:
 
     @property
     def is_part(self) -> bool:
-        """Whether the new one holds (nearly) all that it has, and more."""
+        """Return whether the new one holds (nearly) all that it has, and more."""
         return self.the_less and self.held >= NEARLY_ALL
 
     @property

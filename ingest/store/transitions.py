@@ -273,7 +273,7 @@ def transitions(
     rows: EpisodeRows,
     provenance: Provenance,
 ) -> pa.Table:
-    """One row a transition of a recording.
+    """Return one row a transition of a recording.
 
     Raises:
         RecordingError: as `transition_table`.

@@ -59,7 +59,7 @@ class Audit:
 
     @property
     def place(self) -> str | None:
-        """What it looks at beside the store: "run", "panel" or None."""
+        """Return what it looks at beside the store: "run", "panel" or None."""
         return self.needs.split(".")[0] if self.needs else None
 
     @property

@@ -142,7 +142,7 @@ class Relation:
     def fit(
         self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
     ) -> Response | None:
-        """None where the rows say too little."""
+        """Return the fit, or None where the rows say too little."""
         x, y = self.of(rows)
         y = y.copy()
         y[_left_out(rows, _motion(x, y), leave_out)] = np.nan

@@ -167,13 +167,13 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
 
 
 def _named(answer: Answer, recording: str) -> Answer:
-    """With the recording in the names of its comparisons."""
+    """Return the answer with the recording in the names of its comparisons."""
     rows = (replace(row, check=f"{row.check}, {recording}") for row in answer.comparisons)
     return replace(answer, comparisons=tuple(rows))
 
 
 def _joined(each: Sequence[tuple[str, Finding]], compared: int, kind: str) -> Finding:
-    """One finding of those of several parts, in the words of the first."""
+    """Join the findings of several parts into one, in the words of the first."""
     names = ", ".join(name for name, _ in each[:_NAMED])
     more = f" and {len(each) - _NAMED} more" if len(each) > _NAMED else ""
     first = each[0][1]

@@ -167,14 +167,14 @@ class FedRows:
 
     @cached_property
     def joined(self) -> Bools:
-        """Whether each row is the step after the row before it, (N,)."""
+        """Return whether each row is the step after the row before it, (N,)."""
         joined = np.zeros(len(self), np.bool_)
         joined[1:] = (np.diff(self.episode) == 0) & (np.diff(self.step) == 1)
         return joined
 
     @cached_property
     def cluster(self) -> Ints:
-        """What a bootstrap draws whole, codes (N,): episodes, or stretches of few long ones."""
+        """Return codes (N,) of what a bootstrap draws whole: episodes, or stretches if few."""
         if len(np.unique(self.episode)) >= FEW_EPISODES:
             return self.episode
         stretch = self.step // BLOCK_STEPS

@@ -49,7 +49,7 @@ class ActionSymptom:
 
     @property
     def reason(self) -> str:
-        """For people."""
+        """Say it for people."""
         supplied = "" if self.fresh_share is None else f", fresh rows in {self.fresh_share:.0%}"
         return (
             f"the policy takes {self.action!r} in {self.wanted_share:.0%} of the rows looked at (at"

@@ -414,7 +414,7 @@ class _Curves:
         self._read: dict[Path, RunCurve] = {}
 
     def pairs(self, arm: ArmConfig, baseline: ArmConfig) -> list[tuple[RunCurve, RunCurve]]:
-        """Of the seeds that both arms have finished."""
+        """Return the pairs of the seeds that both arms have finished."""
         both = zip(self._plan.runs(arm), self._plan.runs(baseline), strict=True)
         return [
             (self._curve(first), self._curve(second))
