@@ -1,1 +1,1 @@
-"""How well a policy drives, or would drive."""
+"""Evaluate policies: in the twin, and off-policy on logs."""

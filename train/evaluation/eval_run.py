@@ -1,4 +1,4 @@
-"""Evaluating a run: its policy beside references, on the same episodes; every name is checked.
+"""Evaluate a run: its policy and reference drivers on the same episodes.
 
 Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
 split by how much of the aisle is blocked. Seeds differ from those that training drew its
@@ -70,7 +70,7 @@ FIRST_SEED = 10_000
 
 
 def wrong_seed(seed: int, count: int = 1) -> str | None:
-    """Return what is wrong with a seed, or with the first of `count` in a row; None: nothing."""
+    """Return what is wrong with a seed, or with `count` seeds from it on; None if nothing is."""
     if 0 <= seed <= LAST_SEED + 1 - count:
         return None
     last = f" ({count:,} seeds from there on)" if count > 1 else ""
@@ -78,7 +78,7 @@ def wrong_seed(seed: int, count: int = 1) -> str | None:
 
 
 def reference(name: str, seed: int = 0) -> Policy:
-    """Make a reference driver by its name.
+    """Make the reference driver of this name.
 
     Raises:
         ConfigError: there is none of the name.
@@ -106,7 +106,7 @@ _PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """What to evaluate; every name was checked."""
+    """What to evaluate, with all names checked."""
 
     run: Run
     config: TrainConfig
@@ -124,7 +124,7 @@ class EvaluationPlan:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The requested kinds of episodes that every floor has room for."""
+        """Return the requested kinds of episodes that every floor has room for."""
         fit = [kind for kind in KINDS if kind in self.episodes and kind not in self.left_out]
         if self.missions is not None:
             fit = [kind for kind in fit if kind in self.missions.specs]
@@ -132,7 +132,7 @@ class EvaluationPlan:
 
     @property
     def specs(self) -> list[EpisodeSpec]:
-        """The episodes of each perturbation, kind beside kind; of logged ways each at most once."""
+        """Return the episodes of each perturbation, kinds interleaved; logged routes only once."""
         of = {
             kind: range(self.first_seed, self.first_seed + n) for kind, n in self.episodes.items()
         }
@@ -144,12 +144,12 @@ class EvaluationPlan:
 
     @property
     def floors(self) -> str:
-        """The floors by name, for the record: logged ways there are other missions."""
+        """Return the floors by name, for the record."""
         return self.layouts if self.missions is None else self.layouts + WAYS
 
     @property
     def warnings(self) -> list[str]:
-        """Episodes among those that chose the policy that is kept: they flatter it."""
+        """Warn of episodes that also selected the kept policy: their results are too good."""
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
         if self.missions is not None:
@@ -167,13 +167,13 @@ class EvaluationPlan:
 
     @property
     def origins(self) -> dict[str, PolicyOrigin]:
-        """The training step of the run's own policy, and that of each other run's."""
+        """Return the training step of the run's own policy and of each other run's."""
         own = {n: p.origin for n, p in self.loaded.items() if isinstance(p, GreedyPolicy)}
         return {name: origin for name, origin in own.items() if origin is not None}
 
     @property
     def total(self) -> int:
-        """Episodes to drive."""
+        """Return the number of episodes to drive."""
         episodes = len(self.specs)
         drivers = len(self.policies) * (1 if self.limits is None else 2)
         return drivers * len(self.perturbations) * episodes
@@ -254,7 +254,7 @@ def refuse_unknown(
 
 
 def episodes_of_kind(requested: int | str | Mapping[str, int]) -> dict[str, int]:
-    """Episodes by kind: a number for all, or for each as the text `kind=N,kind=N`.
+    """Return episodes by kind, from one number for all or from the text `kind=N,kind=N`.
 
     Raises:
         ConfigError: no such kind, or not a number of at least 1.
@@ -295,7 +295,7 @@ def _is_path(what: str, name: str) -> bool:
 
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """Make the run's policy, a scripted one, or one that is named."""
+    """Make a policy by its name: the run's own, a scripted one, a file's or another run's."""
     if name in plan.loaded:
         return plan.loaded[name]
     if name == "agent":
@@ -432,9 +432,9 @@ def evaluate(
 def drive_evaluation(
     plan: EvaluationPlan, progress: Callable[[int], None] | None = None
 ) -> list[dict[str, Any]]:
-    """Drive all episodes, and add them to the run's `eval/episodes.parquet`: those rows."""
+    """Drive all episodes, add them to the run's `eval/episodes.parquet`, and return their rows."""
     env = evaluation_env(plan)
-    # One queue a policy, over all perturbations: few environments then wait for the last episodes.
+    # One queue per policy over all perturbations, so that few environments wait for the last ones.
     episodes = [
         (name, msgspec.structs.replace(spec, perturbation=perturbation))
         for name, perturbation in plan.perturbations.items()
@@ -482,7 +482,7 @@ def run_policy(
     specs: Sequence[EpisodeSpec],
     progress: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Drive episodes by a policy, in the twin of a plan; results in the order of `specs`."""
+    """Drive episodes by a policy in a plan's twin; return results in the order of `specs`."""
     with torch_threads(plan.config.threads):
         return run_episodes(
             env,
@@ -497,7 +497,7 @@ def run_policy(
 
 
 def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return the episodes of a run's last evaluation, and a text that says which they are.
+    """Return the episodes of a run's last evaluation, and a text that describes them.
 
     Raises:
         RunError: nothing was driven, or the file is damaged.
@@ -513,7 +513,7 @@ def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
 
 
 def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
-    """Return how good the clones among the policies are; empty before they were driven."""
+    """Return the quality of each cloned policy; empty before they have driven."""
     return [one for one in read_clones(plan.run.path) if one.policy in plan.policies]
 
 

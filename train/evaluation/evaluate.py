@@ -1,4 +1,4 @@
-"""Evaluation: policies on the same seeded episodes, in the twin, without exploration.
+"""Drive policies through the same seeded episodes in the twin, without exploration.
 
 An episode is fully determined by its spec (condition, seed, perturbation), so every policy, run
 and checkpoint meets the same episodes and results can be compared episode by episode.
@@ -66,7 +66,7 @@ class EpisodeResult:
 
     @property
     def row(self) -> dict[str, Any]:
-        """The columns that every table of episodes has."""
+        """Return the columns that every table of episodes has."""
         return {
             "condition": self.condition,
             "block": self.block,
@@ -128,7 +128,7 @@ def run_episodes(
     """
     results: list[EpisodeResult | None] = [None] * len(specs)
     env.set_episodes(specs)
-    # What an environment drives on with, once its episodes are done, is the same every time.
+    # Environments that have finished keep stepping deterministically.
     observation, _ = env.reset(seed=0)
     window = round(STUCK_WINDOW_S / control_period_s)
     steps = np.zeros(env.num_envs, np.int64)
@@ -219,14 +219,14 @@ def _failure(terminated: bool, early: bool, still: bool) -> str:
 
 @dataclass(frozen=True)
 class Score:
-    """What a greedy evaluation came to."""
+    """The result of a greedy evaluation."""
 
     success: dict[str, float]  # per condition; empty if the task has no goal
     success_mean: float  # over conditions, each counting the same; 0 without a goal
     return_mean: float
 
     def beats(self, other: Score | None) -> bool:
-        """Higher mean success over conditions; on a tie, higher return."""
+        """Return whether mean success over conditions is higher or, on a tie, the return."""
         if other is None:
             return True
         best = (other.success_mean, other.return_mean)
@@ -234,7 +234,7 @@ class Score:
 
 
 def score(results: Sequence[EpisodeResult]) -> Score:
-    """Means over episodes within a condition, then over conditions."""
+    """Average over the episodes of a condition, then over conditions."""
     conditions = dict.fromkeys(result.condition for result in results)
     by = {name: [r for r in results if r.condition == name] for name in conditions}
     success = {
@@ -252,7 +252,7 @@ _CAPACITY = 16_384  # steps kept of one evaluation
 
 
 class EvaluationBuffer:
-    """The evaluation's twin, and the steps of the episodes that were last driven in it."""
+    """The evaluation's twin, and the steps of the last episodes driven in it."""
 
     def __init__(
         self,
@@ -301,12 +301,12 @@ class EvaluationBuffer:
         step: Step = collector.start(action, np.ones(len(action), np.float32))
         ended = collector.finish(env_steps=0, gradient_steps=0, acting_step=0)
         number = step[4]["episode_number"]
-        # Environments drive on after their fixed episodes: those steps do not count.
+        # Environments keep driving after their fixed episodes; those steps do not count.
         collector.forget([episode for episode in ended if number[episode.env] < 0])
         return step
 
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
-        """Rows of the run's table, one a condition, of the episodes that were last driven."""
+        """Return a row of the run's table per condition, from the last episodes driven."""
         self._collector.label(all_of_them=True)
         ring = self._collector.ring
         probe = Probe.of_ring(ring, _ROWS)

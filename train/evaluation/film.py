@@ -1,4 +1,4 @@
-"""Episodes of an evaluation driven again, to be looked at: worst failures and rescues by condition.
+"""Drive episodes of an evaluation again and film them: worst failures and rescues by condition.
 
 An episode follows from its spec alone, so what `restock eval` recorded can be driven again with the
 policy that is kept. A film whose outcome is not the recorded one is not made: it would show another

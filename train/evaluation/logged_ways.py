@@ -1,4 +1,4 @@
-"""Missions of the twin from those that robots really drove: start and goal of logged episodes.
+"""Make missions of the twin from real drives: start and goal of logged episodes.
 
 A store keeps no goal. Each row has the goal's distance and, once the goal is within reach of the
 far look-ahead point, its position. If the robot never came that near, the goal is computed from
@@ -56,7 +56,7 @@ class LoggedWays:
 
 @dataclass(frozen=True)
 class LoggedMissions:
-    """Episodes of each kind, one a logged way that has room for it, and what came of the others."""
+    """One episode per kind and logged route with room for it, and why others were left out."""
 
     specs: Mapping[str, Sequence[EpisodeSpec]]  # by kind
     ways: int  # that can be driven
@@ -67,7 +67,7 @@ class LoggedMissions:
 
     @property
     def text(self) -> str:
-        """The counts in a sentence."""
+        """Return the counts as a sentence."""
         said = f"missions of the logs: {self.ways} of {self.logged} can be driven"
         parts = [f"{said} ({self.source})"]
         parts += [f"{count} not: {why}" for why, count in self.left_out.items()]
@@ -152,7 +152,7 @@ def logged_missions(
 
 
 def logged_ways(connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task) -> LoggedWays:
-    """Return the ways of the episodes with some of these rows, if the rows show them."""
+    """Return the routes of the episodes that contain any of these rows, if the rows show them."""
     query = (files("restock.train.evaluation") / "logged_ways.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         columns = connection.sql(query).fetchnumpy()
@@ -235,7 +235,7 @@ def _seed(way: Way) -> int:
 def ways_to_evaluate(
     config: TrainConfig, layouts: str, panel: Panel | None
 ) -> list[EpisodeSpec] | None:
-    """Return the logged ways that a run's evaluations drive on these floors; None: drawn missions.
+    """Return the logged routes that a run's evaluations drive; None if missions are drawn.
 
     Raises:
         ConfigError: ways are asked for, and there are no logs, no goal, or none of them can be

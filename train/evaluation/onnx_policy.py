@@ -103,7 +103,7 @@ def to_onnx(network: PolicyNetwork) -> Any:
 
 
 class _Graph:
-    """Nodes and constants of a graph under way."""
+    """The nodes and constants of a graph that is being built."""
 
     def __init__(self, onnx: Any) -> None:
         self._onnx = onnx

@@ -1,4 +1,4 @@
-"""Off-policy evaluation: what a policy is worth, from logs of others, before it drives itself.
+"""Off-policy evaluation: estimate from logs of others what a policy is worth, before it drives.
 
 What is evaluated is the greedy policy made soft: with probability `epsilon` it acts at random. A
 deterministic one agrees with no long episode to its end, and its weights would all be zero.
@@ -58,7 +58,7 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class OpeEpisodes:
-    """Logged episodes as the evaluated policy sees them; after the end `ratio` is 1, `reward` 0."""
+    """Logged episodes for the evaluated policy, padded with `ratio` 1 and `reward` 0."""
 
     ratio: F64  # (n, T) probability of the action, evaluated policy / behaviour policy
     reward: F64  # (n, T)
@@ -78,17 +78,17 @@ class OpeEpisodes:
         )
 
     def until(self, horizon: int | None) -> OpeEpisodes:
-        """Return the first `horizon` steps; importance sampling then sees no later reward."""
+        """Return the first `horizon` steps; importance sampling then ignores later rewards."""
         return replace(self, ratio=self.ratio[:, :horizon], reward=self.reward[:, :horizon])
 
     @property
     def discounts(self) -> F64:
-        """The discount of each step, (T,)."""
+        """Return the discount of each step, (T,)."""
         return np.asarray(self.discount ** np.arange(self.reward.shape[1]), np.float64)
 
 
 def once(episodes: int) -> F64:
-    """Every episode counted once: (1, n)."""
+    """Return counts that take every episode once, (1, n)."""
     return np.ones((1, episodes))
 
 
@@ -99,7 +99,7 @@ def log_weights(ratio: F64) -> F64:
 
 
 def relative_weights(ratio: F64) -> F64:
-    """Products of ratios up to each step (n, T), the largest of each step 1: only shares count."""
+    """Return products of ratios up to each step (n, T), scaled so that each step's largest is 1."""
     logs = log_weights(ratio)
     most = logs.max(axis=0, initial=-np.inf)
     return np.exp(logs - np.where(np.isfinite(most), most, 0.0))
@@ -136,13 +136,13 @@ def effective_episodes(ratio: F64) -> F64:
 
 @dataclass(frozen=True)
 class EssGate:
-    """What importance weights must be worth, at every step, for their estimates to be shown."""
+    """The effective sample size that weighted estimates need at every step to be shown."""
 
     share: float = 0.2  # of the episodes
     episodes: float = 5.0
 
     def refusal(self, logged: OpeEpisodes) -> str | None:
-        """Why the estimators that weigh are refused, or None."""
+        """Return why weighted estimators are refused, or None."""
         least, reach = self.measure(logged)
         if reach == logged.ratio.shape[1] and len(logged):
             return None
@@ -156,7 +156,7 @@ class EssGate:
         )
 
     def measure(self, logged: OpeEpisodes) -> tuple[float, int]:
-        """Return the least effective number of episodes, and how many first steps have enough."""
+        """Return the lowest effective number of episodes, and how many first steps have enough."""
         if not len(logged):
             return 0.0, 0
         effective = effective_episodes(logged.ratio)
@@ -185,9 +185,9 @@ def estimate(
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> list[OpeEstimate]:
-    """Every estimator, with a percentile bootstrap interval over whole episodes.
+    """Return every estimate, with a percentile bootstrap interval over whole episodes.
 
-    The interval holds what other episodes would have changed. FQE has none: it is the model's word
+    The interval covers what other episodes would have changed. FQE has none: it is a model's value
     on the starts, and an interval over them would leave out what is wrong with the model.
     """
     near = logged.until(horizon)
@@ -227,7 +227,7 @@ class OpeConfig:
 
 @dataclass(frozen=True)
 class OpeResult:
-    """The rows of `off_policy`, and notes on the logs."""
+    """Rows of the `off_policy` table, and notes on the logs."""
 
     rows: list[dict[str, Any]]
     notes: tuple[str, ...]
@@ -237,7 +237,7 @@ class OpeResult:
 
 @dataclass(frozen=True)
 class OpePlan:
-    """What the off-policy evaluation of a run needs: nothing is fitted yet."""
+    """What the off-policy evaluation of a run needs; nothing is fitted yet."""
 
     path: Path
     policy: GreedyPolicy
@@ -252,7 +252,7 @@ class OpePlan:
 
     @property
     def updates(self) -> int:
-        """Number of updates of all models."""
+        """Return the number of updates of all models."""
         model = self.config.model
         cloned = bool(self.dataset.evaluation.unlogged.any())
         return model.cloning_updates * cloned + (
@@ -278,7 +278,7 @@ class OpePlan:
 
 
 def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
-    """Read and check the run and the logs of an evaluation; raises as these do."""
+    """Read and check the run and the logs of an evaluation; raise as reading these does."""
     run = Run.open(path)
     trained = parse_config(run.document["config"], where=str(path / "config.json"))
     agent = load_agent(run)
@@ -366,7 +366,7 @@ def evaluate_off_policy(
     config: OpeConfig = OpeConfig(),
     between: Callable[[], None] = lambda: None,
 ) -> list[dict[str, Any]]:
-    """Rows of `off_policy`: measure x condition of the episode x estimator.
+    """Return the rows of `off_policy`: measure x condition of the episode x estimator.
 
     `between` is called before every update of its models; what it raises ends the evaluation.
     """
@@ -428,7 +428,7 @@ def padded_episodes(
     discount: float,
     epsilon: float,
 ) -> OpeEpisodes:
-    """Rows by episode (N,) to padded episodes, as policy and model see them."""
+    """Pad rows by episode (N,) to episodes (n, T), as policy and model see them."""
     rows = steps.rows
     policy = soft_greedy(network, rows.observation, epsilon)
     at = np.arange(len(rows))

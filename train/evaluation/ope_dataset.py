@@ -32,7 +32,7 @@ MODEL_ROWS = 200_000  # at most, chosen at random: bounds memory and time
 
 @dataclass(frozen=True)
 class OpeSteps:
-    """Rows by episode and step; only the first steps of an episode may be there."""
+    """Rows by episode and step; episodes may be cut after their first steps."""
 
     rows: Transitions
     episode: Ints  # (N,) ascending, the place in `condition`
@@ -70,7 +70,7 @@ class OpeSteps:
 
     @property
     def unlogged(self) -> Bools:
-        """(N,) whether the logs do not say the probability of the action."""
+        """Return whether the logs lack the action's probability, (N,)."""
         return ~(self.probability > 0)
 
 
@@ -87,7 +87,7 @@ class OpeDataset:
 def load_ope_dataset(
     trained: Panel | None, task: Task, logs: str | None = None, *, seed: int = 0
 ) -> OpeDataset:
-    """Episodes that a run did not learn from, and the rows that it did.
+    """Load episodes that a run did not learn from, and the rows that it did.
 
     Args:
         trained: the panel that the run learnt from. For a run without one the models are fitted
@@ -154,12 +154,12 @@ def load_ope_dataset(
 
 
 def _unsplit(trained: Panel | None) -> bool:
-    """Tell whether a panel's logs had no rows to hold out."""
+    """Return whether a panel's logs had no rows to hold out."""
     return trained is not None and not trained.splits and bool(trained.header.split_note)
 
 
 def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
-    """Tell whether some of these rows' goals are where the robot got to."""
+    """Return whether some of these rows have a goal in hindsight."""
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         ((found,),) = connection.sql(
             "SELECT coalesce(bool_or(goal_source = 'hindsight'), false) FROM transitions"
@@ -300,7 +300,7 @@ def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
 
 
 def _halves(store: Store, ids: Ints) -> tuple[Ints, Ints]:
-    """Rows to evaluate on, and rows for the models: episodes by hash."""
+    """Split episodes by their hash into rows to evaluate on and rows for the models."""
     with passed_in(store.connection, wanted=pa.table({"transition_id": ids})):
         columns = store.connection.sql(
             "SELECT transition_id, hash(episode_id) % 2 = 0 AS evaluation"

@@ -1,4 +1,4 @@
-"""Policies by name: the network of a run, an ONNX file, or a clone of the logs' drivers.
+"""Load policies by name: a run's network, an ONNX file, or a clone of the logs' drivers.
 
 A clone is behaviour cloning, a reference in the twin: a network whose softmax is the probability of
 each action in the logs acts by these probabilities, as its drivers did, not by the likeliest. Its
@@ -148,7 +148,7 @@ def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
 
 
 def kept_one(state: Mapping[str, Any]) -> bool:
-    """Tell whether a run had kept a policy when this checkpoint of it was taken."""
+    """Return whether the run had kept a policy when this checkpoint was taken."""
     return bool(state["progress"]["evaluated_at"] >= 0)
 
 
@@ -192,7 +192,7 @@ SET_ASIDE = 5  # every fifth episode chooses among them
 
 
 class ClonedPolicy:
-    """Takes each action with the probability that it has in the logs, by its own seeded draws."""
+    """A policy that takes each action with its probability in the logs, by its own seeded draws."""
 
     def __init__(self, network: QNetwork, quality: CloneQuality, version: str, seed: int) -> None:
         self.name, self.version = quality.policy, version
@@ -209,13 +209,13 @@ class ClonedPolicy:
 
 
 def is_cloned(name: str) -> bool:
-    """Tell whether a policy's name is `cloned`, or `cloned:DRIVER`."""
+    """Return whether a policy's name is `cloned` or `cloned:DRIVER`."""
     kind, sign, driver = name.partition(":")
     return kind == CLONED and bool(driver) == bool(sign)
 
 
 def cloned_panel(run: Run, name: str) -> Panel:
-    """Open the panel of the rows that a clone is made of.
+    """Open the panel whose rows a clone is fitted to.
 
     Raises:
         ConfigError: the run learnt from no logs, or nobody of that name drove in them.
@@ -308,7 +308,7 @@ def clone_of(panel: Panel, name: str) -> tuple[QNetwork, CloneQuality]:
 def best_updates(observation: F32, action: Ints, episode: Ints, actions: int) -> int:
     """Return the number of updates that gives held-out episodes the largest likelihood.
 
-    Of a single episode its last fifth is set aside. More updates than that learn rows by heart.
+    If there is a single episode, its last fifth is held out. More updates would memorise rows.
     """
     aside: Bools = episode % SET_ASIDE == SET_ASIDE - 1
     if not aside.any() or aside.all():
@@ -330,7 +330,7 @@ def _drivers(panel: Panel) -> list[str]:
 
 
 def _held_out(panel: Panel, driver: str) -> tuple[F32, Ints, str | None]:
-    """Observations and actions that the panel holds out; why there are none, where that says."""
+    """Return the panel's held-out observations and actions, or why there are none."""
     try:
         rows = held_out_rows(panel, driver or None)
     except (PanelError, StoreError) as error:

@@ -1,4 +1,4 @@
-"""Did a run get worse than a baseline: per perturbation and condition, on the same episodes.
+"""Compare a run with a baseline on the same episodes, per perturbation and condition.
 
 A baseline is another run, or a file that keeps one's evaluation under a name, small enough to be
 committed beside the code that a pipeline tests. Differences are paired by episode: both policies
@@ -40,7 +40,7 @@ _Episodes = dict[_Key, tuple[float, float]]  # success and return
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A policy's episodes, and what it must share with another to be compared with it."""
+    """A policy's episodes, and what another must share to be compared with it."""
 
     name: str
     task_hash: str
@@ -99,14 +99,14 @@ def save_baseline(path: Path, name: str) -> Path:
 
 
 def baseline_file(name: str) -> Path:
-    """`baselines/NAME.parquet`, or the file that is named."""
+    """Return `baselines/NAME.parquet`, or the file that is named."""
     return Path(name) if name.endswith(".parquet") else FOLDER / f"{name}.parquet"
 
 
 def regression(
     baseline: Evaluated, candidate: Evaluated, *, margin: float = MARGIN, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Compare with a baseline: a row per perturbation and condition, and one over all conditions.
+    """Compare with a baseline: one row per perturbation and condition, one over all conditions.
 
     `worse` is a success lower by more than `margin`, with the paired 95 % interval below 0;
     `better` is an interval above 0. From fewer than `MIN_EPISODES` neither is told: the row is
@@ -142,7 +142,7 @@ def regression(
 def _row(
     cell: tuple[str, str], pairs: list[NDArray[Any]], margin: float, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Conditions count the same, however many episodes they have.
+    """Return a row in which every condition counts the same, whatever its episodes.
 
     Args:
         pairs: of each condition (n, 2, 2): episodes x (baseline, candidate) x (success, return).

@@ -1,1 +1,1 @@
-"""Judges: may runs be compared, which did better, what went wrong in one, are its rows right."""
+"""Judge runs: whether they may be compared, which did better, what went wrong, and its rows."""

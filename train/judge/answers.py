@@ -1,7 +1,7 @@
 """Test whether the logs' sensors and actions answer to each other as the twin's do.
 
-Of each relation the gain, the delay and what is left unexplained, in logs against in the twin; or
-against what holds by definition where no twin can be driven. And of each action the motion that it
+For each relation: the gain, the delay and the unexplained part, in the logs against the twin; or
+against the definition if no twin can be driven. And for each action: the motion that it
 comes to when held: which of the twin's actions is that?
 """
 
@@ -41,7 +41,7 @@ class Response:
 def fit_response(
     x: F64, y: F64, cluster: Ints, lags: Ints, rng: np.random.Generator
 ) -> Response | None:
-    """Return the response of y (n,) to x (n, L) at `lags` (L,); None where too little is known.
+    """Fit the response of y (n,) to x (n, L) at `lags` (L,); None if too little is known.
 
     Rows with a value that is not finite are left out.
     """
@@ -79,7 +79,7 @@ def fit_response(
 
 
 def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> ConfidenceInterval:
-    """Return a ratio of two statistics with independent draws (R,) each, and the values `at`.
+    """Return the interval of a ratio of statistics with independent draws (R,) and values `at`.
 
     `clusters` are those of the one that has fewer.
     """
@@ -90,7 +90,7 @@ def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> 
 def difference_of(
     first: F64, second: F64, at: tuple[float, float], clusters: int
 ) -> ConfidenceInterval:
-    """Return a difference of two statistics with independent draws (R,) each, and the values `at`.
+    """Return the interval of a difference, with independent draws (R,) and values `at`.
 
     `clusters` are those of the one that has fewer.
     """
@@ -106,7 +106,7 @@ def interval_of(value: float, draws: NDArray[np.float64], clusters: int) -> Conf
 
 
 def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
-    """x (N,) at each of L lags, (N, L); NaN where the row of that lag is not known."""
+    """Return x (N,) at each of L lags, (N, L); NaN if the row of that lag is unknown."""
     return np.stack([np.where(known, x[row], np.nan) for row, known in before], axis=1)
 
 
@@ -130,7 +130,7 @@ SlipLeftOut = Literal["episodes", "rows", "none"]
 
 @dataclass(frozen=True)
 class Relation:
-    """`y` answers to `x`; each end has a name that says whose it is."""
+    """A response of signal `y` to signal `x`."""
 
     name: str
     x: str
@@ -142,7 +142,7 @@ class Relation:
     def fit(
         self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
     ) -> Response | None:
-        """Return the fit, or None where the rows say too little."""
+        """Fit the response; None if the rows say too little."""
         x, y = self.of(rows)
         y = y.copy()
         y[_left_out(rows, _motion(x, y), leave_out)] = np.nan
@@ -153,10 +153,10 @@ class Relation:
         return fit_response(lagged(x, before), y, rows.cluster, self.lags, rng)
 
     def slip_to_leave_out(self, rows: FedRows) -> SlipLeftOut:
-        """Return what of logs to leave out so that a floor does not count as a fault of the robot.
+        """Return which logged rows to leave out, so that the robot is not blamed for a wet floor.
 
-        Where wheels slip, how a robot moves is the floor's, also in the rows around those that are
-        labelled: so whole episodes, as long as others remain. But a sensor that is wrong looks
+        Where wheels slip, the floor decides how a robot moves, also in the rows around those
+        labelled: so whole episodes are left out, as long as others remain. But a wrong sensor looks
         like slip too, all the time: then nearly every episode of its recording is so labelled.
         """
         moves = _motion(*self.of(rows))
@@ -166,7 +166,7 @@ class Relation:
 
 
 def _motion(x: F64, y: F64) -> F64:
-    """How much each row says of a relation, (N,)."""
+    """Return the weight of each row in the fit, (N,)."""
     moves = np.where(np.isfinite(y), x, 0.0) ** 2
     return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
 
@@ -182,7 +182,7 @@ def _slips(rows: FedRows) -> Bools:
 
 
 def _near_slip(rows: FedRows) -> Bools:
-    """Rows (N,) labelled as slipping, and those a few steps from them."""
+    """Return which rows (N,) are labelled as slipping or within a few steps of one."""
     slips = _slips(rows)
     near = slips.copy()
     for lag in (*range(-_NEAR_STEPS, 0), *range(1, _NEAR_STEPS + 1)):
@@ -225,7 +225,7 @@ def _pose_speed(rows: FedRows) -> F64:
 
 
 def _gained(rows: FedRows) -> F64:
-    """How much wheels speeded up over the step, m/s2."""
+    """Return the acceleration of the wheels over the step, m/s2."""
     change = rows.after("wheel_speed") - rows.now("wheel_speed")
     return np.asarray(change / rows.task.control_period_s)
 
@@ -246,7 +246,7 @@ def _turned_waypoint(rows: FedRows) -> F64:
 def _route_speed(rows: FedRows) -> F64:
     """Return how fast the way to go became shorter, m/s.
 
-    NaN where the plan jumped or reads its most, and where the robot is not headed along it: whoever
+    NaN if the plan jumped or is at its maximum, or if the robot does not head along it: who
     drives elsewhere does not shorten it.
     """
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
@@ -257,7 +257,7 @@ def _route_speed(rows: FedRows) -> F64:
 
 
 def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
-    """How sectors changed (N, S), and how they would by a turn (rad/s, (N,)) on the spot."""
+    """Return how sectors (N, S) would change by a turn on the spot (rad/s), and how they did."""
     now, after = rows.sectors(), rows.sectors(after=True)
     width = 2 * np.pi / max(rows.task.sectors, 1)
     slope = (np.roll(now, -1, axis=1) - np.roll(now, 1, axis=1)) / (2 * width)
@@ -325,7 +325,7 @@ class Answer:
 
     @property
     def fine(self) -> bool:
-        """Neither off nor undecided."""
+        """Return whether no comparison is off or undecided."""
         return all(one.status in ("ok", "not run") for one in self.comparisons)
 
     def is_off(self, figure: str) -> bool:
@@ -336,7 +336,7 @@ class Answer:
 def answers(
     logs: FedRows, twin: FedRows | None, seed: int = 0, of_twin: TwinFits | None = None
 ) -> list[Answer]:
-    """Every relation, compared. `of_twin` keeps the twin's fits for the next logs."""
+    """Compare every relation. `of_twin` keeps the twin's fits for the next logs."""
     rng = np.random.default_rng([seed, 1])
     of_twin = {} if of_twin is None else of_twin
     return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
@@ -392,7 +392,7 @@ def _answer(
 
 
 def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
-    """Without a twin: a speed is a speed, and commands come before what they cause."""
+    """Judge without a twin: a speed equals a speed, and commands precede what they cause."""
     name = relation.name
     if relation.gain is None:
         row = not_run(f"gain: {name}", what, "no twin to compare with")
@@ -414,7 +414,7 @@ def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
 
 
 def held_motion(rows: FedRows) -> list[F64]:
-    """Of each action the motion (n, 2) of the rows that hold it: m/s and rad/s by the wheels."""
+    """Return the motion (n, 2) of the rows that hold each action: m/s and rad/s by the wheels."""
     held = np.ones(len(rows), np.bool_)
     for lag in range(1, HELD):
         place, known = rows.before(lag)
@@ -427,8 +427,8 @@ def held_motion(rows: FedRows) -> list[F64]:
 def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comparison, int]]:
     """Return how far each logged action's motion is from that action's in the twin.
 
-    Without a twin, from the task's table. With it comes the action whose motion most of its rows
-    have.
+    Without a twin, the task's table is compared with. Each comparison comes with the action whose
+    motion most of its rows have.
     """
     expected = np.array(logs.task.actions, np.float64)
     scale = np.maximum(np.abs(expected).max(axis=0), 1e-9)

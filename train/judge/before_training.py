@@ -1,4 +1,4 @@
-"""What can be known before anything is trained: from a panel or a store, and the twin alone.
+"""Diagnose the rows of a panel or store before anything is trained, with the twin alone.
 
 A critic that is fed consistent mistakes learns them, and no figure of its training shows it: logs
 that swap left and right explain themselves. So the rows are held against fresh rows of the twin,
@@ -99,7 +99,7 @@ _NAMED = 3
 def unlike_recordings(
     logs: FedRows, twin: FedRows | None, seed: int = 0
 ) -> tuple[list[Finding], list[Comparison]]:
-    """Return what is wrong in some of the recordings alone, and the comparisons that say so."""
+    """Return what is wrong in only some recordings, and the comparisons that show it."""
     recordings = len(np.unique(logs.recording))
     if recordings < 2:
         return [], []
@@ -148,9 +148,9 @@ def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
 
 
 def _by_start(logs: FedRows) -> NDArray[np.str_]:
-    """Return the group of each row (N,), of recordings that started one after the other.
+    """Return the group of each row (N,); a group has recordings that started consecutively.
 
-    A group has `MIN_ROWS` rows at least, or as many as let `MOST` groups hold all.
+    A group has at least `MIN_ROWS` rows, or enough for `MOST` groups to hold all.
     """
     names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
     place = place.reshape(-1)
@@ -202,7 +202,7 @@ def drive_twin(
     robots: int = ROBOTS,
     steps: int = STEPS,
 ) -> FedRows:
-    """Rows of whole episodes that ended within `steps` steps of each robot.
+    """Drive the twin, and return the rows of episodes that ended within `steps` steps per robot.
 
     `conditions` are those that the twin's signals can say.
 
@@ -244,7 +244,7 @@ def drive_twin(
 def _rows(
     task: Task, conditions: Sequence[Condition], taken: Sequence[dict[str, NDArray[Any]]]
 ) -> FedRows:
-    """Return the rows of episodes that ended, robot by robot, from T steps of N robots."""
+    """Return the rows of ended episodes, robot by robot, from T steps of N robots."""
     steps = {name: np.stack([step[name] for step in taken], axis=1) for name in taken[0]}
     flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in steps.items()}
     ended = steps["ended"]
@@ -278,7 +278,7 @@ def _rows(
 def _labels(
     conditions: Sequence[Condition], rows: dict[str, NDArray[Any]], episode: Ints, step: Ints
 ) -> NDArray[np.str_]:
-    """Return the one condition of each row, by the very rules that label logs."""
+    """Return the primary condition of each row, by the rules that label logs."""
     ends = np.flatnonzero(rows["ended"])
     order = np.argsort(np.concatenate([np.arange(len(episode)), ends + 0.5]), kind="stable")
     columns: dict[str, Any] = {
@@ -298,7 +298,7 @@ Verdict = Literal["HEALTHY", "BUFFER", "UNDETERMINED"]
 
 @dataclass(frozen=True)
 class RowDiagnosis:
-    """What is wrong with rows before they are trained on, and the evidence."""
+    """The verdict on rows before training, with the evidence."""
 
     verdict: Verdict
     findings: list[Finding]
@@ -307,16 +307,16 @@ class RowDiagnosis:
 
     @property
     def not_run(self) -> list[Comparison]:
-        """Checks that could not be made, each with the reason in `note`."""
+        """Return the checks that could not be made, each with the reason in `note`."""
         return [row for row in self.comparisons if row.status == "not run"]
 
     @property
     def untrusted(self) -> list[str]:
-        """The conditions in which `restock twin gap` found the twin far from these logs."""
+        """Return the conditions in which `restock twin gap` found the twin far from these logs."""
         return untrusted(self.comparisons)
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the diagnosis as JSON values."""
         return {
             "verdict": self.verdict,
             "untrusted": self.untrusted,
@@ -327,7 +327,7 @@ class RowDiagnosis:
 
 
 class OpenedRows(NamedTuple):
-    """Rows at hand, and what needs more than them."""
+    """Opened rows, and what comes with them from their store."""
 
     rows: FedRows
     profile: Profile
@@ -345,7 +345,7 @@ def diagnose_before_training(
     run: Path | str | None = None,
     seed: int = 0,
 ) -> RowDiagnosis:
-    """Hold the rows of a panel or a store against the twin, and against the task's definitions.
+    """Compare the rows of a panel or store with the twin and with the task's definitions.
 
     Args:
         profile: whose task and conditions the twin is driven with; None: that of the rows.
@@ -377,10 +377,10 @@ def diagnose_rows(
     rows: FedRows, twin: FedRows | None, reason: str = "", *, seed: int = 0,
     more: Sequence[Comparison] = (),
 ) -> RowDiagnosis:  # fmt: skip
-    """Diagnose rows at hand.
+    """Diagnose opened rows.
 
-    `reason` says why there are none of a twin. `more` comparisons, made elsewhere, count like
-    these.
+    `reason` says why there are no rows of a twin. `more` are comparisons made elsewhere, which
+    count alike.
     """
     compared = answers(rows, twin, seed)
     permuted = list(permuted_actions(rows, twin))
@@ -484,7 +484,7 @@ def _drive(
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one judgement needs, and how much of it a store holds."""
+    """What one judgement needs, and how much of that a store holds."""
 
     purpose: str  # "judge the twin in nominal driving"
     needed: str  # "20 segments of 3 s in 5 episodes"
@@ -503,7 +503,7 @@ class Evidence:
 
 
 def twin_evidence(store: Store, config: GapConfig) -> Evidence:
-    """Return what the verdict of `restock twin gap` on nominal driving needs of a store.
+    """Return what a store needs for `restock twin gap` to judge nominal driving.
 
     Raises:
         ConfigError: a horizon that is not some control periods, or a robot that the twin cannot
@@ -524,7 +524,7 @@ def twin_evidence(store: Store, config: GapConfig) -> Evidence:
 
 
 def policy_evidence(store: Store, held_out_share: float, gate: EssGate) -> Evidence:
-    """Return what an estimate by importance weights needs, of a store's one task.
+    """Return what a store needs for an estimate by importance weights.
 
     Args:
         store: the logs.
@@ -547,7 +547,7 @@ def policy_evidence(store: Store, held_out_share: float, gate: EssGate) -> Evide
 
 
 def _more_h(driven_h: float, *counts: tuple[int, int]) -> float | None:
-    """Hours that are missing, of counts that are there and that are needed."""
+    """Return the missing hours, from pairs of existing and needed counts; None if one is 0."""
     if not all(there for there, _ in counts):
         return None
     return driven_h * max(0.0, *(least / there - 1 for there, least in counts))

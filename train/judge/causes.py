@@ -1,8 +1,8 @@
-"""From comparisons that are off to what is wrong with the logs, in their owner's words.
+"""Infer what is wrong with logs from the comparisons that are off, in their owner's words.
 
 A sensor whose readings are scaled, turned round or late is off in every relation that it takes part
-in, and the others agree among themselves: the fewest ends that all relations which are off have in
-common are at fault.
+in, and the others agree among themselves. So the smallest set of ends that all failing relations
+share is at fault.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ _UNITS = (
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong with the logs' rows."""
+    """A fault in the logs' rows."""
 
     cause: str  # a name that docs and programs know it by
     text: str  # what, by how much
@@ -101,7 +101,7 @@ def findings(
     others: Iterable[Comparison],
     task: Task,
 ) -> list[Finding]:
-    """Return what is wrong, worst understood last."""
+    """Return the faults, the least understood last."""
     of_rows = _of_rows([row for row in others if row.off])
     first = [one for one in of_rows if one.cause in _FIRST]
     if first:  # what rows are made of, and all that is compared with their next, follows from it
@@ -152,7 +152,7 @@ def _has(answer: Answer, ends: tuple[str, ...]) -> bool:
 
 
 def _distortion(end: str, off: Sequence[Answer]) -> tuple[float, float]:
-    """By how much an end's values are scaled, and how many steps later they are."""
+    """Return the factor by which an end's values are scaled, and how many steps late they are."""
     ends = GROUPS.get(end, (end,))
     scales, delays = [], []
     for one in off:
@@ -234,7 +234,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
 
 
 def _surely_reversed(off: Sequence[Answer]) -> bool:
-    """Whether every gain that is off is below 0 with its whole interval: noise has either sign."""
+    """Return whether each gain that is off is below 0 with its whole interval, unlike noise."""
     gains = [
         row for one in off for row in one.comparisons if row.off and row.check.startswith("gain")
     ]
@@ -274,7 +274,7 @@ def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Findi
 
 
 def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
-    """Return findings of the checks that name their cause themselves; the first claims a check."""
+    """Return findings of checks that imply their cause; the first one claims a check."""
     left = {row.check: row for row in off}
     found = []
     for kind in KINDS:
@@ -306,7 +306,7 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
 
 @dataclass(frozen=True)
 class Kind:
-    """What checks of rows stand for. `text` has each check's comparison by its name."""
+    """A cause that checks of rows imply. `text` has each check's comparison by its name."""
 
     cause: str
     checks: tuple[str, ...]  # the first must be off; the others belong to it

@@ -78,7 +78,7 @@ class Check:
 
     @classmethod
     def exact(cls, name: str, first: float, second: float, value: float, limit: float) -> Check:
-        """Of counts of the whole run, with nothing random in them."""
+        """Return whether the check compares counts of the whole run, which are not random."""
         return cls(name, "whole run", first, second, value, value, value, limit)
 
     @property
@@ -89,14 +89,14 @@ class Check:
 
 
 def worst(verdicts: Sequence[Verdict]) -> Verdict:
-    """Return the verdict of many: one that is incomparable decides."""
+    """Return the verdict of several checks: one that is incomparable decides."""
     return max(verdicts, key=_ORDER.index, default="comparable")
 
 
 def check_feeds(
     first: Feed, second: Feed, limits: ComparabilityLimits, rng: np.random.Generator
 ) -> list[Check]:
-    """All checks. Both feeds must name the same cells in the same order."""
+    """Run all checks. Both feeds must name the same cells in the same order."""
     checks = []
     totals = [_resampled(feed, limits, rng) for feed in (first, second)]
     # Without importance weights the mix after weights is the mix.
@@ -134,7 +134,7 @@ def _ratios(
 
 
 def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
-    """Rows drawn before they had labels may be of any condition: many of them show nothing."""
+    """Check the share of rows drawn before they had labels: they may be of any condition."""
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
     for feed in (first, second):
@@ -149,7 +149,7 @@ def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[
 
 
 def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
-    """Episodes that each cell was drawn from: a count, with nothing random in it."""
+    """Compare the numbers of episodes that each cell was drawn from; these are not random."""
     checks = []
     totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
     for index, cell in enumerate(first.cells):
@@ -163,7 +163,7 @@ def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Ch
 
 
 def _episodes_a_run(feed: Feed, cell: int) -> float:
-    """Distinct episodes that a cell was drawn from, the mean over the arm's runs."""
+    """Return the distinct episodes that a cell was drawn from, averaged over the arm's runs."""
     here = feed.cell == cell
     pairs = np.stack([feed.run[here], feed.episode[here]])
     return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
@@ -172,11 +172,11 @@ def _episodes_a_run(feed: Feed, cell: int) -> float:
 def _distance(
     name: str, part: str, a: F64, b: F64, limit: float, limits: ComparabilityLimits
 ) -> Check:
-    """Total variation distance of mixes (1 + R, C): the figure, then its resamples."""
+    """Return the total variation distance of mixes (1 + R, C): the figure, then its resamples."""
     values = np.abs(a - b).sum(1) / 2
     value = float(values[0])
     low, high, lowest, highest = _interval(values[1:], limits)
-    # Two resamples are further apart than what they are from, for noise alone; mirrored about the
+    # Two resamples are further apart than their originals, by noise alone; mirrored about the
     # figure the interval errs to the other side. The wider of the two at each end says neither
     # "same" nor "different" for noise.
     low, high = min(lowest, 2 * value - highest), max(high, 2 * value - low)
@@ -184,7 +184,7 @@ def _distance(
 
 
 def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
-    """Return the larger share over the smaller; a, b (1 + R,): the figure, then its resamples."""
+    """Return the larger share over the smaller; a, b (1 + R,) are the figure, then resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)
     logs[np.isnan(logs)] = 0.0  # none in both
@@ -220,7 +220,7 @@ def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, f
 
 
 def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator) -> F64:
-    """Draws, then weights, by tenth and cell, (1 + R, 2, 10, C): as they were, then resampled.
+    """Return draws and weights by tenth and cell, (1 + R, 2, 10, C): the originals, then resamples.
 
     A fresh episode is resampled as a whole: in all tenths and cells that it was drawn in.
     """
@@ -320,7 +320,7 @@ _NO_SETTING = frozenset(  # or it follows from the config
 
 @dataclass(frozen=True)
 class Difference:
-    """A setting in which two arms (or two runs of one) differ."""
+    """A setting in which two arms, or two runs of one arm, differ."""
 
     setting: str
     kind: Kind
@@ -350,7 +350,7 @@ class Arm:
 
     @cached_property
     def totals(self) -> dict[str, float]:
-        """What a run of this arm did, in the mean: environment steps and updates."""
+        """Return the mean environment steps and updates of the arm's runs."""
         for run in self.runs:
             if not run.table("progress").num_rows:
                 raise RunError(
@@ -382,7 +382,7 @@ class Arm:
 
 
 def refuse_dependent(runs: Sequence[Run]) -> None:
-    """Run of one method are independent seeds of it, or their spread is too small.
+    """Refuse runs of one method that are not independent seeds: their spread would be too small.
 
     Raises:
         RunError: there is none, two are one run (or copies of it) or have one seed, or their
@@ -422,7 +422,7 @@ def refuse_dependent(runs: Sequence[Run]) -> None:
 
 
 def same_run(first: Run, second: Run) -> bool:
-    """Whether two directories hold one run: a copy has the same time of creation and settings."""
+    """Return whether two directories hold one run: a copy has its time of creation and settings."""
     return first.document == second.document
 
 

@@ -1,4 +1,4 @@
-"""May two arms be compared, and how do they compare: the checks, then the outcomes.
+"""Check whether two arms may be compared, then compare their outcomes.
 
 A comparison of methods that were fed differently measures the feed. It is refused, with what
 differs, unless the feed is what is compared (`treatment="mixture"`).
@@ -73,11 +73,11 @@ class Comparison:
 
     @property
     def deciding_checks(self) -> list[Check]:
-        """The checks that the verdict is made of: of the feed too, unless it is the treatment."""
+        """Return the checks that decide: those of the feed too, unless it is the treatment."""
         return [] if self.identical else _deciding(self.treatment, self.totals, self.checks)
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
+        """Return the whole comparison as JSON values."""
         deciding = self.deciding_checks
         return {
             "treatment": self.treatment,
@@ -133,7 +133,7 @@ def compare(
 
 
 def _identical(first: Arm, second: Arm) -> bool:
-    """Whether both arms are the same runs. Raises RunError where only some are in both."""
+    """Return whether both arms are the same runs; raise RunError if only some are in both."""
     both = [(a, b) for a in first.runs for b in second.runs if same_run(a, b)]
     if both and not len(both) == len(first.runs) == len(second.runs):
         a, b = both[0]
@@ -161,7 +161,7 @@ def _total(name: str, first: float, second: float) -> Check:
 
 
 def _outcomes(first: Arm, second: Arm) -> tuple[str, list[dict[str, Any]]]:
-    """Where the episodes are from, and one row a perturbation and condition that both arms drove.
+    """Return the episodes' origin, and a row per perturbation and condition that both arms drove.
 
     Raises:
         RunError: a run has no evaluation, or the arms share no episode.
@@ -214,12 +214,12 @@ def _outcome(
 
 
 def _known(value: float) -> float | None:
-    """None where the task has no goal: its success is NaN."""
+    """Return None for NaN: without a goal, there is no success."""
     return None if np.isnan(value) else float(value)
 
 
 def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
-    """Return what an interval would claim too much of, or None. A, b as of `_outcome`."""
+    """Return why an interval would claim too much, or None; a, b as in `_outcome`."""
     if np.isnan(difference.value):
         return "the task has no goal: compare the returns"
     runs, episodes = min(len(a), len(b)), a.shape[1]
@@ -233,7 +233,7 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
 
 
 def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
-    """Cell -> episode seed -> (runs, 2) success and return; episodes that every run drove."""
+    """Return success and return (runs, 2) by cell and seed, of episodes that every run drove."""
     runs: list[dict[Cell, dict[int, tuple[float, float]]]] = []
     for table in tables:
         cells: dict[Cell, dict[int, tuple[float, float]]] = {}
@@ -254,7 +254,7 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
 
 
 def last_evaluation(run: Run) -> pa.Table:
-    """Return the last periodic evaluation in training. Raises RunError where there was none."""
+    """Return the last periodic evaluation in training; raise RunError if there was none."""
     import pyarrow.compute as pc  # slow to import
 
     table = run.table("evaluations")
@@ -320,7 +320,7 @@ def _side(run: Run) -> dict[str, Any]:
 
 
 def _panels(a: Run, b: Run) -> dict[str, Any] | None:
-    """Return what is different between their panels, where both are still where they were."""
+    """Return what differs between their panels, if both still exist."""
     fed = [run.document.get("panel") or {} for run in (a, b)]
     if not all(fed) or fed[0].get("id") == fed[1].get("id"):
         return None
@@ -335,7 +335,7 @@ def _panels(a: Run, b: Run) -> dict[str, Any] | None:
 
 
 def _fed(a: Run, b: Run) -> Rows:
-    """One line a source and condition: its share of all rows drawn, plain and after weights."""
+    """Return a line per source and condition: its share of the rows drawn, plain and weighted."""
     query = files("restock.train.judge").joinpath("fed_shares.sql")
     with duckdb.connect() as connection:
         for side, run in (("a", a), ("b", b)):
@@ -344,7 +344,7 @@ def _fed(a: Run, b: Run) -> Rows:
 
 
 def _ages(a: Run, b: Run) -> Rows:
-    """One line a source and unit: median and 90th percentile of the rows drawn, last interval."""
+    """Return a line per source and unit: median and 90th percentile age in the last interval."""
     lines: dict[tuple[str, str], dict[str, Any]] = {}
     for side, run in (("a", a), ("b", b)):
         table = run.table("ages")
@@ -362,7 +362,7 @@ def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> Rows:
 
 
 def _evaluations(a: Run, b: Run, rng: np.random.Generator) -> tuple[str | None, Rows, str | None]:
-    """Where the episodes are from, a line a perturbation and condition, or why there is none."""
+    """Return the episodes' origin and a line per perturbation and condition, or why none."""
     driven = [agent_episodes(run) for run in (a, b)]
     source = "restock eval"
     if any(table is None for table in driven):
@@ -388,7 +388,7 @@ def _evaluations(a: Run, b: Run, rng: np.random.Generator) -> tuple[str | None, 
 def _evaluation(
     cell: tuple[str, str], pairs: np.ndarray[Any, Any], rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Success and return of both, and the paired differences over episodes."""
+    """Return success and return of both, and the paired differences over episodes."""
     line: dict[str, Any] = {
         "perturbation": cell[0],
         "condition": cell[1],
@@ -421,7 +421,7 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], dict[_Key, tuple[float, flo
 
 
 def _verdict(first: Path, second: Path) -> dict[str, Any]:
-    """Return the verdict of `restock compare`, by the difference that is allowed."""
+    """Return the verdict of `restock compare`, given the difference that is allowed."""
     verdict: dict[str, Any] = {}
     for treatment in ("algorithm", "mixture"):
         try:

@@ -1,4 +1,4 @@
-"""Buffer failure or target failure: what a critic gets wrong, and where.
+"""Tell buffer failure from target failure: what a critic gets wrong, and where.
 
 A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may lack, outnumber
 or misstate a condition: then it is wrong on fresh steps of that condition and right elsewhere. Or
@@ -7,8 +7,8 @@ networks disagree. Steps of the evaluations, in no replay, tell which: `windows`
 their limits. Each figure is its median over the last evaluations.
 
 An experiment confirms a diagnosis: the same run with one suspect replaced. If the target was at
-fault, another target rule on the same feed mends it; if the feed was, the same target rule on
-another feed does. What is left unchanged says as much as what changes.
+fault, another target rule on the same feed repairs it; if the feed was, the same target rule on
+another feed does. What stays the same is evidence, too.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def diagnose(
 
 
 def target_rule(run: Run) -> TargetRule:
-    """Return the rule that its target followed."""
+    """Return the rule that the run's target followed."""
     rule: TargetRule = msgspec.convert(run.document["config"]["target"], TargetRule)
     return rule
 
@@ -113,7 +113,7 @@ def other_target(rule: TargetRule) -> Polyak:
 
 
 def _figures(run: Run, windows: Sequence[Window]) -> Window:
-    """Return what the last windows of a run show together."""
+    """Return the median figures of a run's last windows."""
     before = windows[-WINDOWS - 1].gradient_steps if len(windows) > WINDOWS else 0
     actions = action_symptoms(run, before)
     return replace(median_window(windows[-WINDOWS:]), actions=actions)
@@ -122,7 +122,7 @@ def _figures(run: Run, windows: Sequence[Window]) -> Window:
 def _verdict(
     run: Run, windows: Sequence[Window], figures: Window, limits: DiagnosisLimits
 ) -> tuple[Cause, str]:
-    """Return what the last windows come to, and what to do where that is UNDETERMINED."""
+    """Return the verdict on the last windows, and what to do if it is UNDETERMINED."""
     if windows[-1].diverged(limits) and figures.diverged(limits):
         return "DIVERGENCE", ""
     last = windows[-WINDOWS:]
@@ -148,10 +148,10 @@ def _verdict(
 
 
 def _too_young(last: Sequence[Window], rule: TargetRule) -> str:
-    """Why an L past its limit may be the run's age, or nothing.
+    """Return why an L past its limit may come from the run's age; "" if it does not.
 
-    While values grow from 0, every target lags. A rule that is so slow that no run would be old
-    enough is at fault itself, which shows by an L that does not fall.
+    While values grow from 0, every target lags. If a rule is so slow that no run would be old
+    enough, the rule is at fault: its L does not fall.
     """
     updates, settled = last[-1].gradient_steps, _SETTLED_LAGS * rule.effective_lag
     if updates >= settled:
@@ -172,7 +172,7 @@ def _explained(explained: float | None) -> str:
 
 
 def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
-    """Return what a window shows, for people."""
+    """Describe a window in sentences."""
     most = f"of at most {window.q_bound:.3g}"
     if isinf(window.q_bound):
         most = "(how large it may be is unknown: no audited row has a reward)"
@@ -252,7 +252,7 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
 
 
 def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
-    """Return the verdict on a run and its rows together; sound rows change nothing."""
+    """Combine the verdicts on a run and on its rows; sound rows change nothing."""
     if not rows.findings:
         return diagnosis
     cause = _TOGETHER.get(diagnosis.cause, diagnosis.cause)
@@ -275,7 +275,7 @@ _NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
 
 
 def check_place(out: Path) -> None:
-    """Raise RunError where the experiment's run cannot be made at `out`."""
+    """Raise RunError if the experiment's run cannot be made at `out`."""
     try:
         check_free(out)
     except RunError as taken:
@@ -289,9 +289,9 @@ def check_place(out: Path) -> None:
 def confirm(
     run: Run, diagnosis: Diagnosis, out: Path, *, rows_at_fault: bool = False
 ) -> dict[str, Any]:
-    """Train again with one thing swapped, to `out`, and diagnose that.
+    """Train again into `out` with one thing swapped, and diagnose that run.
 
-    `diagnosis` is of the run's own figures (`diagnose`), without its rows: those that are wrong
+    `diagnosis` is of the run's own figures (`diagnose`), without its rows: rows that are wrong
     alike leave no trace in any run's figures, so that a new run without such a trace would confirm
     nothing. `rows_at_fault` says that the rows are, for a run whose figures are not.
 

@@ -1,4 +1,4 @@
-"""The rows that a critic is fed, of whatever source: a panel, a store, or fresh from the twin.
+"""Rows that a critic is fed, from a panel, a store or the twin, in one form.
 
 Rows lie in the order in which they were driven, episode by episode, so that a row's predecessors
 are those before it. What is compared later is compared in these terms alone: observations,
@@ -29,7 +29,7 @@ Status = Literal["ok", "off", "undecided", "not run"]
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison: `effect` is a ratio or a difference, as `measure` says.
+    """The result of a check: `effect` is a ratio or a difference, as `measure` says.
 
     `status` is by whether its 95 % interval lies within the allowed range, across its end, or
     beyond it.
@@ -56,7 +56,7 @@ class Comparison:
 
     @property
     def suspicious(self) -> bool:
-        """Undecided, and not for lack of rows: the interval has no effect at all outside of it."""
+        """Return whether it is undecided with an interval that excludes "no effect"."""
         neutral = 1.0 if self.measure == "ratio" else 0.0
         if self.status != "undecided" or self.low is None or self.high is None:
             return False
@@ -68,7 +68,7 @@ def judged(
     logs: float | None, twin: float | None, least: float = -math.inf, most: float = math.inf,
     logs_rows: int, twin_rows: int = 0, note: str = "",
 ) -> Comparison:  # fmt: skip
-    """Return a comparison judged by its interval.
+    """Judge a comparison by its interval.
 
     It is off if all of the interval is beyond the allowed range, undecided if the value alone is.
     """
@@ -86,14 +86,14 @@ def judged(
 
 
 def not_run(check: str, what: str, reason: str) -> Comparison:
-    """Return a check that could not be made, and why."""
+    """Return a check that could not be made, with the reason."""
     return Comparison(check, what, "", "not run", note=reason)
 
 
 def share_judged(
     check: str, what: str, found: int, of: int, most: float, *, least: float = 0.0, note: str = ""
 ) -> Comparison:
-    """Return a share of the logs' rows that is known by definition."""
+    """Judge a share of the logs' rows against a limit known by definition."""
     if not of:
         return not_run(check, what, note or "no such rows")
     interval = ConfidenceInterval(found / of, *wilson(found, of))
@@ -107,7 +107,7 @@ def share_judged(
 def shares_compared(
     check: str, what: str, logs: tuple[int, int], twin: tuple[int, int], least: float, most: float
 ) -> Comparison:
-    """Return the difference of two shares, each (found, of), with Newcombe's interval for it."""
+    """Judge the difference of two shares, each (found, of), by Newcombe's interval."""
     if not logs[1] or not twin[1]:
         return not_run(check, what, "no such rows in the logs" if twin[1] else "nor in the twin")
     (p, q), ((a, b), (c, d)) = (
@@ -174,7 +174,7 @@ class FedRows:
 
     @cached_property
     def cluster(self) -> Ints:
-        """Return codes (N,) of what a bootstrap draws whole: episodes, or stretches if few."""
+        """Return codes (N,) of a bootstrap's units: episodes, or stretches if there are few."""
         if len(np.unique(self.episode)) >= FEW_EPISODES:
             return self.episode
         stretch = self.step // BLOCK_STEPS
@@ -182,7 +182,7 @@ class FedRows:
 
     @cached_property
     def last(self) -> Bools:
-        """The last row of each episode, (N,)."""
+        """Return whether each row is the last of its episode, (N,)."""
         return np.asarray(
             np.append(np.diff(self.episode) != 0, np.ones(min(len(self), 1))), np.bool_
         )
@@ -289,7 +289,7 @@ def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
 
 
 def _check_actions(rows: FedRows, error: type[RestockError], where: str) -> None:
-    """Nothing can be compared of an action that is in no table of actions."""
+    """Raise an error if a row's action is not in the task's table."""
     actions = len(rows.task.actions)
     unknown = np.flatnonzero((rows.action < 0) | (rows.action >= actions))
     if len(unknown):
@@ -304,7 +304,7 @@ def _check_actions(rows: FedRows, error: type[RestockError], where: str) -> None
 
 
 def _some(counts: Ints, most: int) -> Ints:
-    """Which episodes (E,) of so many rows to read: all, or some of about `most` rows."""
+    """Choose which episodes (E,) to read: all, or enough for about `most` rows."""
     shuffled = np.random.default_rng(0).permutation(len(counts))
     return np.sort(shuffled[np.cumsum(counts[shuffled]) <= max(most, counts[shuffled[:1]].sum())])
 
@@ -319,7 +319,7 @@ def _not_looked_at(rows: int) -> dict[str, int]:
 
 
 def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
-    """Return what a store and a panel's `meta` have by the same names, as `FedRows` has it."""
+    """Return the columns that a store and a panel's `meta` share, in the form of `FedRows`."""
     episode = np.unique(_text(table, "episode_id")[order], return_inverse=True)[1].reshape(-1)
     kinds: dict[str, Any] = {"action": np.int64, "reward": np.float64, "transition_id": np.int64}
     kinds |= {"terminated": np.bool_, "truncated": np.bool_, "logged_ns": np.int64}
@@ -336,7 +336,7 @@ def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
 
 
 def _one_step(rows: FedRows, far: Bools) -> FedRows:
-    """Next observations of one step, from the row after, where a panel's are of several."""
+    """Return one-step next observations from the row after, if a panel's span several steps."""
     following, known = rows.before(-1)
     after = rows.next_observation.copy()
     after[far & known] = rows.observation[following[far & known]]

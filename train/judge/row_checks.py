@@ -45,7 +45,7 @@ _MIN_STEPS = 10  # of an episode, for its repetition to be no accident
 
 
 def row_order(rows: FedRows) -> Iterator[Comparison]:
-    """Every check of rows against rows."""
+    """Check rows against the rows before and after them."""
     joined, before = rows.joined, np.maximum(np.arange(len(rows)) - 1, 0)
     count = int(joined.sum())
     apart = _differ(rows.next_observation[before], rows.observation) & joined
@@ -78,7 +78,7 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
 
 
 def _foresight(rows: FedRows, joined: Bools) -> Comparison:
-    """Return an observation that holds the action taken at it, where that is not the one before."""
+    """Count observations that contain the action taken afterwards instead of the one before."""
     before = np.maximum(np.arange(len(rows)) - 1, 0)
     changed = joined & (rows.action != rows.action[before])
     knows = changed & (rows.previous_action() == rows.action)
@@ -100,7 +100,7 @@ def _still(rows: FedRows) -> Comparison:
 
 
 def _repeated(rows: FedRows) -> Comparison:
-    """Rows of episodes that are another's, byte for byte, or steps that are there twice."""
+    """Count rows of episodes that equal another byte for byte, and steps that occur twice."""
     what = "row belongs to an episode that is stored twice"
     if not len(rows):
         return not_run("repeated episodes", what, "no rows")
@@ -131,7 +131,7 @@ _ARRIVED_M = 0.15  # of plan beyond the goal's radius: the plan is never shorter
 
 
 def implied_reward(rows: FedRows) -> F64:
-    """Return the reward (N,) that the observations come to; NaN where they do not say."""
+    """Return the reward (N,) that follows from the observations; NaN if they do not tell."""
     task = rows.task
     clearance = np.full(len(rows), np.nan)
     if task.lidar:
@@ -152,7 +152,7 @@ def implied_reward(rows: FedRows) -> F64:
 
 
 def arrived(rows: FedRows) -> Bools:
-    """Return the rows (N,) after which the robot is at its goal, as far as its plan says."""
+    """Return whether the robot is at its goal after each row (N,), by its plan."""
     if rows.task.goal == "none":
         return np.zeros(len(rows), np.bool_)
     to_go = 10.0 * rows.after("goal_distance")
@@ -169,7 +169,7 @@ def _progress(rows: FedRows) -> F64:
 
 
 def outcomes(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
-    """Rewards, then ends."""
+    """Check rewards, then ends."""
     rng = np.random.default_rng([seed, 2])
     yield from _rewards(logs, twin, rng)
     yield from _ends(logs, twin)
@@ -202,7 +202,7 @@ def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> I
 
 
 def _unlike(rows: FedRows, implied: F64, scale: float) -> tuple[int, int]:
-    """Rows whose reward is not the implied one times `scale`, and of how many that is known."""
+    """Count rows whose reward is not the implied one times `scale`, of rows with an implied one."""
     known = np.isfinite(implied)
     scale = scale if abs(scale) > _TELLING else 1.0
     off = np.abs(rows.reward[known] / scale - implied[known]) > _TELLING
@@ -268,7 +268,7 @@ _FAR = 0.97  # of the lidar's range
 
 
 def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
-    """Ranges and spreads of what is measured, then the lidar's bearing and scale."""
+    """Check ranges and spreads of measured values, then the lidar's bearing and scale."""
     if twin is None:
         yield not_run("range", "values against the twin's", "no twin to compare with")
     else:
@@ -314,9 +314,9 @@ def _entry(
 
 
 def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
-    """Return by how many degrees the logs' sectors are turned against the twin's (or a cosine).
+    """Check by how many degrees the logs' sectors are turned against the twin's (or a cosine).
 
-    With it comes how much nearer things come for each metre driven, compared with the twin.
+    Then check how much nearer things come per metre driven, compared with the twin.
     """
     what = "bearing in which things come nearer when driving on"
     if not logs.task.lidar:
@@ -358,7 +358,7 @@ def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Ite
 
 
 def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
-    """How much nearer each sector comes for each metre driven, (1 + R, sectors), bootstrapped."""
+    """Return how much nearer each sector comes per metre driven, (1 + R, sectors), bootstrapped."""
     task = rows.task
     now, after = rows.sectors() ** 2 * task.range_max_m, rows.sectors(after=True) ** 2
     after = after * task.range_max_m
@@ -391,7 +391,7 @@ _ENDS = "termination of the row does not agree with its signals"
 def stored(
     store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
 ) -> Iterator[Comparison]:
-    """Commands and actions, labels, and terminations; of whole recordings of some 40,000 rows.
+    """Check commands, labels and terminations, in whole recordings of about 40,000 rows.
 
     `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
     """
@@ -408,7 +408,7 @@ def stored(
 
 
 def fed_labels(store: Store, rows: FedRows) -> Iterator[Comparison]:
-    """Of each condition the rows of a panel whose label is not the one in its store."""
+    """Check, per condition, the panel's labels against those of its store."""
     fed = pa.table({"transition_id": rows.transition_id, "fed": rows.condition})
     with passed_in(store.connection, fed=fed):
         found = store.connection.sql(
@@ -435,7 +435,7 @@ def _far_commands(store: Store, task_hash: str) -> Comparison:
 
 
 def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
-    """Return recordings that these rules labelled and nobody corrected, and notes on others."""
+    """Return recordings labelled by these rules and not corrected, and notes on the others."""
     found = store.connection.sql(
         "SELECT recording_id, labels_version, count(*) FROM transitions WHERE task_hash = ?"
         " GROUP BY ALL ORDER BY ALL",
@@ -456,7 +456,7 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
 
 
 def _whole(steps: LoggedSteps) -> Bools:
-    """Return the rows (N,) of episodes that are stored whole, their end too."""
+    """Return whether each row (N,) is of an episode that is stored whole, with its end."""
     ended = np.isin(steps.episode_id, steps.episode_id[steps.ending])
     broken = steps.episode_id[steps.begins & (steps.step_index > 0)]
     return np.asarray(ended & ~np.isin(steps.episode_id, broken), np.bool_)

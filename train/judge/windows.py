@@ -1,4 +1,4 @@
-"""What the evaluations of a run show of its critic, its rows and its target: windows and limits.
+"""Turn a run's evaluations into windows: figures of its critic, rows and target, and their limits.
 
 A window is one evaluation with the batches before it. Its figures, of a condition k or of all:
 
@@ -49,7 +49,7 @@ class ActionSymptom:
 
     @property
     def reason(self) -> str:
-        """Say it for people."""
+        """Describe the symptom in words."""
         supplied = "" if self.fresh_share is None else f", fresh rows in {self.fresh_share:.0%}"
         return (
             f"the policy takes {self.action!r} in {self.wanted_share:.0%} of the rows looked at (at"
@@ -59,7 +59,7 @@ class ActionSymptom:
 
 
 def action_symptoms(run: Run, since: int) -> list[ActionSymptom]:
-    """Every action in every condition of the logs, in batches after gradient step `since`.
+    """Return every action in every condition of the logs, in batches after gradient step `since`.
 
     Empty for a run without logs, of another library, or of a Restock that kept no such table.
     """
@@ -93,7 +93,7 @@ _MIN_LOGGED = 100  # different logged rows of a condition, for an action to be l
 
 @dataclass(frozen=True)
 class DiagnosisLimits:
-    """From where on a figure is a symptom."""
+    """Limits beyond which a figure is a symptom."""
 
     gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
     relative: float = 3.0  # and G_k over the median G
@@ -127,13 +127,13 @@ class Symptom:
 
     @property
     def supply(self) -> float | None:
-        """Its share of replay over its share of what driving meets."""
+        """Return the condition's share of replay divided by its share of driving."""
         return self.replay_share / self.met_share if self.met_share else None
 
 
 @dataclass(frozen=True)
 class Window:
-    """What one evaluation shows, or several."""
+    """The figures of one evaluation, or of several."""
 
     gradient_steps: int
     symptoms: list[Symptom]
@@ -146,11 +146,11 @@ class Window:
     actions: list[ActionSymptom] = field(default_factory=list)  # over several windows only
 
     def relative(self, symptom: Symptom) -> float | None:
-        """G_k over the median G: how much worse held out this condition is than the others."""
+        """Return G_k divided by the median G: how much worse than the others the condition is."""
         return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
 
     def bad(self, limits: DiagnosisLimits) -> dict[str, list[str]]:
-        """Return the conditions whose replay is in doubt, with what is wrong, for people."""
+        """Return the conditions whose replay is in doubt, with reasons in words."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
         least = min(follows, default=0.0)
         doubts = {}
@@ -202,7 +202,7 @@ class Window:
         return reasons
 
     def unlogged(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
-        """Actions that the policy wants in a condition, and whose logged rows hardly have them."""
+        """Return actions that the policy wants in conditions whose logged rows hardly have them."""
         return [
             symptom
             for symptom in self.actions
@@ -212,12 +212,12 @@ class Window:
         ]
 
     def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
-        """Of these, the ones that fresh rows do not supply either."""
+        """Return those of `unlogged` that fresh rows do not supply either."""
         unlogged = self.unlogged(limits)
         return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= limits.fresh]
 
     def target(self, limits: DiagnosisLimits) -> list[str]:
-        """Why the target is in doubt, for people: the figures past their limit; none if it is not.
+        """Return in words which figures put the target in doubt; empty if none does.
 
         A value that is not a number is past every limit.
         """
@@ -239,7 +239,7 @@ class Window:
         return reasons
 
     def diverged(self, limits: DiagnosisLimits) -> bool:
-        """Whether values are beyond what rewards can add up to, or say nothing of their targets."""
+        """Return whether values exceed the sum of rewards, or explain nothing of their targets."""
         if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
             return True
         # A frozen target can be far from what it is learnt from; then the target is at fault.
@@ -248,7 +248,7 @@ class Window:
         return self.explained < limits.explained
 
     def cause(self, limits: DiagnosisLimits) -> Cause:
-        """Return the rule."""
+        """Return the cause by these limits."""
         if self.diverged(limits):
             return "DIVERGENCE"
         bad = self.bad(limits)
@@ -263,7 +263,7 @@ class Window:
 
 
 def median_window(windows: Sequence[Window]) -> Window:
-    """Return the median of each figure over windows; a condition's over windows that have it."""
+    """Return the median of each figure over windows, of a condition over those that have it."""
 
     def middle(name: str, of: Sequence[Any] = windows) -> Any:
         known = [value for item in of if (value := getattr(item, name)) is not None]
@@ -330,8 +330,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
     weight = sum(row["evaluation_rows"] for row in known_well)
-    # Less than nothing counts as nothing: where robots stand, targets hardly vary, and a share of
-    # that is of any size.
+    # Clip at 0: if robots stand, targets hardly vary and the share can be any size.
     reported = [row["explained"] for row in judged or known_well if row["explained"] is not None]
     known = [max(share, 0.0) for share in reported]
 
@@ -351,7 +350,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
 
 
 def _value_bound(run: Run) -> float:
-    """r_max / (1 - gamma), with the largest reward in the audited batches."""
+    """Return r_max / (1 - gamma), with the largest reward in the audited batches."""
     rewards = run.table("audit")["reward"].to_numpy()
     largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
     discount = run.document["config"]["loss"]["discount"]
