@@ -42,11 +42,11 @@ _OFFLINE_BLOCK = 64  # updates between two looks at the clock and at Ctrl-C
 # Of a budget in seconds, what may have passed when the teacher's rows are cloned, and when the
 # updates on the logs end: the other half is for the twin.
 _OF_CLONING, _OF_LOGS = 0.25, 0.5
-Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "evaluation"), values
+Notify = Callable[[str, dict[str, Any]], None]  # name of an event, its values
 
 
 class TrainingInterrupted(RestockError):
-    """A run was interrupted, and has a checkpoint to go on from."""
+    """A run was interrupted; it has a checkpoint to resume from."""
 
     exit_code = ExitCode.INTERRUPTED
 
@@ -70,7 +70,7 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     notify: Notify = lambda event, values: None,
 ) -> TrainResult:
-    """Run a session to the end of its budget; one that is there already is left as it is.
+    """Run a session to the end of its budget; do nothing if it is there already.
 
     Args:
         stop: called between steps and while the policy is evaluated; True ends the run with a
@@ -105,7 +105,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
     schedule, epsilon_at = config.schedule, config.epsilon.at
     offline_updates = schedule.offline_updates if session.logs is not None else 0
 
-    # 1. Offline, the logs alone: what their teacher finds plausible, then values.
+    # 1. Offline, on the logs alone: clone the teacher, then learn values.
     _clone_teacher(session, stop)
     of_logs = _OF_LOGS if config.env.twin else 1.0
     began_s, made = session.wall_s, learner.gradient_steps
@@ -128,7 +128,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
     _evaluate_if_due(session, notify, stop)  # if the run stopped during one
     while progress.env_steps < schedule.env_steps and time_left(session):
         _interrupt(session, stop)
-        # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
+        # 2. Warm-up: the policy from the logs drives; nothing is learnt from its rows yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
         if progress.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
             progress.online_from, progress.online_from_s = progress.env_steps, session.wall_s
@@ -169,7 +169,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         session.practice.note(ended)
         session.run.append("practice", session.practice.advance(session.steps))
 
-        # 6. Every so often: the fixed episodes, greedily; and a checkpoint.
+        # 6. At intervals: evaluate the fixed episodes greedily, and write a checkpoint.
         _evaluate_if_due(session, notify, stop)
         if (
             progress.env_steps - progress.checkpointed_at
@@ -309,7 +309,7 @@ def _follow(session: Session, phase: str, notify: Notify) -> None:
     rule = learner.target.rule
     last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
     if isinstance(rule, Hard) and learner.target.is_due(step) and last_of_interval:
-        # At a hard sync the distance is 0 by definition: what it was just before is what counts.
+        # At a hard sync the distance is 0 by definition, so it is measured just before.
         interval.distance_before_sync = learner.target.distance()
         if session.probe is not None:
             interval.lag_before_sync = session.probe.measure(learner)[1]
@@ -381,7 +381,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
 
 
 def _note_silence(session: Session, notify: Notify) -> None:
-    """Tell whoever watches that the teacher has answered nothing so far."""
+    """Notify that the teacher has answered nothing so far."""
     teacher = session.collector.teacher
     if teacher is None or teacher.answered or teacher.requested == session.silence_noted:
         return
@@ -517,7 +517,7 @@ def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, 
     bad_rows = ~np.isfinite(batch.rows.cpu().numpy()).all(axis=1)
     td = loss.td.cpu().numpy()
     bad = bad_rows | ~np.isfinite(td)
-    if not bad.any():  # finite one by one, and too large together
+    if not bad.any():  # finite one by one, but not their sum
         bad = np.abs(td) == np.abs(td).max()
     what = f"the loss is {value} ({phase})"
     if bad_rows.any():
@@ -544,7 +544,7 @@ def check_parameters(session: Session) -> None:
 def _stop_not_finite(
     session: Session, what: str, bad: Bools, why: str, remedy: str, *, before: bool = False
 ) -> NoReturn:
-    """Leave the run's tables whole, write down the rows, and raise."""
+    """Write the run's tables and the batch's rows, then raise NotFinite."""
     session.write_held()
     rows_before = session.feed.last_batch(before=True) if before else []
     rows, path = session.feed.last_batch(), session.run.path

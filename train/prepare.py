@@ -1,4 +1,4 @@
-"""From flags to a run: config, panel and twin are checked against each other first."""
+"""Prepare a run from its flags: check config, panel and twin against each other first."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ _EVALUATION_ENVS = 16
 
 @dataclass
 class Prepared:
-    """A run that can begin, or go on: everything was checked, nothing was written."""
+    """A checked run that can begin or resume; nothing is written yet."""
 
     path: Path
     config: TrainConfig
@@ -90,7 +90,7 @@ class Prepared:
     requested: AskedTeacher | None = None  # that a new run's config names
 
     def open(self) -> Session:
-        """Make the run directory (or take up the old one), the twin and the learner.
+        """Make or reopen the run directory, and build the twin and the learner.
 
         Raises:
             RunError: another process trains this run; or it cannot go on, and why.
@@ -234,7 +234,7 @@ def prepare_new(
     require_trackers(config.record.trackers)
     driven = {config.env.layouts, _evaluation_layouts(config)} if config.env.twin else ()
     for layouts in driven:
-        # What is wrong with one is reported before anything is written. Evaluation drives all kinds
+        # Report errors before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
     fed = Panel.open(panel_path) if panel_path is not None else None
@@ -357,7 +357,7 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
 
 
 def rows_by_policy(panel: Panel) -> Counter[str]:
-    """Rows by behaviour policy."""
+    """Count rows by behaviour policy."""
     return Counter(name for name in panel.meta_column("behaviour_policy").tolist() if name)
 
 
@@ -385,7 +385,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         controller = controller_for(panel, planned, config.replay.logs_share, fresh)
         fed = {
             **panel_document(panel),
-            # The quotas, and what fills them, as far as this run's own draws say.
+            # The quotas and their fill, judged by this run's own draws.
             "forecast": controller.forecast(),
             "planned_draws": asdict(planned),
         }
@@ -396,7 +396,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "target": describe(config.target),
         "update_path": update_path(config.device, config.threads),
         **profile_document(profile),
-        # Conditions of logs alone, with the signals that the twin does not fill.
+        # Conditions that only logs can have, with the signals that the twin does not fill.
         "not_evaluated": conditions_in_twin(
             profile.conditions, profile.signals, lidar=profile.task.lidar
         )[1],

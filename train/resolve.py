@@ -1,4 +1,4 @@
-"""Settle what a config leaves open, by panel and profile, and refuse what cannot be trained.
+"""Resolve a config's open settings by panel and profile, and refuse what cannot be trained.
 
 Refused before anything is written: settings that name what the panel does not have, settings
 without effect, and a run that the machine's memory cannot hold.
@@ -70,7 +70,7 @@ def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedD
     )
 
 
-_ROWS_OF_UPDATES = 5_000  # as many cloned rows want as many updates as the critic makes
+_ROWS_OF_UPDATES = 5_000  # cloned rows; for more, it makes more updates than the critic
 _MAX_UPDATES = 10.0  # times the critic's
 
 

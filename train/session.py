@@ -1,4 +1,4 @@
-"""All that is alive in a training run: its parts, its clocks, and how they are saved and restored.
+"""The live state of a training run: its parts and clocks, and how to save and restore them.
 
 Every random draw comes from a generator that belongs to one of the parts, and every part is in the
 checkpoint, so a run that is resumed goes on exactly as it would have.
@@ -55,7 +55,7 @@ class Progress:
     evaluated_at: int = -1  # environment steps of the last evaluation
     checkpointed_at: int = 0
     wall_s: float = 0.0  # of training, before this process
-    driving_from_s: float | None = None  # of training, when it began to drive in the twin
+    driving_from_s: float | None = None  # of training, when driving in the twin began
     online_from_s: float | None = None  # of training, when online updates began
     offline_update_s: float = 0.0  # of an update on the logs, on average
     evaluation_s: float = 0.0  # of the last evaluation; before it, an estimate
@@ -133,12 +133,12 @@ class Session(Stateful):
 
     @property
     def wall_s(self) -> float:
-        """Seconds of training, over all processes of the run."""
+        """Return the seconds of training, over all processes of the run."""
         return self.progress.wall_s + time.monotonic() - self._started
 
     @property
     def steps(self) -> dict[str, int]:
-        """The two clocks of a run, with which every row of its tables begins."""
+        """Return the two clocks of a run, with which every row of its tables begins."""
         return {
             "env_steps": self.progress.env_steps,
             "gradient_steps": self.learner.gradient_steps,
@@ -162,7 +162,7 @@ class Session(Stateful):
             self.batches.replan(planned_draws(config, end))
 
     def _steps_per_s(self) -> float:
-        """Environment steps a second: with their updates, and the evaluations so far."""
+        """Return environment steps per second, updates and evaluations included."""
         progress, wall_s = self.progress, self.wall_s
         if progress.online_from_s is None or progress.driving_from_s is None:
             return FIRST_GUESS
@@ -187,7 +187,7 @@ class Session(Stateful):
         checkpoint.save(self.run.latest, {**self.state_dict(), **extra})
 
     def write_held(self) -> None:
-        """Write also what waits for its episodes' end; a run that goes on from here takes it back.
+        """Also write rows that wait for their episodes' end; a resumed run reads them back.
 
         Call after `save`: rows beyond the checkpoint's are removed when the run is resumed.
         """
@@ -195,7 +195,7 @@ class Session(Stateful):
         self.run.flush()
 
     def open_events(self) -> None:
-        """Begin to write curves; in a run that goes on, those after its checkpoint are purged."""
+        """Begin to write curves; a resumed run purges those after its checkpoint."""
         run, record = self.run, self.config.record
         from_step = self.progress.env_steps if run.latest.exists() else None
         sinks = tracker_sinks(run, record.trackers)
@@ -242,7 +242,7 @@ class Session(Stateful):
             ) from error
 
     def save_best(self, results: Score) -> None:
-        """Keep the policy as it is now as the run's best."""
+        """Keep the current policy as the run's best."""
         clocks = {
             "env_steps": self.progress.env_steps,
             "gradient_steps": self.learner.gradient_steps,
@@ -295,7 +295,7 @@ def open_session(
     episodes: Sequence[EpisodeSpec] | None = None,
     exposures: Sequence[Condition] = (),
 ) -> Session:
-    """Put the parts of a run together, new or as its latest checkpoint left them.
+    """Build the parts of a run, new or from its latest checkpoint.
 
     `episodes` are what evaluations drive, None: as drawn by the config's seeds.
     """

@@ -1,1 +1,1 @@
-"""The learner: network, loss, target updates, checkpoints, and the config of a run."""
+"""The learner: network, loss, target updates, and the config of a run."""

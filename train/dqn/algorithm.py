@@ -35,7 +35,7 @@ MARGIN = 0.8  # how much better an expert's action must be (arXiv:1704.03732)
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """What one update learns from. Rows from logs come first."""
+    """The batch of one update. Rows from logs come first."""
 
     observation: Tensor  # (B, D) float32
     next_observation: Tensor  # (B, D) float32
@@ -51,7 +51,7 @@ class TrainingBatch:
 
 @dataclass(frozen=True)
 class Loss:
-    """What one batch cost, and the parts that the record of the run keeps."""
+    """The loss of a batch, and the parts that the run records."""
 
     value: Tensor  # () float32, with gradient
     td: Tensor  # (B,) float32, Q(s, a) - y, without gradient
@@ -195,7 +195,7 @@ def td_target(
     next_online_q: Tensor | None = None,
     plausible: Tensor | None = None,
 ) -> Tensor:
-    """Return what Q(s, a) should be, (B,).
+    """Return the TD target of Q(s, a), (B,).
 
     Args:
         reward: (B,), the sum of the row's n discounted rewards.

@@ -1,6 +1,6 @@
-"""A behaviour network beside Q: what a teacher finds plausible, and Q's choice among that.
+"""A behaviour network beside Q: it says which actions are plausible, and Q chooses among them.
 
-G(a|s) is learnt by cross-entropy from what a teacher would do in the states that are met, and from
+G(a|s) is learnt by cross-entropy from what a teacher would do in the visited states, and from
 what it did in the logs. An action is plausible where G(a|s) is at least `ratio` times the largest;
 Q takes the best of those, and its target may look no further (discrete BCQ, arXiv:1910.01708). The
 teacher is asked where the agent goes, not where it went itself (DAgger, arXiv:1011.0686).
@@ -39,7 +39,7 @@ _SEED = 1 << 32  # apart from that of Q, which may be as large
 
 @dataclass(frozen=True)
 class Labelled:
-    """States, and what the teacher would do in them."""
+    """States, and the teacher's actions in them."""
 
     observation: Tensor  # (M, D) float32
     action: Tensor  # (M,) int64, or UNKNOWN
@@ -63,7 +63,7 @@ def imitation_loss(logits: Tensor, action: Tensor) -> Tensor:
 
 
 class FilteredNetwork(nn.Module):
-    """Q where an action is plausible, -inf elsewhere: whatever takes its maximum is filtered."""
+    """A network that gives Q for plausible actions and -inf for others."""
 
     ratio: Tensor
 
@@ -101,7 +101,7 @@ def make_policy(config: TrainConfig, observation_size: int, actions: int) -> Pol
 
 
 class Behaviour(Stateful):
-    """G, how it learns, and the ratio in force. `average` is the G that is evaluated and kept.
+    """G with its optimizer and the current ratio. `average` is the G that is evaluated and kept.
 
     Args:
         averaging: the rate of the average of weights, as of Q's.
@@ -139,7 +139,7 @@ class Behaviour(Stateful):
 
     @property
     def in_force(self) -> float:
-        """The ratio, as a number."""
+        """Return the current ratio as a number."""
         return float(self.ratio)
 
     @in_force.setter
@@ -154,7 +154,7 @@ class Behaviour(Stateful):
         self.optimizer.step(self._slow, self.averaging_rate(self.updates))
 
     def move(self, labelled: Labelled, rate: Tensor) -> None:
-        """Do the same on the device alone; the caller keeps the counts."""
+        """Make one gradient step on the device alone; the caller keeps the counts."""
         self._fill_gradient(labelled)
         self.optimizer.move(self._slow, rate)
 

@@ -1,6 +1,6 @@
 """The configuration of a training run: one typed struct, read from TOML, unknown keys refused.
 
-A run's directory keeps the resolved one, so that nothing about a run is a default that may change
+A run's directory keeps the resolved config, so that no run depends on a default that may change
 later. Every field has its meaning in a comment; `docs/train.md` explains the choices.
 """
 
@@ -64,7 +64,7 @@ class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
 
     @property
     def effective_lag(self) -> float:
-        """The mean age of the target in updates: C / 2."""
+        """Return the mean age of the target in updates: C / 2."""
         return self.every / 2
 
     def __str__(self) -> str:
@@ -78,7 +78,7 @@ class Polyak(Checked, frozen=True, tag_field="rule", tag="polyak"):
 
     @property
     def effective_lag(self) -> float:
-        """The mean age of what the target holds, in updates: 1 / tau."""
+        """Return the mean age of the target's weights in updates: 1 / tau."""
         return 1 / self.tau
 
     def __str__(self) -> str:
@@ -113,7 +113,7 @@ class ReplayConfig(Checked, frozen=True):
 
     @property
     def ring_rows(self) -> int:
-        """The capacity as a number. Raises ValueError where it is still to be chosen."""
+        """Return the capacity as a number; raise ValueError if it is still to be chosen."""
         if self.ring_capacity == "auto":
             raise ValueError('ring_capacity = "auto" was not resolved')
         return self.ring_capacity
@@ -128,7 +128,7 @@ class ScheduleConfig(Checked, frozen=True):
 
 
 class TeacherConfig(Checked, frozen=True):
-    """The teacher, which says what it would do, and how far the policy may deviate from that."""
+    """The teacher, and how far the policy may deviate from its actions."""
 
     # operator: the twin's; logs: rows of `policies` alone; none; or your own, as module:name.
     # None: the operator where the task has a goal, else none.
@@ -166,7 +166,7 @@ class TeacherConfig(Checked, frozen=True):
 
 
 class EnvConfig(Checked, frozen=True):
-    twin: bool = True  # false: logs alone, no driving; keeps the last policy
+    twin: bool = True  # false: train on logs alone, keep the last policy
     num_envs: Count = 32
     # Shares of true conditions among the episodes of the twin.
     conditions: dict[str, NonNegative] = msgspec.field(
@@ -270,7 +270,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     applied = apply_overrides(document, overrides)
     try:
         return parse_config(applied, where=f"{path} and --set")
-    except ConfigError:  # one of the two alone, or what they say together
+    except ConfigError:  # wrong in one of the two, or in their combination
         parse_config(document, where=str(path))
         parse_config(apply_overrides({}, overrides), where="--set")
         raise
@@ -288,10 +288,10 @@ def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> di
 
 
 def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Nested settings as `key.path=value`, which `apply_overrides` takes."""
+    """Return nested settings as `key.path=value`, which `apply_overrides` takes."""
     overrides = []
     for key, value in document.items():
-        # A target rule is one value, as is a schedule: half of one and half of another is none.
+        # A target rule or a schedule is one value: half of one and half of another is invalid.
         if isinstance(value, Mapping) and prefix + key not in ("target", "teacher.ratio"):
             overrides += as_overrides(value, f"{prefix}{key}.")
         elif value is not None:

@@ -75,10 +75,10 @@ def fitted_q(
     """Fit the values of a policy.
 
     Args:
-        rows: what was seen.
+        rows: the logged transitions.
         next_probability: (N, A) the policy's, of each action in `next_observation`.
         discount: of one step.
-        bounds: between which every value is known to be.
+        bounds: lower and upper bound of every value.
         seed: of the network's beginning and of the batches.
         between: called before every update; what it raises ends the fit.
     """
@@ -110,7 +110,7 @@ def fitted_q(
             if bounds is not None:
                 target = target.clamp(*bounds)
             q = network(observation[some]).gather(1, action[some, None])[:, 0]
-            # Huber's loss would leave out most of what is rare and large: the value is a mean.
+            # Not Huber's loss: the value is a mean, and rare large rewards must count in full.
             _descend(optimizer, nn.functional.mse_loss(q, target))
         decay.step()
         before = clone(network)
@@ -126,7 +126,7 @@ def cloned_behaviour(
     seed: int = 0,
     between: Callable[[], None] = lambda: None,
 ) -> QNetwork:
-    """Behaviour cloning: a network whose softmax is the probability of each action in the logs.
+    """Clone the behaviour: a network whose softmax is the probability of each logged action.
 
     For logs that do not say with which probability they acted. Weights from it are estimates.
     `between` is called before every update; what it raises ends the fit.

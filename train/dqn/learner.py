@@ -1,4 +1,4 @@
-"""One update: a batch of packed rows to a loss, a step of Adam, a tick of the target's clock.
+"""One update: the loss of a batch of packed rows, a step of Adam, a step of the target.
 
 Two clocks run in DQN: the online network moves at every update, the target network by its own
 rule. The rule decides how old the values are that the critic learns from, so it is a typed value
@@ -34,7 +34,7 @@ from restock.train.dqn.network import (
 
 @dataclass(frozen=True)
 class Terms:
-    """What an update is given beside the rows (B, W)."""
+    """Arguments of an update besides the rows (B, W)."""
 
     weight: Tensor | None  # (B,) importance weights; None: ones
     logged: int  # how many of the first rows the terms below apply to
@@ -43,7 +43,7 @@ class Terms:
 
 
 class Learner(Stateful):
-    """The online network, its target, its optimizer and how many updates they have seen.
+    """The online network, its target, its optimizer and the number of updates made.
 
     Batches are packed rows (B, 2D + 3) float32 as `restock.replay.sampling.packed_rows` says:
     `[observation | next_observation | action | reward | discount]`.
@@ -67,7 +67,7 @@ class Learner(Stateful):
         *,
         path: UpdatePath | None = None,
     ) -> None:
-        """`path` None takes the fastest that the config allows; both agree but for rounding."""
+        """Build the networks; `path` None takes the fastest allowed; paths agree up to rounding."""
         self.device = open_device(config.device)
         self.algorithm = make_algorithm(config.loss)
         self.network = self.algorithm.make_network(
@@ -121,7 +121,7 @@ class Learner(Stateful):
         expert: Tensor | None = None,
         labelled: Labelled | None = None,
     ) -> Loss:
-        """Make one gradient step on `rows`; `self.target` ticks the target's clock afterwards.
+        """Make one gradient step on `rows`; the caller advances `self.target` afterwards.
 
         Args:
             rows: (B, 2D + 3) float32, on the learner's device.
@@ -206,7 +206,7 @@ class Learner(Stateful):
 
     @property
     def is_finite(self) -> bool:
-        """Whether every parameter is finite: a gradient that is not leaves its mark on them."""
+        """Return whether every parameter is finite; a gradient that is not makes them so, too."""
         of_values = [self.optimizer.values]
         if self.behaviour is not None:
             of_values.append(self.behaviour.optimizer.values)
@@ -228,7 +228,7 @@ class Learner(Stateful):
         return greedy_actions(self._acting, observation)
 
     def take_over(self, weights: Mapping[str, Tensor]) -> None:
-        """Put a kept policy's weights (of `policy`) into all networks; moments are forgotten."""
+        """Copy a kept policy's weights into all networks, and reset Adam's moments."""
         ratio = None if self.behaviour is None else self.behaviour.in_force
         self.policy.load_state_dict(weights)
         kept = self.policy_network.state_dict()
@@ -242,7 +242,7 @@ class Learner(Stateful):
 
 
 class TargetUpdate(Stateful):
-    """Applies a rule to the parameters of a pair of networks, in the same order."""
+    """A rule applied to the parameters of a pair of networks, in the same order."""
 
     STATE: ClassVar[tuple[str, ...]] = ("last_sync",)
 
@@ -281,7 +281,7 @@ class TargetUpdate(Stateful):
 
     @torch.no_grad()
     def distance(self) -> float:
-        """|online - target| / |online|, over all parameters together (Euclidean)."""
+        """Return |online - target| / |online| over all parameters (Euclidean norm)."""
         apart = torch._foreach_norm(torch._foreach_sub(self._online, self._target))
         size = torch._foreach_norm(self._online)
         total = torch.stack(list(size)).norm()
@@ -290,7 +290,7 @@ class TargetUpdate(Stateful):
 
 @torch.no_grad()
 def value_lag(online_q: torch.Tensor, target_q: torch.Tensor) -> float:
-    """mean |Q - Q_target| / mean |Q| over values (B, A): how far apart the two clocks are."""
+    """Return mean |Q - Q_target| / mean |Q| over values (B, A)."""
     return float((online_q - target_q).abs().mean() / online_q.abs().mean().clamp_min(1e-12))
 
 
@@ -316,7 +316,7 @@ def greedy_actions(network: PolicyNetwork, observation: NDArray[np.float32]) -> 
 
 
 def open_device(name: str) -> torch.device:
-    """Return the device, or refuse it.
+    """Return the device.
 
     Raises:
         ConfigError: `cuda` where this PyTorch sees none.

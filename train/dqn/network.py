@@ -27,7 +27,7 @@ N = TypeVar("N", bound=nn.Module)
 
 
 class QNetwork(nn.Module):
-    """Observations (B, D) float32 to action values (B, A) float32."""
+    """A LayerNorm MLP from observations (B, D) float32 to action values (B, A) float32."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class QNetwork(nn.Module):
         self._initialise(generator)
 
     def _initialise(self, generator: torch.Generator | None) -> None:
-        """PyTorch's initialisation of a Linear layer, but from a generator of ours."""
+        """Initialise a Linear layer as PyTorch does, but from our own generator."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 bound = module.in_features**-0.5
@@ -82,7 +82,7 @@ def clone(network: N) -> N:
 def torch_threads(number: int) -> Iterator[None]:
     """Set the number of torch's CPU threads while the block runs.
 
-    Networks of this size are slower on several, many times so where other processes want the cores.
+    Networks of this size are slower on several, much slower if other processes use the cores.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(number)
@@ -96,14 +96,14 @@ UpdatePath = Literal["native", "autograd"]
 
 
 class Differentiable(Protocol):
-    """A network that learns, or the kernel that computes the same."""
+    """A learning network, or a kernel that computes the same."""
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return action values (B, A) of observations (B, D)."""
         ...
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Forget the gradient; False keeps its memory."""
+        """Reset the gradient; False keeps its memory."""
         ...
 
 
@@ -353,7 +353,7 @@ class FlatAdam(Stateful):
         )
 
     def forget(self) -> None:
-        """Begin again without moments: the parameters were replaced."""
+        """Reset the moments after the parameters were replaced."""
         for tensor in (*self._moments, self._step):
             tensor.zero_()
         self._steps = 0
@@ -365,7 +365,7 @@ class FlatAdam(Stateful):
 
     @property
     def moments(self) -> dict[str, dict[str, Tensor]]:
-        """Adam's moments a parameter, in the network's order, as if each were its own."""
+        """Return Adam's moments per parameter, in the network's order."""
         if not self._steps:
             return {}
         moments = zip(*(self._flat.views(each) for each in self._moments), strict=True)

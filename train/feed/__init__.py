@@ -1,1 +1,1 @@
-"""What a batch is made of, and the record of it."""
+"""Build batches, and record what they contained."""

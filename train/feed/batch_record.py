@@ -1,4 +1,4 @@
-"""What the critic was fed: exact sums over every batch, and every row of a seeded few.
+"""Record what the critic was fed: exact sums over all batches, and all rows of a seeded sample.
 
 A batch's rows, strata, TD errors and values are kept as they are sampled (no statistics inside the
 update loop) and summed once an interval. The sums go to the run's tables `fed`, `strata`,
@@ -62,7 +62,7 @@ _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
 
 class FeedRecord(Stateful):
-    """Records the batches of a run.
+    """The record of a run's batches.
 
     Args:
         audit_share: of all batches, chosen by `seed`.
@@ -217,7 +217,7 @@ class FeedRecord(Stateful):
         self._held = []
 
     def restored(self) -> None:
-        """Intervals that wait, of what a checkpoint says of them."""
+        """Return the waiting intervals from a checkpoint's values."""
         held: Sequence[Any] = self._held
         self._held = [HeldInterval(**interval) for interval in held]
 
@@ -239,7 +239,7 @@ class FeedRecord(Stateful):
         return HeldInterval(clocks, phase, rows, available, open_rows, self._audits, quotas)
 
     def _by_stratum(self, stratum: NDArray[Any]) -> Ints:
-        """Fresh rows (n,) counted by stratum (S + 1,), last those that are in none."""
+        """Count fresh rows (n,) by stratum (S + 1,); the last count is of rows in none."""
         size = len(self.ring.strata)
         return np.bincount(_told(stratum, size), minlength=size + 1)
 
@@ -262,7 +262,7 @@ class FeedRecord(Stateful):
         }
 
     def _release(self) -> None:
-        """Write the intervals whose rows have their conditions by now, in their order."""
+        """Write, in order, the intervals whose rows all have their conditions."""
         if self.labels is None:
             self.write_held()
             return
@@ -377,7 +377,7 @@ class FeedRecord(Stateful):
         )
 
     def _audit(self, step: int, batch: ReplayBatch, last_sync: int | None) -> None:
-        """Every row of the batch last kept: logged ones are written, fresh ones wait."""
+        """Audit every row of the last kept batch: write logged ones, hold fresh ones."""
         packed, logged = batch.rows.cpu().numpy(), batch.logged
         hashes, place = row_hashes(packed), np.arange(len(packed))
         greedy = None
@@ -406,7 +406,7 @@ class FeedRecord(Stateful):
 
 
 def _told(code: NDArray[Any], kinds: int) -> Ints:
-    """Codes (n,) of `kinds` names, with one more for rows that have none."""
+    """Return codes (n,) of `kinds` names, with one more code for rows that have none."""
     return np.where(code < 0, kinds, code).astype(np.int64)
 
 
@@ -473,7 +473,7 @@ def check_fed(
 
 
 def check_kept(parameters: bool, run: Path, steps: Mapping[str, int]) -> None:
-    """Before what another library learnt is evaluated: whether all its parameters are finite.
+    """Check that all parameters of another library's policy are finite before it is evaluated.
 
     Raises:
         NotFinite: one is not.

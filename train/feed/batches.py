@@ -1,4 +1,4 @@
-"""What a batch is made of: rows of logs and fresh rows from the twin, both by quota.
+"""Draw batches: rows of logs and fresh rows from the twin, both by quota.
 
 This module builds the half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948)
 from two sources that share one packed row layout, by one gather each. The share controller
@@ -65,7 +65,7 @@ class ReplayBatch:
 
 
 class Batches(Stateful):
-    """Draws batches: all from logs while offline, `logs_share` of them from logs online.
+    """A source of batches: all rows from logs while offline, `logs_share` of them online.
 
     Without logs every batch is fresh. Each source has its own generator, seeded from `seed`.
 
@@ -97,7 +97,7 @@ class Batches(Stateful):
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._draws: LoggedSampler | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
-        # Logged rows of an online batch, and what rounding them owes; quotas of the fresh ones,
+        # Logged rows of an online batch and the rounding carried over; quotas of the fresh ones,
         # the last for rows of any kind.
         self._logged, self._owed, self._taken_over = 0, 0.0, 0.0
         strata = 0 if fresh is None else len(fresh)
@@ -110,21 +110,21 @@ class Batches(Stateful):
 
     @property
     def controller(self) -> ShareController | None:
-        """The shares in force, and what was drawn; None without logs."""
+        """Return the controller of shares; None without logs."""
         return self._draws.controller if self._draws is not None else None
 
     @property
     def needs_td(self) -> bool:
-        """True if the next batch depends on the TD errors of the last."""
+        """Return whether the next batch depends on the TD errors of the last."""
         return self._draws is not None and self._draws.needs_td
 
     @property
     def reads_chunks(self) -> bool:
-        """True if the logs' rows are not in memory."""
+        """Return whether the logs' rows are read in chunks from disk."""
         return self._draws is not None and self._draws.reads_chunks
 
     def describe(self) -> list[dict[str, Any]]:
-        """Rows for the run's table `shares`; none without logs."""
+        """Return rows for the run's table `shares`; none without logs."""
         return self._draws.describe() if self._draws is not None else []
 
     def draw_offline(self) -> ReplayBatch:
@@ -178,7 +178,7 @@ class Batches(Stateful):
             self._fresh_quotas.set_shares(fresh / fresh.sum())
 
     def _draw_fresh(self, count: int, env_steps: int) -> Ints:
-        """`count` slots: of each stratum what its quota says, and of the whole ring the rest."""
+        """Draw `count` slots: each stratum's quota, and the rest from the whole ring."""
         quotas = self._fresh_quotas
         if quotas.shares[-1] == 1.0:
             return self._sample_fresh(count, env_steps)
@@ -359,5 +359,5 @@ def _prefetching_works() -> bool:
 
 @lru_cache(maxsize=64)
 def _counted(count: int) -> Tensor:
-    """(count,): where each bag begins."""
+    """Return where each bag begins, (count,)."""
     return torch.arange(count)

@@ -1,4 +1,4 @@
-"""Collecting: the twin's steps into the fresh ring, and labels for the episodes that ended.
+"""Collect the twin's steps into the fresh ring, and label the episodes that ended.
 
 Finished episodes are labelled by the very conditions that label logs, over the same signals,
 several episodes per query.
@@ -70,7 +70,7 @@ class EndedEpisode:
 
 
 class Collector(Stateful):
-    """Steps the twin and keeps what the labels need.
+    """A collector that steps the twin and keeps the signals that labels need.
 
     `start` sends the actions off (to a thread, with an executor), `finish` takes the result in;
     between them the learner may learn from what the ring held before.
@@ -129,7 +129,7 @@ class Collector(Stateful):
         self._saved_log: Mapping[str, Any] | None = None
 
     def keep(self, folder: Path) -> FreshLog:
-        """Keep labelled episodes whole in `folder` from here on, or go on as a checkpoint did."""
+        """Keep labelled episodes whole in `folder` from here on, or as in a checkpoint."""
         longest = self.task.time_limit_steps
         self.log = FreshLog(folder, self.ring.observation_size, longest, self._steps)
         if self._saved_log is not None:
@@ -145,12 +145,12 @@ class Collector(Stateful):
         label(pa.table(columns), self.conditions)
 
     def reset(self, seed: int) -> None:
-        """Begin: the first observations (N, D)."""
+        """Reset the twin; return the first observations (N, D)."""
         self.observation, _ = self.env.reset(seed=seed)
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """Steps so far of the episode under way in each environment, (N,)."""
+        """Return the steps so far of each environment's current episode, (N,)."""
         return self._steps
 
     def start(
@@ -282,14 +282,14 @@ class Collector(Stateful):
         return finished
 
     def _zones(self, info: Mapping[str, Any], env: int, count: int) -> list[str] | None:
-        """`LAYOUT/zone` of an ended episode's steps: the profile's are of the default floor."""
+        """Return `LAYOUT/zone` of an episode's steps; None on the floor of the profile's zones."""
         if "floor" not in info or (floor := info["floor"][env]).name == DEFAULT:
             return None
         x, y = (self._history[f"pose_{axis}_m"][env, : count + 1] for axis in "xy")
         return [f"{floor.name}/{zone}" for zone in floor.zone_of(x, y)]
 
     def _drop(self, keys: NDArray[np.int64], invalid: NDArray[np.bool_]) -> None:
-        """Drop a step whose physics blew up: its row repeats the one before."""
+        """Replace the row of a step whose physics diverged by the row before it."""
         ring = self.ring
         for key in keys[invalid]:
             slots = np.flatnonzero(ring.meta["episode"][: len(ring)] == key)
@@ -301,14 +301,14 @@ class Collector(Stateful):
             self.invalid_steps += 1
 
     def forget(self, episodes: Sequence[EndedEpisode]) -> None:
-        """Never label these ended episodes: their rows belong to no condition."""
+        """Mark ended episodes as never labelled: their rows belong to no condition."""
         keys = {episode.key for episode in episodes}
         for key in sorted(keys):
             self.labels.give_up(key)
         self._unlabelled = [episode for episode in self._unlabelled if episode.key not in keys]
 
     def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
-        """Label the ended episodes once enough are waiting; rows for the run's `episodes`."""
+        """Label the ended episodes once enough wait; return rows for the run's `episodes`."""
         waiting = self._unlabelled
         if not waiting or (len(waiting) < _EPISODES_PER_QUERY and not all_of_them):
             return []
@@ -355,13 +355,13 @@ class Collector(Stateful):
         return rows
 
     def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values. Call between `finish` and `start`, never while a step is out."""
+        """Return arrays and JSON values. Call between `finish` and `start`, never during a step."""
         if self._sent is not None:
             raise RuntimeError("a step is under way")
         return {**super().state_dict(), "log": saved(self.log)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the collector where `state_dict` found it; the twin has its own state."""
+        """Restore the collector; the twin has its own state."""
         super().load_state_dict(state)
         self._unlabelled = [EndedEpisode(**episode) for episode in state["unlabelled"]]
         self._saved_log = state["log"]
@@ -414,7 +414,7 @@ def steps_table(episodes: Sequence[EndedEpisode]) -> pa.Table:
 
 
 class FreshStrata:
-    """Puts episodes into the strata of a mixture.
+    """The strata of a mixture, for episodes of the twin.
 
     Args:
         names: of the strata (S,), without a store's name.
@@ -446,7 +446,7 @@ class FreshStrata:
 
     @classmethod
     def of(cls, panel: Panel, conditions: Sequence[Condition]) -> FreshStrata:
-        """Make one for the mixture that a panel was made by."""
+        """Build it for the mixture that a panel was made by."""
         header = panel.header
         first = header.strata[: len(header.strata) // (1 + len(header.others))]
         return cls(header.mixture, [stratum.name for stratum in first], conditions)

@@ -1,4 +1,4 @@
-"""Labelled episodes of the twin: labels that sampled rows wait for, and steps for a store.
+"""Keep labelled episodes of the twin: labels for sampled rows, and steps for a store.
 
 The ring keeps packed n-step rows and forgets the oldest. Here every labelled episode is kept in the
 run's directory, steps and signals, until `restock train --flush-fresh STORE` writes them as one
@@ -72,7 +72,7 @@ class FreshEpisode:
 
 
 class FreshLog(Stateful):
-    """Keeps episodes of N environments: writes one file to `folder` per batch of labelled episodes.
+    """A log of N environments' episodes: one file in `folder` per batch of labelled episodes.
 
     Args:
         longest: steps of an episode at most.
@@ -152,7 +152,7 @@ class FreshLog(Stateful):
         )
 
     def keep_labelled(self, episodes: Sequence[EndedEpisode], labels: Mapping[str, Bools]) -> None:
-        """Keep ended episodes; `labels` are over their steps, (steps + 1) each, end to end."""
+        """Keep ended episodes; `labels` are of their steps, (steps + 1) each, concatenated."""
         kept: list[FreshEpisode] = []
         begin = 0
         for episode in episodes:
@@ -167,7 +167,7 @@ class FreshLog(Stateful):
             self.parts += 1
 
     def restored(self) -> None:
-        """Files written since the checkpoint go: their steps come again."""
+        """Remove files written since the checkpoint: their steps will be made again."""
         waiting: Mapping[Any, Any] = self._waiting  # as JSON has it
         self._waiting = {int(key): FreshEpisode(**entry) for key, entry in waiting.items()}
         for path in episode_files(self.folder)[self.parts :]:
@@ -185,7 +185,7 @@ def write_episodes(path: Path, episodes: Sequence[FreshEpisode]) -> None:
 
 
 def read_episodes(folder: Path) -> list[FreshEpisode]:
-    """Every episode kept, in order.
+    """Yield every kept episode, in order.
 
     Raises:
         RunError: a file is damaged, or of an earlier Restock.
@@ -197,7 +197,7 @@ def read_episodes(folder: Path) -> list[FreshEpisode]:
 Entries = list[tuple[str, float]]
 
 
-WAITING, NEVER = -1, -2  # codes of a row without a condition: its episode goes on; it is not known
+WAITING, NEVER = -1, -2  # codes of a row without a condition: its episode has not ended; unknown
 
 
 class EpisodeLabels(Stateful):
@@ -255,7 +255,7 @@ class EpisodeLabels(Stateful):
 
 
 class FreshPerturbations(Stateful):
-    """Names and values by the ring's key of an episode, for the audit of sampled rows."""
+    """Perturbation names and values by the ring's episode key, for the audit of sampled rows."""
 
     STATE: ClassVar[tuple[str, ...]] = ("_of",)
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"_of": dict[int, tuple[str, str]]}
@@ -299,7 +299,7 @@ _MOVED = ("stamp_ns", "pose_stamp_ns")  # episodes begin at 0: laid out one afte
 
 @dataclass(frozen=True)
 class Flushed:
-    """What a flush put in a store."""
+    """The result of a flush into a store."""
 
     recording_id: str
     status: str  # written | unchanged
@@ -350,7 +350,7 @@ def _content_id(episodes: Sequence[FreshEpisode]) -> str:
 
 
 def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
-    """Lay all steps one after the other, as if one robot had driven the episodes in turn."""
+    """Concatenate all steps, as if one robot had driven the episodes in turn."""
     lengths = np.array([episode.count + 1 for episode in episodes], np.int64)
     first = np.concatenate([[0], np.cumsum(lengths)])[:-1].astype(np.int64)
     tick = np.arange(lengths.sum(), dtype=np.int64)
@@ -381,7 +381,7 @@ def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
 def _values(
     rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile, run: str
 ) -> TransitionValues:
-    """Collect the values that were kept of each step, end to end."""
+    """Concatenate the values that were kept of each step."""
     begin = rows.starts
     number = rows.episode[begin]
     version = [f"{run}@{episode.version}" for episode in episodes]
@@ -430,7 +430,7 @@ def _perturbed(episodes: Sequence[FreshEpisode]) -> Perturbed:
 def _manifest(
     rows: EpisodeRows, table: pa.Table, profile: Profile, provenance: Provenance, dropped_steps: int
 ) -> dict[str, Any]:
-    """Make the row of `recordings`, with log times such that the last step was just now."""
+    """Make the row of `recordings`; its log times end now."""
     stamps = rows.signals["stamp_ns"]
     return manifest_row(
         profile,

@@ -1,4 +1,4 @@
-"""The logged rows of a run, and fixed rows of each condition to measure critic and labels on.
+"""The logged rows of a run, and fixed rows per condition that critic and labels are measured on.
 
 `Probe` holds a few rows per condition, fixed for the whole run. Batches change with the policy and
 the mixture; the probe does not. So TD error by condition and the distance between the two networks'
@@ -52,7 +52,7 @@ _IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped
 
 @dataclass(frozen=True)
 class Coded:
-    """A column of few distinct values: a code per row into `names`."""
+    """A column with few distinct values, as a code per row into `names`."""
 
     codes: NDArray[np.int32]  # (n,)
     names: list[str]
@@ -230,7 +230,7 @@ class Probe:
         return cls(picked, kept, bounds, source, digest)
 
     def measure(self, learner: Learner) -> tuple[list[dict[str, Any]], float]:
-        """Rows for the run's `probe`, per condition, and the lag over all of it."""
+        """Return rows for the run's `probe`, per condition, and the lag over all of it."""
         td, q, slow = learner.td_error(self.rows.to(learner.device))
         action = self.rows[:, -3].long().to(learner.device)
         chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
@@ -279,7 +279,7 @@ class LogFidelity:
 
     @classmethod
     def of(cls, logs: Logs, observation_size: int) -> LogFidelity | None:
-        """Make it from a run's logs; None if they have no row."""
+        """Build it from a run's logs; None if they have no row."""
         rows = Probe.of_logs(logs, ROWS)
         return cls(rows, observation_size) if rows is not None else None
 
@@ -304,7 +304,7 @@ class LogFidelity:
         }
 
     def _unexplained(self, next_observation: F64, action: F64) -> dict[str, float]:
-        """`next_observation` (n, D) are next observations, `action` (n,) indices."""
+        """Return the unexplained share of variance of `next_observation` (n, D)."""
         taken = np.eye(int(action.max()) + 1)[action.astype(np.int64)]
         features = _standard(np.concatenate([self._observation, taken], axis=1))
         features = np.concatenate([features, np.ones((len(features), 1))], axis=1)

@@ -1,8 +1,8 @@
-"""The twin of a run and its practice: which missions it gives next, by arm, and a record of them.
+"""Make a run's twin, and choose which missions it practises next, by arm.
 
 An arm is a kind of missions (`restock.train.twin.env.episode_queue`). The rules:
 
-- natural: as `env.conditions`, `env.missions` and the floors say; the twin is left as it is;
+- natural: as `env.conditions`, `env.missions` and the floors say;
 - even: every arm alike;
 - missions: the ordered missions alone, each at its part;
 - success: an arm's weight is its rate of failures, while the agent explores. The failures and
@@ -46,7 +46,7 @@ MAX_CHANGE = 0.1  # of a share per interval
 
 
 class Practice(Stateful):
-    """Counts ended missions by arm, and sets the twin's shares at the end of an interval.
+    """A counter of ended missions by arm, which sets the twin's shares at each interval's end.
 
     Raises:
         ConfigError: the rule's floors do not fit the arms, or it lacks what it needs.
@@ -154,19 +154,19 @@ class Practice(Stateful):
 
     @property
     def weights(self) -> F64:
-        """Weights of the arms by the rule, before the floor, (K,): above 0 somewhere."""
+        """Return the arms' weights by the rule, before the floor, (K,); not all 0."""
         return self.failure_rate if self._fixed is None else self._fixed
 
     @property
     def believed(self) -> Bools:
-        """True for each arm that has ended often enough, (K,)."""
+        """Return whether each arm has ended often enough, (K,)."""
         return self._seen >= self.config.warmup_episodes
 
     @property
     def failure_rate(self) -> F64:
-        """Failure rate of each arm's fading episodes, with Jeffreys' prior, (K,).
+        """Return each arm's failure rate over fading episodes, with Jeffreys' prior, (K,).
 
-        That of its kind if it has too few episodes; 1 if the kind has too few.
+        It is the kind's rate if the arm has too few episodes, and 1 if the kind has too few.
         """
         kinds = np.unique([arm.kind for arm in self.arms], return_inverse=True)[1]
 

@@ -1,4 +1,4 @@
-"""Rows as they were sampled, and the columns of the run's tables that are made of them.
+"""Keep rows as they were sampled, and compute the run's tables from them.
 
 The update loop only appends, in one pass of compiled code if it is built. Statistics are computed
 once an interval, one function a table, and the rows of a few audited batches are written down.
@@ -67,7 +67,7 @@ class SampledRows(Stateful):
         return self._count
 
     def grow(self, rows: int) -> tuple[tuple[NDArray[Any], ...], int]:
-        """Room for more rows: the columns, and where in them these begin."""
+        """Make room for more rows; return the columns and where the new rows begin."""
         begin, self._last = self._count, self._count
         self._count += rows
         if self._count > len(self._held[0]):
@@ -78,20 +78,20 @@ class SampledRows(Stateful):
         return self._held, begin
 
     def append(self, *part: NDArray[Any]) -> None:
-        """Rows (n,), columns in their order."""
+        """Append rows (n,), given as columns in their order."""
         columns, begin = self.grow(len(part[0]))
         for column, values in zip(columns, part, strict=True):
             column[begin : self._count] = values
 
     def clear(self) -> None:
-        """Begin again; `columns` that were taken stay as they are."""
+        """Remove all rows; columns returned earlier stay valid."""
         if self._count:
             self._held = self._made(self._count)  # as many as the interval before
         self._count = self._last = 0
 
     @property
     def last(self) -> dict[str, NDArray[Any]]:
-        """The rows last appended."""
+        """Return the rows last appended."""
         return self._since(self._last)
 
     def last_of(self, *names: str) -> tuple[NDArray[Any], ...]:
@@ -119,7 +119,7 @@ class SampledRows(Stateful):
 
 @dataclass(frozen=True)
 class BatchValues:
-    """Values computed for each row of a batch (B,), its logged rows first."""
+    """Values per row of a batch (B,), its logged rows first."""
 
     td: F32
     q: F32
@@ -174,7 +174,7 @@ def episode_sums(
     weight: NDArray[np.float32],  # (n,)
     pairs: int,
 ) -> dict[str, NDArray[Any]]:
-    """Rows summed by episode and pair: columns episode, pair, drawn_rows, weight.
+    """Sum rows by episode and pair, into columns episode, pair, drawn_rows, weight.
 
     Rows of one episode are drawn together and are alike, so what a critic learnt from is only as
     certain as its episodes are many. `restock compare` resamples these.
@@ -197,7 +197,7 @@ def episode_sums(
 
 
 def row_hashes(packed: NDArray[np.float32]) -> list[str]:
-    """blake2b of each packed row (B, W), 16 hex digits: `restock trace` compares rows with it."""
+    """Return blake2b of each packed row (B, W), 16 hex digits, which `restock trace` checks."""
     return [hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest() for row in packed]
 
 
@@ -300,7 +300,7 @@ class HeldInterval:
     quotas: Mapping[str, NDArray[Any]] | None = None  # of the batch, as `fed` takes
 
     def fill(self, labels: EpisodeLabels) -> None:
-        """Conditions that are known by now."""
+        """Fill in the conditions that are known by now."""
         for part in (self.rows, self.open_rows):
             labels.fill(part["condition"], part["stratum"], part["episode"], part["episode_step"])
         for audit in self.audits:
@@ -310,7 +310,7 @@ class HeldInterval:
 
     @property
     def waits(self) -> bool:
-        """True if a row has no condition yet, and may get one."""
+        """Return whether a row has no condition yet and may get one."""
         parts = (self.rows, self.open_rows)
         return any((part["condition"] == WAITING).any() for part in parts)
 
@@ -321,7 +321,7 @@ _MAX_MARKS = 1 << 25  # keys that are marked in place; those of a wider range ar
 
 @dataclass(frozen=True)
 class SourceRows:
-    """The rows (n,) of an interval that came from one source, and what their codes name.
+    """The rows (n,) of an interval from one source, with the names of their codes.
 
     A row has one action and one condition. *Cells* are combinations of stratum, condition and
     action, numbered in that order (the action's number changes fastest).
@@ -346,27 +346,27 @@ class SourceRows:
 
     @cached_property
     def pair(self) -> Ints:
-        """Stratum and condition of each row (n,)."""
+        """Return the code of stratum and condition of each row (n,)."""
         return self.stratum * len(self.conditions) + self.condition
 
     @property
     def pairs(self) -> int:
-        """Number of combinations of stratum and condition."""
+        """Return the number of combinations of stratum and condition."""
         return len(self.strata) * len(self.conditions)
 
     @cached_property
     def action_count(self) -> int:
-        """Number of actions that cells distinguish."""
+        """Return the number of actions that cells distinguish."""
         return int(self.rows["action"].max(initial=0)) + 1
 
     @cached_property
     def drawn(self) -> Ints:
-        """Rows by cell (S, C, A)."""
+        """Return the rows by cell (S, C, A)."""
         return self._by_cell(slice(None))
 
     @cached_property
     def unique(self) -> Ints:
-        """Different rows by cell (S, C, A)."""
+        """Return the distinct rows by cell (S, C, A)."""
         return self._by_cell(first_places(self.row * len(self.strata) + self.stratum))
 
     def summed(self, values: NDArray[Any]) -> F64:
@@ -376,7 +376,7 @@ class SourceRows:
 
     @cached_property
     def sums(self) -> dict[str, F64]:
-        """Sums of the averaged columns by stratum and condition, (S, C)."""
+        """Return sums of the averaged columns by stratum and condition, (S, C)."""
         rows = self.rows
         return {
             "weight": self.summed(rows["weight"]),

@@ -1,10 +1,10 @@
-"""A teacher that is queried in the agent's states, and what the behaviour network learns from.
+"""The teacher that is queried in the agent's states, and the behaviour network's batches.
 
 The teacher is the twin's operator, or one of yours. Besides its answers, logged rows are cloned.
 
 Logged rows are drawn by the shares of their strata, as the critic's are: a network that clones the
 majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh rows are drawn alike.
-If a teacher keeps to no side, a row's mirror image is as valid as the row: half of the rows are
+If a teacher prefers no side, a row's mirror image is as valid as the row: half of the rows are
 drawn mirrored.
 
 The rows of named drivers are cloned, and other drivers' successes. An operator is called when the
@@ -50,7 +50,7 @@ Label = NDArray[np.int16]
 
 @runtime_checkable
 class Teacher(Protocol):
-    """A driver that says what it would do in each of N environments, without driving them.
+    """A driver that returns its actions for N environments without driving them.
 
     It may look at the environment itself, beyond what the observation says. It is queried once a
     step, in order, and once before training begins. If it has `state_dict` and
@@ -63,7 +63,7 @@ class Teacher(Protocol):
 
 
 class OperatorTeacher(Stateful):
-    """The operator of the warehouse twin, without its slips of the hand."""
+    """The operator of the warehouse twin, without its random errors."""
 
     STATE: ClassVar[tuple[str, ...]] = ("_operator",)
 
@@ -89,7 +89,7 @@ class OperatorTeacher(Stateful):
 
 
 class _Called:
-    """A function that is a teacher."""
+    """A function wrapped as a teacher."""
 
     def __init__(self, function: Any) -> None:
         self.act = function
@@ -122,7 +122,7 @@ class AskedTeacher(Stateful):
                 the task has not.
         """
         with _of_the_user(f"the teacher {self._name}", self._teacher.act):
-            # A copy: what it does to it does not reach what the agent sees and the run keeps.
+            # A copy, so that the teacher cannot change what the agent sees and the run keeps.
             given = self._teacher.act(env, observation.copy())
         count = len(observation)
         try:
@@ -219,9 +219,9 @@ def _raised(what: str, called: Any, error: BaseException) -> TeacherFailed:
 
 
 def _place(called: Any, error: BaseException) -> str:
-    """FILE:LINE of the user's innermost line that the error came through, else of what was called.
+    """Return FILE:LINE of the user's innermost line in the traceback, else of the called object.
 
-    Without frames of libraries and of Restock, which the user's code may call.
+    Frames of libraries and of Restock, which the user's code may call, do not count.
     """
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}:{error.lineno}"
@@ -292,7 +292,7 @@ def rows_of_successes(
 
 
 def packed_successes(policy: Coded, episode: Coded, packed: F32, policies: Sequence[str]) -> Bools:
-    """`of_successes` of packed rows (n, W)."""
+    """Apply `rows_of_successes` to packed rows (n, W)."""
     columns = row_columns((packed.shape[1] - len(SCALARS)) // 2)
     reward, discount = (
         np.asarray(packed[:, columns[name]]).ravel() for name in ("reward", "discount")
@@ -311,7 +311,7 @@ def cloned(panel: Panel, teacher: TeacherConfig) -> Bools:
 
 
 class Imitation(Stateful):
-    """Draws batches of states with the action that a teacher took, or would have taken.
+    """A source of batches of states with the action that a teacher took or would have taken.
 
     Args:
         batch_size: M.
@@ -381,21 +381,21 @@ class Imitation(Stateful):
         return Labelled(torch.from_numpy(observation), torch.from_numpy(action))
 
     def _logged_states(self, rows: Ints) -> tuple[F32, Ints]:
-        """Observations (n, D) of rows of the logs, and the actions (n,) that were taken."""
+        """Return observations (n, D) of logged rows and the actions (n,) that were taken."""
         if self.logs is None or not len(rows):
             return self._fresh_states(np.empty(0, np.int64))
         packed = self.logs.rows[torch.from_numpy(rows)].numpy()
         return packed[:, self.ring.columns["observation"]], packed[:, -3].astype(np.int64)
 
     def _fresh_states(self, slots: Ints) -> tuple[F32, Ints]:
-        """Observations (n, D) of slots of the ring, and the teacher's answers (n,)."""
+        """Return observations (n, D) of slots of the ring and the teacher's answers (n,)."""
         observation = self.ring.rows[slots, self.ring.columns["observation"]]
         return observation, self.ring.meta["teacher_action"][slots].astype(np.int64)
 
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
-        """Rows of the run's `teacher`: what the filter does now, by source and condition.
+        """Return rows of the run's table `teacher`: the filter's effect by source and condition.
 
-        Of up to 128 rows a condition that learning draws from, chosen at random.
+        It uses up to 128 random rows per condition, of those that learning draws from.
         """
         rng = np.random.default_rng([self._seed, 8, learner.gradient_steps])
         groups: dict[tuple[str, str], tuple[F32, Ints]] = {}
@@ -420,7 +420,7 @@ def _some(rows: Ints, rng: np.random.Generator) -> Ints:
 
 @torch.no_grad()
 def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, Any]:
-    """Measure what the filter does in states (n, D) with the teacher's actions (n,)."""
+    """Measure the filter in states (n, D) with the teacher's actions (n,)."""
     if learner.behaviour is None:
         raise RuntimeError("there is no behaviour network to measure")
     states = torch.from_numpy(observation).to(learner.device)
@@ -473,7 +473,7 @@ def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None)
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Logged rows (n,), and where the probability of each ends: by the shares of their strata."""
+    """Logged rows (n,) with their cumulative probabilities, by the shares of their strata."""
 
     rows: Ints
     cumulative: F64

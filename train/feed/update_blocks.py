@@ -1,4 +1,4 @@
-"""A run's updates with its learner on a GPU: drawn and recorded on the host, made on the device.
+"""Updates with the learner on a GPU: batches are drawn and recorded on the host.
 
 The samplers that a run on the CPU has draw the batches, so that a seed feeds the same rows to both;
 row numbers, a few kilobytes, go to the device, which holds the logs' rows and a mirror of the ring.
@@ -67,7 +67,7 @@ class DeviceTable:
 
 
 class UpdateBlocks:
-    """Makes a learner's updates in blocks; create it after the session is restored."""
+    """A learner's updates in blocks; create it after the session is restored."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class UpdateBlocks:
     def make(
         self, count: int, draw: Callable[[], ReplayBatch], *, conservative: float, labelled: bool
     ) -> Iterator[Made]:
-        """`count` updates, each counted by the learner when it is given out.
+        """Make `count` updates, and yield each once the learner has counted it.
 
         Args:
             draw: the next batch.
@@ -169,7 +169,7 @@ class UpdateBlocks:
 def _drawn(
     draw: Callable[[], ReplayBatch], count: int
 ) -> tuple[list[ReplayBatch], MixtureError | None]:
-    """Batches, and what ended them early."""
+    """Draw batches; return them, and the error that ended them early, if any."""
     batches: list[ReplayBatch] = []
     for _ in range(count):
         try:
@@ -184,7 +184,7 @@ _WARM_UP = 3  # updates before the capture: libraries take their memory at the f
 
 @dataclass(frozen=True)
 class UpdateBlock:
-    """What K updates in a row are made of, on the host."""
+    """The inputs of K consecutive updates, on the host."""
 
     rows: Tensor  # (K, B) int64, of the table
     packed: Tensor | None  # (K, B, W) float32 those rows, where the table is not on the device
@@ -199,7 +199,7 @@ class UpdateBlock:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What K updates came to, on the host."""
+    """The results of K updates, on the host."""
 
     td: Tensor  # (K, B) float32
     q: Tensor  # (K, B) float32
@@ -208,7 +208,7 @@ class Outcome:
 
 
 class Launched:
-    """Updates that the device may still be at."""
+    """Updates that the device may still be computing."""
 
     def __init__(self, per_row: Tensor, loss: Tensor) -> None:
         pinned = per_row.is_cuda
@@ -224,7 +224,7 @@ class Launched:
             self._event.record()
 
     def outcome(self) -> Outcome:
-        """Wait for them."""
+        """Wait for the updates, and return their results."""
         if self._event is not None:
             self._event.synchronize()
         td, q, *tail = self._per_row.unbind(dim=1)
@@ -232,7 +232,7 @@ class Launched:
 
 
 class CapturedUpdates:
-    """A learner's updates, up to `longest` in a row.
+    """A learner's updates as a captured graph, up to `longest` consecutive ones.
 
     `Learner.count` is to be called for each update whose outcome was taken note of.
 
@@ -325,11 +325,11 @@ class CapturedUpdates:
         place[: len(values)].copy_(values, non_blocking=True)
 
     def _now(self, of_block: Tensor) -> Tensor:
-        """Return what the update under way has of (K, ...)."""
+        """Return the current update's slice of (K, ...)."""
         return of_block.index_select(0, self._cursor).squeeze(0)
 
     def _one(self, labels: bool) -> None:
-        """Make the update that the cursor is at."""
+        """Make the update at the cursor."""
         row = self._now(self._rows)
         rows = self._now(self._packed) if self.table is None else self.table.index_select(0, row)
         logged, conservative, rate, behaviour_rate = self._now(self._scalars).unbind()

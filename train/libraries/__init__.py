@@ -1,1 +1,1 @@
-"""Other libraries in the twin and on the mixtures."""
+"""Other libraries trained in the twin and on the mixtures."""

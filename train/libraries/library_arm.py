@@ -1,4 +1,4 @@
-"""Another library's algorithm as an arm of a study: trained in the same twin, kept as a run.
+"""Train another library's algorithm as an arm of a study, in the same twin, kept as a run.
 
 Stable-Baselines3's DQN and PPO learn with their own code. The environment, its conditions, the
 number of environment steps, the fixed episodes that choose the policy to keep, the discount and the
@@ -48,7 +48,7 @@ _EVALUATION_ENVS = 32
 
 
 class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run that is to be made."""
+    """A run to make."""
 
     out: str
     library: Library
@@ -57,7 +57,7 @@ class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check_installed() -> None:
-    """Raise ConfigError where Stable-Baselines3 is not installed."""
+    """Raise ConfigError if Stable-Baselines3 is not installed."""
     if not installed("stable_baselines3"):
         raise ConfigError(
             "an arm trains with Stable-Baselines3, which is not installed",
@@ -66,7 +66,7 @@ def check_installed() -> None:
 
 
 def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
-    """Return the study's settings as the library can follow them.
+    """Return the study's settings in a form that the library can follow.
 
     Raises:
         ConfigError: settings that it has no counterpart of.
@@ -125,7 +125,7 @@ def dqn_arguments(config: TrainConfig) -> dict[str, Any]:
 
 
 def ppo_arguments(config: TrainConfig) -> dict[str, Any]:
-    """`stable_baselines3.PPO`'s own defaults, but for the rollout: 2,048 steps of all together."""
+    """Return the arguments of `stable_baselines3.PPO`: its defaults, with 2,048 steps a rollout."""
     steps = min(2048, config.schedule.env_steps) // config.env.num_envs
     return {"gamma": config.loss.discount, "n_steps": max(steps, 2)}
 
@@ -182,9 +182,9 @@ def train_library(arm: LibraryArm) -> None:
     on_policy = arm.library == "sb3-ppo"
     arguments = (ppo_arguments if on_policy else dqn_arguments)(config) | arm.arguments
     known = {"name": DISTRIBUTION, "algorithm": arm.library}
-    if on_policy:  # what its settings say of these is not in force
+    if on_policy:  # these settings do not apply to the library
         known |= {"replay": "none: each rollout is used once, then discarded", "target": "none"}
-    elif arm.arguments:  # its own words may have changed replay, exploration or target
+    elif arm.arguments:  # its own arguments may have changed replay, exploration or target
         known |= {"replay": f"changed by {arm.arguments}", "target": f"changed by {arm.arguments}"}
     run = create_run(
         Path(arm.out),
@@ -217,7 +217,7 @@ def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
 
 
 def main(words: list[str]) -> int:
-    """`python -m restock.train.libraries.library_arm JSON`: one run, in a process of its own."""
+    """Run `python -m restock.train.libraries.library_arm JSON`: one run in its own process."""
     try:
         with kill_as_interrupt():
             train_library(msgspec.json.decode(words[0], type=LibraryArm))

@@ -1,4 +1,4 @@
-"""What another library's replay buffer draws, labels and writes down: logs by quota, and fresh.
+"""Draw, label and record the rows of another library's replay buffer: logs by quota, and fresh.
 
 The library owns the training loop. Its buffer is a subclass (`restock.train.libraries.sb3_buffer`,
 `restock.train.libraries.tianshou_buffer`) that asks this class for rows of the panel, tells it
@@ -69,7 +69,7 @@ class FeedOptions(TypedDict, total=False):
 
 
 class MixedFeed:
-    """The part that does not depend on the library.
+    """The part of the buffers that does not depend on the library.
 
     Args:
         library: the distribution whose loop this is, e.g. "stable-baselines3".
@@ -140,7 +140,7 @@ class MixedFeed:
         self.fresh: Any = None
 
     def keep_record(self, fresh: Any) -> None:
-        """Say what the fresh rows are: a `FreshRing`, or a `FreshMeta`."""
+        """Set the fresh rows to record: a `FreshRing` or a `FreshMeta`."""
         self.fresh = fresh
         if self.run is not None:
             tables: Any = PartialTables(self.run)
@@ -170,7 +170,7 @@ class MixedFeed:
         self.label()
 
     def label(self, *, all_of_them: bool = False) -> None:
-        """Label what ended."""
+        """Label the episodes that ended."""
         for labelled in self.labels.label(all_of_them=all_of_them):
             self.fresh.set_labels(labelled.key, labelled.codes)
             self.episode_labels.note(labelled.key, labelled.codes)
@@ -208,7 +208,7 @@ class MixedFeed:
         return drawing
 
     def sample_fresh(self, slots: Ints, count: int) -> Ints:
-        """`count` of the filled `slots` (n,), alike; only those that the mixture deems young.
+        """Draw `count` of the filled `slots` (n,) uniformly, of those young enough for the mixture.
 
         Raises:
             MixtureError: there is none.
@@ -323,7 +323,7 @@ class MixedFeed:
             self.episode_labels.give_up(key)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Save how long it ran: a clock of this process means nothing in another."""
+        """Save how long it ran, since this process's clock means nothing in another."""
         return vars(self) | {"_begun": time.monotonic() - self._begun}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -371,7 +371,7 @@ def create_run(
     seeds: Mapping[str, int],
     **more: Any,
 ) -> Run:
-    """Make the run of a library by its distribution's `name`: its `config.json` says all of this.
+    """Make the run of a library by its distribution's `name`, and write its `config.json`.
 
     Raises RunError when something is at `path` already.
     """
@@ -399,7 +399,7 @@ def create_run(
 
 
 class PartialTables:
-    """A run's tables, null where a value is missing or NaN: what a library keeps to itself."""
+    """A run's tables in which missing values and NaN are null."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
@@ -520,7 +520,7 @@ class FreshMeta:
 
     @property
     def stratum(self) -> NDArray[np.int16]:
-        """The stratum of each slot (capacity,): its condition's code."""
+        """Return the stratum of each slot (capacity,): its condition's code."""
         return self.by_condition.stratum
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:

@@ -100,7 +100,7 @@ class MixtureReplayBuffer(ReplayBuffer):
 
     @cached_property
     def feed(self) -> MixedFeed:
-        """What is drawn and recorded; its first use opens the panel and makes the run."""
+        """Return the feed; its first use opens the panel and makes the run."""
         panel = self._panel
         panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
         if panel is not None and not self._ignore_weights and weighted(panel):
@@ -118,7 +118,7 @@ class MixtureReplayBuffer(ReplayBuffer):
 
     @cached_property
     def ring(self) -> FreshRing:
-        """The fresh rows, packed as the panel's are."""
+        """Return the fresh rows, packed like the panel's."""
         panel, discount = self.feed.panel, self._discount
         if discount is None:
             discount = panel.discount if panel is not None else 0.99
@@ -135,7 +135,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         return ring
 
     def _logged_actions(self, panel: Panel | None, commands: NDArray[Any] | None) -> F32 | None:
-        """(n, A) as Stable-Baselines3 keeps actions: indices, or commands scaled to [-1, 1]."""
+        """Return actions (n, A) as Stable-Baselines3 keeps them: indices or scaled commands."""
         if panel is None:
             return None
         index = panel.rows[:, panel.columns["action"]]
@@ -153,7 +153,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         return np.clip(scaled, -1, 1).astype(np.float32)
 
     def reset(self) -> None:
-        """Stable-Baselines3 calls this only where a buffer is made."""
+        """Empty the buffer; Stable-Baselines3 calls this only when it makes one."""
         self.pos, self.full = 0, False
 
     def add(
@@ -271,7 +271,7 @@ def weighted(panel: Panel) -> bool:
 
 
 def dqn_critic(model: Any) -> Critic:
-    """Q and TD of a batch as `stable_baselines3.DQN` is about to learn from it."""
+    """Return a function that computes Q and TD of a batch as `stable_baselines3.DQN` does."""
 
     def critic(samples: ReplayBufferSamples) -> tuple[torch.Tensor, torch.Tensor]:
         after = model.q_net_target(samples.next_observations).max(dim=1, keepdim=True).values

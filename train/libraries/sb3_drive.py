@@ -118,7 +118,7 @@ def ppo(
 
 
 class _Drive(BaseCallback):
-    """Evaluates what the linear layers of `parts` make when it is due, and at the end."""
+    """A callback that evaluates the linear layers of `parts` at intervals and at the end."""
 
     def __init__(
         self,
@@ -147,7 +147,7 @@ class _Drive(BaseCallback):
         self.check()
 
     def check(self) -> None:
-        """Raise NotFinite where an update has left a parameter that is not finite."""
+        """Raise NotFinite if an update has left a parameter that is not finite."""
         finite = all(p.isfinite().all() for layer in self.linears for p in layer.parameters())
         steps = {"env_steps": self.num_timesteps, "gradient_steps": self.updates()}
         check_kept(finite, self.evaluations.run.path, steps)
@@ -159,7 +159,7 @@ class _Drive(BaseCallback):
 
 
 class _OnPolicyFeed(BaseCallback):
-    """What an on-policy algorithm was fed: all steps of a rollout alike, some epochs long."""
+    """The record of an on-policy algorithm's feed: all steps of a rollout, for some epochs."""
 
     def __init__(self, config: TrainConfig, run: Run, model: PPO) -> None:
         super().__init__()
@@ -205,7 +205,7 @@ class _OnPolicyFeed(BaseCallback):
         self._write()
 
     def close(self) -> None:
-        """Write what is left: of episodes that began before the last rollout's end."""
+        """Write the remaining episodes, which began before the last rollout's end."""
         self._write()
         running = {
             int(key): max(self.fed_calls - int(first), 0)

@@ -79,7 +79,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
             self._lay_out(panel, commands)
 
     def _lay_out(self, panel: Panel, commands: NDArray[Any] | None) -> None:
-        """Memory for all rows, with the panel's in place."""
+        """Allocate memory for all rows, and copy the panel's into it."""
         rows, column, begin = panel.rows, panel.columns, self.fresh.capacity
         action = rows[:, column["action"]][:, 0].astype(np.int64)
         acts = action if commands is None else np.asarray(commands, np.float32)
@@ -163,7 +163,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         return batch, index
 
     def update_weight(self, index: NDArray[Any], new_weight: Any) -> None:
-        """Tianshou hands back its TD errors (target - Q) of the batch it just learnt from."""
+        """Take Tianshou's TD errors (target - Q) of the batch it just learnt from."""
         if hasattr(new_weight, "detach"):
             new_weight = new_weight.detach().cpu().numpy()
         td = -np.asarray(new_weight, np.float32).reshape(-1)
@@ -186,7 +186,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         self.feed.drawn(packed, drawing, slots, weight=weight, td=td)
 
     def _pack(self, packed: F32, slots: Ints) -> None:
-        """Fresh rows as the record takes them; the discount only says whether it terminated."""
+        """Pack fresh rows for the record; their discount only tells whether they terminated."""
         column, rows = self._columns, cast(Any, self._meta)
         packed[:, column["observation"]] = rows.obs[slots]
         packed[:, column["next_observation"]] = rows.obs_next[slots]

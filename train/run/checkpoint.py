@@ -93,7 +93,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def _checksum(document: str, tensors: Mapping[str, torch.Tensor]) -> str:
-    """blake2b of all that a checkpoint holds, 32 hex digits."""
+    """Return blake2b of a checkpoint's content, 32 hex digits."""
     digest = hashlib.blake2b(document.encode(), digest_size=16)
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -167,9 +167,9 @@ def newest_whole(latest: Path) -> int | None:
 
 
 def keep(latest: Path, env_steps: int, count: int) -> None:
-    """Before the latest, taken after `env_steps`, is replaced: of `count` in all, keep it as one.
+    """Keep the latest checkpoint, taken after `env_steps`, as an earlier one, of `count` in all.
 
-    It stays where it is until then, so a kill at any instant leaves a latest one.
+    It stays in place until it is replaced, so a kill at any instant leaves a latest one.
     """
     if count > 1 and latest.exists():
         named = latest.with_name(f"{_PREFIX}{env_steps:09d}{_SUFFIX}")
@@ -210,7 +210,7 @@ def go_back(latest: Path, env_steps: int) -> None:
 
 
 def _put(source: Path, target: Path) -> None:
-    """Put a file under another name in one step; copy it if the disk has no hard links."""
+    """Link a file under another name atomically; copy it if the disk has no hard links."""
     temporary = temporary_name(target)
     temporary.unlink(missing_ok=True)
     try:

@@ -31,21 +31,21 @@ GIVE_UP_AFTER = 3  # failures in a row: a server that is gone would cost its tim
 
 
 class Sink(Protocol):
-    """Takes the curves of one run. Whatever its methods raise is caught and counted."""
+    """A receiver of one run's curves. Errors of its methods are caught and counted."""
 
     name: str
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Numbers by `group/name`, after `step` environment steps."""
+        """Write numbers by `group/name`, after `step` environment steps."""
 
     def flush(self) -> None:
-        """Make what was given readable from here on."""
+        """Make everything written so far readable."""
 
     def close(self) -> None:
-        """Close the sink: nothing more will come."""
+        """Close the sink."""
 
     def describe(self) -> dict[str, Any]:
-        """Return the ids and addresses by which the run is found again."""
+        """Return the ids and addresses of the run."""
 
 
 class TensorBoard:
@@ -83,7 +83,7 @@ class _Count:
 
 
 class Events:
-    """Gives every number to every sink.
+    """A fan-out of numbers to all sinks.
 
     Args:
         run: the run's directory.
@@ -105,7 +105,7 @@ class Events:
         self._write()
 
     def scalars(self, step: int, prefix: str, values: Mapping[str, Any]) -> None:
-        """Every number among `values`, as `prefix/name`."""
+        """Write every number among `values` as `prefix/name`."""
         numbers = {
             f"{prefix}/{name}": float(value)
             for name, value in values.items()
@@ -121,7 +121,7 @@ class Events:
         self._write()
 
     def close(self) -> None:
-        """Close every sink, and say what they did not take."""
+        """Close every sink, and report failed calls."""
         for sink in list(self._open):
             self._try(sink.name, sink.close)
         for name, count in self.failures.items():
@@ -198,7 +198,7 @@ def require_trackers(names: Sequence[str]) -> None:
 
 
 def tracker_sinks(run: Run, names: Sequence[str]) -> dict[str, Callable[[], Sink]]:
-    """Return what opens each of these trackers for a run, a new one or one that goes on."""
+    """Return a function per tracker that opens it for a new or resumed run."""
     kinds: dict[str, Callable[[], Sink]] = {
         "wandb": lambda: WandbSink(run),
         "mlflow": lambda: MlflowSink(run),

@@ -1,4 +1,4 @@
-"""Episodes that `restock eval` drove, collected in `RUN/eval/episodes.parquet`, and their measures.
+"""Keep the episodes that `restock eval` drove in `RUN/eval/episodes.parquet`, and measure them.
 
 An episode is identified by its policy, floor, perturbation and seed. If it is driven again, it
 replaces the earlier one; all others are kept. Pages show the newest floors, the newest version of
@@ -51,7 +51,7 @@ def read_evaluations(run: Path) -> pa.Table:
 
 
 def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
-    """Put an evaluation beside the earlier ones; episodes that were driven again are replaced.
+    """Add an evaluation to the earlier ones, replacing episodes that were driven again.
 
     Time lost is against the planner as it last drove the mission, of all that was ever driven.
     Returns what was added, with it.
@@ -90,7 +90,7 @@ def mission_of(row: Mapping[str, Any]) -> Mission:
 
 
 def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
-    """Return the episodes to show and compare, and a text that says which of how many they are.
+    """Return the episodes to show and compare, and a text that counts them.
 
     With `ways` only those on the ways of logs are looked at; without, the others, if there are any.
 
@@ -127,14 +127,14 @@ def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
 
 
 def trained_step(shown: pa.Table) -> int | None:
-    """After how many environment steps of training the run's own policy was taken."""
+    """Return the environment steps of training after which the run's own policy was taken."""
     own = shown.filter(pc.equal(shown["policy"], "agent"))
     step: int | None = own["trained_env_steps"][-1].as_py() if own.num_rows else None
     return step
 
 
 def _floors(layouts: str) -> str:
-    """Floors as a run names them, in few words: files by name, of many the first and last."""
+    """Shorten a run's floors: files by name, of many only the first and last."""
     ways = WAYS if layouts.endswith(WAYS) else ""
     names = [part.rpartition("/")[2].strip() for part in layouts.removesuffix(ways).split(",")]
     some = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
@@ -142,7 +142,7 @@ def _floors(layouts: str) -> str:
 
 
 def _changes(policy: str) -> bool:
-    """Tell whether a policy of this name changes with the run, or with the limiter's settings."""
+    """Return whether a policy of this name changes with the run or with the limiter's settings."""
     return policy == "agent" or policy.startswith(LIMITED)
 
 
@@ -156,7 +156,7 @@ CLONES = Path("eval") / "clones.parquet"  # in a run
 
 @dataclass(frozen=True)
 class CloneQuality:
-    """How good a clone is: a row of `RUN/eval/clones.parquet`, whose columns say what each is."""
+    """The quality of a clone: a row of `RUN/eval/clones.parquet`, whose columns explain it."""
 
     policy: str
     drivers: list[str]
@@ -174,7 +174,7 @@ class CloneQuality:
 
     @property
     def poor(self) -> str | None:
-        """Why it is no good stand-in for the drivers; None where nothing says so."""
+        """Return why it is a poor stand-in for the drivers; None if nothing shows that."""
         if self.log_likelihood is None or self.agreement is None:
             return "the quality of the clone is not known: no row of its drivers is held out"
         if self.log_likelihood <= (self.frequencies_log_likelihood or 0.0):
@@ -188,7 +188,7 @@ class CloneQuality:
 
     @property
     def text(self) -> str:
-        """The warning to the reader, in a sentence or two."""
+        """Return a warning in a sentence or two."""
         said = (
             f"{self.policy} is behaviour cloning of {', '.join(self.drivers) or 'unnamed drivers'}"
             f" ({counted(self.rows, 'row')} of"
@@ -214,7 +214,7 @@ def read_clones(run: Path) -> list[CloneQuality]:
 
 
 def keep_clone(run: Path, quality: CloneQuality) -> None:
-    """Put one beside the others; one of its name is replaced."""
+    """Add a clone's quality, replacing one of the same name."""
     others = [row for row in read_clones(run) if row.policy != quality.policy]
     rows = [asdict(row) for row in (*others, quality)]
     write_table(pa.Table.from_pylist(rows, schema=EVAL_CLONES), run / CLONES)
@@ -224,7 +224,7 @@ Row = Mapping[str, Any]
 
 
 def cell_name(condition: str, block: str) -> str:
-    """`blocked_aisle (partial)`, but `nominal`."""
+    """Name a cell: `blocked_aisle (partial)`, but `nominal`."""
     return condition if block in ("none", "") else f"{condition} ({block})"
 
 

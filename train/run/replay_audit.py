@@ -1,4 +1,4 @@
-"""What the critic of a run was fed: its batches in sum by stratum, and each audited transition."""
+"""Read what a run's critic was fed: its batches summed by stratum, and each audited transition."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ReplayAuditRecord(msgspec.Struct, frozen=True):
     age_steps: int  # updates since it was collected; of a logged row since the run began
     age_days: float | None  # of a logged row: days before training began
     condition: str | None  # None: the episode of a fresh row had not ended with the run
-    behavior_policy: str  # who acted
+    behavior_policy: str  # behaviour policy
     action: str  # its name
     reward: float  # the n-step return
     target_sync_step: int | None  # update after which the target last moved; None: not known

@@ -57,7 +57,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 class _Document(dict[str, Any]):
-    """What `config.json` says; a key that it lacks is an error that names the file."""
+    """The content of `config.json`; a missing key is an error that names the file."""
 
     def __init__(self, values: Mapping[str, Any], path: Path) -> None:
         super().__init__(values)
@@ -126,7 +126,7 @@ class Run:
         return f"<Run {self.path}>"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Go on from a pickled run: the next flush writes all tables, without rows of later."""
+        """Restore a pickled run: the next flush writes all tables, without later rows."""
         vars(self).update(state)
         self._on_disk = dict.fromkeys(TABLES, _UNKNOWN)
 
@@ -140,7 +140,7 @@ class Run:
 
     @property
     def absent(self) -> list[str]:
-        """The files of tables that are not there: lost, or unknown to the Restock that wrote it."""
+        """Return the files of missing tables."""
         files = [f"{name}.parquet" for name in TABLES]
         return [file for file in files if not (self.path / file).exists()]
 
@@ -212,7 +212,7 @@ class Run:
         self._on_disk[name] = table.num_rows
 
     def remove_leftovers(self) -> None:
-        """Remove what a killed process left of the tables and checkpoints that it was writing."""
+        """Remove partial tables and checkpoints that a killed process left."""
         for folder, pattern in (
             (self.path, "*.parquet"),
             (self.path, "*.json"),
@@ -222,11 +222,11 @@ class Run:
             remove_leftovers(folder, pattern)
 
     def row_counts(self) -> dict[str, int]:
-        """Rows per table, for a checkpoint."""
+        """Return the rows per table, for a checkpoint."""
         return {name: self.table(name).num_rows for name in TABLES}
 
     def truncate(self, counts: Mapping[str, int]) -> None:
-        """Forget rows that were written after the checkpoint of `counts`; `flush` removes them.
+        """Drop rows that were written after the checkpoint of `counts`; `flush` removes them.
 
         Raises:
             RunError: a table has fewer rows than the checkpoint knew of.
@@ -297,7 +297,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
 
 
 def now_ns() -> int:
-    """Wall time, to which the ages of logged rows refer: that of a run's start, `created_ns`."""
+    """Return the wall time, ns; at a run's start it is the reference for ages of logged rows."""
     return time.time_ns()
 
 
@@ -356,7 +356,7 @@ class RunLock:
         os.write(self._file, f"{os.getpid()} {platform.node()}".encode())
 
     def release(self) -> None:
-        """Let others write the run. Does nothing the second time."""
+        """Release the lock; a second call does nothing."""
         if self._file is not None:
             self._path.unlink(missing_ok=True)
             os.close(self._file)
@@ -384,7 +384,7 @@ def _refused(run: Path, holder: str) -> RunError:
 
 @dataclass(frozen=True)
 class PolicyOrigin:
-    """The step of training that a policy is from, and why it is the one that drives."""
+    """The training step that a policy is from, and why it is the one that drives."""
 
     chosen: Literal["best", "latest"]
     env_steps: int
@@ -393,7 +393,7 @@ class PolicyOrigin:
 
     @property
     def text(self) -> str:
-        """The origin for people: `policy of step 120,000 of 192,000, the best in training`."""
+        """Describe the origin: `policy of step 120,000 of 192,000, the best in training`."""
         if not self.run_env_steps:
             return f"policy of update {self.gradient_steps:,}, from the logs alone"
         of = "" if self.env_steps == self.run_env_steps else f" of {self.run_env_steps:,}"
@@ -403,7 +403,7 @@ class PolicyOrigin:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The fields and the text as JSON values."""
+        """Return the fields and the text as JSON values."""
         return {**asdict(self), "text": self.text}
 
 
@@ -420,7 +420,7 @@ def kept_policy(run: Run) -> PolicyOrigin | None:
 
 
 def latest_drives(run: Run) -> bool:
-    """Tell whether the run has learned, but never evaluated what it learned in the twin."""
+    """Return whether the run has learned but never evaluated that in the twin."""
     latest, best = _values(run.latest), _values(run.best)
     if not latest:
         return False
@@ -446,7 +446,7 @@ def run_clocks(run: Run) -> dict[str, Any]:
 
 
 def env_steps_of(run: Run) -> int:
-    """Environment steps of a run so far, by its last checkpoint and its tables."""
+    """Return the environment steps of a run so far, by its last checkpoint and its tables."""
     steps: list[int] = [run_clocks(run).get("env_steps", 0)]
     for name in ("progress", "evaluations"):
         steps += run.table(name)["env_steps"].to_pylist()
@@ -454,7 +454,7 @@ def env_steps_of(run: Run) -> int:
 
 
 def _values(path: Path) -> dict[str, Any]:
-    """Numbers and texts of a checkpoint, without its arrays; empty if it cannot be read."""
+    """Return the numbers and texts of a checkpoint without arrays; empty if it cannot be read."""
     try:
         with safe_open(path, framework="numpy") as opened:
             values = json.loads((opened.metadata() or {})["state"])

@@ -1,4 +1,4 @@
-"""The profile and the panel of a run, by its `config.json`.
+"""Find the profile and the panel of a run by its `config.json`.
 
 A run carries the text of its profile, so that it can be read anywhere. Its panel is a folder
 elsewhere, which must still be the one that the run learned from.
@@ -55,7 +55,7 @@ def profile_of_run(run: Run) -> Profile:
 
 
 def carries_profile(panel: Panel, name: str) -> bool:
-    """Tell whether `name` is the profile that the panel carries."""
+    """Return whether `name` is the profile that the panel carries."""
     own = panel.header.profile_toml and name == panel.header.profile
     return bool(own) and name not in shipped_profiles() and not Path(name).is_file()
 

@@ -1,1 +1,1 @@
-"""Methods x mixtures x seeds, ending in one comparison."""
+"""Studies: methods x mixtures x seeds, ending in one comparison."""

@@ -1,4 +1,4 @@
-"""What the runs of a study came to, one number a run, and contrasts of arms, paired by seed.
+"""Measure each run of a study by one number, and contrast arms, paired by seed.
 
 A measure is named `auc_WHAT` or `success_WHAT`. `auc` is the area under the run's own curve of
 success over environment steps (trapezoids, divided by the steps: a mean success on the way),
@@ -54,7 +54,7 @@ def unknown_measure(name: str) -> str | None:
 
 @dataclass(frozen=True)
 class Contrast:
-    """An arm less its baseline in one measure, paired by seed."""
+    """The difference of an arm from its baseline in one measure, paired by seed."""
 
     arm: str
     baseline: str
@@ -76,7 +76,7 @@ class Contrast:
 
 
 class RunCurve:
-    """A finished run's success by cell: on the way, and of the policy that it kept."""
+    """A finished run's success by cell, over training and of the kept policy."""
 
     def __init__(self, path: Path) -> None:
         self._run = Run.open(path)
@@ -85,12 +85,12 @@ class RunCurve:
 
     @cached_property
     def end(self) -> dict[tuple[str, str], float]:
-        """Success of the kept policy by condition and block."""
+        """Return the kept policy's success by condition and block."""
         return _success(agent_episodes(self._run))
 
     @property
     def conditions(self) -> list[tuple[str, int, float]]:
-        """Condition, environment steps and success of each evaluation on the way.
+        """Return condition, environment steps and success of each evaluation in training.
 
         Partly and wholly blocked aisles count by half each, however many of each were drawn.
         """
@@ -109,7 +109,7 @@ class RunCurve:
         return area(self.steps, np.array(list(self.curve(what).values())), reach)
 
     def curve(self, what: str) -> dict[int, float]:
-        """Success at each periodic evaluation, by environment steps in their order."""
+        """Return success at each periodic evaluation, by ascending environment steps."""
         return {step: self._of(self._at[step], what) for step in self.steps.tolist()}
 
     def _of(self, success: Mapping[tuple[str, str], float], what: str) -> float:
@@ -120,7 +120,7 @@ class RunCurve:
                 success.get((condition, block or "none"), float("nan"))
                 for condition, block in CELLS[what]
             ]
-        # A study may leave out kinds, and few episodes may all be blocked one way: that half then
+        # A study may leave out kinds, and a few episodes may all be blocked alike: that half then
         # stands for both.
         known = [value for value in own if not np.isnan(value)]
         return _mean(known) if known else float("nan")
@@ -194,7 +194,7 @@ def _why_no_interval(ahead: F64) -> str | None:
 
 
 def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:
-    """Return the same with p adjusted for all that are not the primary one."""
+    """Return the contrasts with p adjusted (Holm) for all but the primary one."""
     places = [i for i, one in enumerate(contrasts) if not one.primary and one.p is not None]
     adjusted = holm([float(contrasts[i].p or 0.0) for i in places])
     found = list(contrasts)
@@ -260,7 +260,7 @@ def _last_progress(path: Path) -> dict[str, Any] | None:
 
 
 def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
-    """Success by cell at each evaluation; of two at one step, the later one."""
+    """Return success by cell at each evaluation; of two at one step, the later one."""
     by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
     for row in table.to_pylist():
         step, update = int(row["env_steps"]), int(row["gradient_steps"])
@@ -273,7 +273,7 @@ def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
 
 
 def _success(table: pa.Table | None) -> dict[tuple[str, str], float]:
-    """Of the unperturbed episodes, by condition and block."""
+    """Return the success of unperturbed episodes by condition and block."""
     if table is None:
         return {}
     return _success_of([row for row in table.to_pylist() if row["perturbation"] == "none"])

@@ -1,4 +1,4 @@
-"""A study: arms x seeds as its TOML file asks for, and what there is to do."""
+"""A study: arms x seeds as its TOML file describes them, and the jobs to do."""
 
 from __future__ import annotations
 
@@ -73,14 +73,14 @@ class StudyEvaluation(Checked, frozen=True):
 
     @property
     def of_kind(self) -> Mapping[str, int]:
-        """Episodes by kind."""
+        """Return the episodes by kind."""
         if isinstance(self.episodes, dict):
             return self.episodes
         return dict.fromkeys(KINDS, self.episodes)
 
 
 class Primary(Checked, frozen=True):
-    """The one contrast that a study is for, named before its runs."""
+    """The one contrast that a study tests, named before its runs."""
 
     arm: str  # compared with its baseline
     measure: str
@@ -151,12 +151,12 @@ class Study(Checked, frozen=True):
 
     @property
     def base(self) -> ArmConfig:
-        """The arm that the others are compared with, unless they name one of their own."""
+        """Return the arm that the others are compared with, unless they name another."""
         return self.arms[0]
 
     @property
     def pairs(self) -> list[Pair]:
-        """What is compared with what, in the order of the arms."""
+        """Return the comparisons, in the order of the arms."""
         return [
             Pair(
                 arm,
@@ -190,7 +190,7 @@ def load_study(path: Path | str) -> Study:
 
 
 def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str) -> None:
-    """Refuse an arm that makes no update, which would be found only after all its runs."""
+    """Refuse an arm that makes no update, before its runs are trained."""
     if arm.library == "sb3-ppo":  # it has no warm-up
         return
     has_logs = arm.mixture is not None or arm.panel is not None
@@ -206,7 +206,7 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
 
 
 def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
-    """Raise ConfigError where a run could not be evaluated, which would be found once trained."""
+    """Raise ConfigError if a run could not be evaluated after training."""
     from restock.train.evaluation.eval_run import refuse_unknown
 
     names = evaluation.perturbations
@@ -240,7 +240,7 @@ class StudyJob:
 
     @property
     def done(self) -> Path:
-        """There when the run was trained and evaluated as the study asks."""
+        """Return the file that exists once the run was trained and evaluated as requested."""
         return self.path / DONE
 
 
@@ -254,7 +254,7 @@ class StudyPlan:
 
     @property
     def jobs(self) -> list[StudyJob]:
-        """Seeds first: an interrupted study has fewer seeds of all arms, not fewer arms."""
+        """Return the jobs, seed by seed: an interrupted study has fewer seeds of all arms."""
         return [
             StudyJob(arm, seed, self.out / "runs" / f"{arm.name}-{seed}")
             for seed in self.study.seeds
@@ -266,17 +266,17 @@ class StudyPlan:
         return [job.path for job in self.jobs if job.arm.name == arm.name]
 
     def panel(self, arm: ArmConfig) -> Path | None:
-        """Where an arm's panel is, or will be."""
+        """Return the path of an arm's panel."""
         if arm.panel is not None:
             return self.folder / arm.panel
         return self.out / "panels" / arm.name if arm.mixture is not None else None
 
     def settings(self, arm: ArmConfig, seed: int) -> list[str]:
-        """`key=value` of a run."""
+        """Return a run's settings as `key=value`."""
         return [*as_overrides(self.study.settings), *as_overrides(arm.settings), f"seed={seed}"]
 
     def fingerprint(self, job: StudyJob) -> str:
-        """Return what a finished run was asked to be, as JSON."""
+        """Return the request of a finished run as JSON."""
         return json.dumps(self._request(job), indent=1) + "\n"
 
     def _request(self, job: StudyJob) -> dict[str, Any]:
@@ -315,7 +315,7 @@ def check_jobs(plan: StudyPlan) -> None:
 
 
 def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Return what one request says and the other does not."""
+    """Return the items of one request that the other lacks."""
     reported = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
     reported += [
         f"{key} = {json.dumps(value)}"

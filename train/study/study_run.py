@@ -1,4 +1,4 @@
-"""Running a study, and what it found: every arm with every seed, then the comparisons.
+"""Run a study, every arm with every seed, then compare.
 
 A study is a TOML file and a directory. What already exists is not done again: a panel that was
 built, a run that has ended, an evaluation that was driven. So a study that was interrupted, or got
@@ -66,7 +66,7 @@ REFERENCES = ("planner", "operator")  # drive the episodes of the runs once
 def run_study(
     plan: StudyPlan, *, workers: int = 1, say: Say = lambda line: None
 ) -> list[Comparison | RunError]:
-    """Do what is not done yet, then compare every arm with its baseline, in the order of the arms.
+    """Run the open jobs, then compare every arm with its baseline, in the order of the arms.
 
     A comparison that cannot be made is its error:
     the others of a study that has run count all the same.
@@ -97,7 +97,7 @@ def _compare(plan: StudyPlan, pair: Pair) -> Comparison | RunError:
 
 
 def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:
-    """Train and evaluate; after a failure nothing more is begun, and what runs is waited for."""
+    """Train and evaluate; after a failure start nothing more, and wait for running jobs."""
     failed = Event()
 
     def run(job: StudyJob) -> None:
@@ -129,7 +129,7 @@ def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) 
 
 
 def _wait(pool: ThreadPoolExecutor) -> None:
-    """Until what runs has ended, or is interrupted."""
+    """Wait until the running jobs have ended, or an interrupt."""
     try:
         pool.shutdown()
     except KeyboardInterrupt:
@@ -139,7 +139,7 @@ def _wait(pool: ThreadPoolExecutor) -> None:
 
 
 def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
-    """Pack an arm's panel, if it is a mixture that has not been packed yet."""
+    """Build an arm's panel, if it is a mixture that is not packed yet."""
     out = plan.panel(arm)
     if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
         return
@@ -178,7 +178,7 @@ def check_mixtures(plan: StudyPlan) -> None:
 
 
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
-    """Train and evaluate one run; taken up from its checkpoint if it has one."""
+    """Train and evaluate one run, from its checkpoint if it has one."""
     log = plan.out / "logs" / f"{job.path.name}.log"
     if job.arm.library is not None:
         _train_library(plan, job, job.arm.library, log, say)
@@ -198,7 +198,7 @@ def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
 
 
 def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
-    """Return what `restock eval` is told to drive."""
+    """Return the options of `restock eval` for the episodes to drive."""
     given = evaluation.episodes
     if isinstance(given, dict):
         text = ",".join(f"{kind}={count}" for kind, count in given.items())
@@ -223,7 +223,7 @@ def _drive_references(plan: StudyPlan, say: Say) -> None:
 
 
 def _train_library(plan: StudyPlan, job: StudyJob, library: Library, log: Path, say: Say) -> None:
-    """Another library keeps no checkpoint to go on from: a run that was cut begins again."""
+    """Train another library's run; it has no checkpoints, so a run that was cut begins again."""
     if (job.path / TRAINED).exists():
         return
     if job.path.exists():
@@ -257,7 +257,7 @@ def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) 
 
 
 def restock_verb(arguments: Sequence[str], log: Path) -> None:
-    """One verb in a process of its own, its words in a log."""
+    """Run a verb in its own process, with its output in a log."""
     _command("restock", arguments, log)
 
 
@@ -293,7 +293,7 @@ MAX_NAMED = 4  # checks that refuse a comparison
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
-    """Return the study and all that it found, as JSON values.
+    """Return the study and its results as JSON values.
 
     `comparisons` are those of `run_study`; an error is why there is none.
     """
@@ -339,7 +339,7 @@ def _why_refused(pair: Pair, comparison: Comparison) -> str:
             f' treatment = "{pair.treatment}" does not allow'
         )
     failed = [one for one in comparison.deciding_checks if one.verdict == comparison.verdict]
-    # A feed that differs follows from numbers of updates that do: one cause is named.
+    # Different numbers of updates make the feeds differ: name that one cause.
     for check in failed:
         if check.name == "updates" and check.first is not None and check.second is not None:
             return (
@@ -407,7 +407,7 @@ def arms(plan: StudyPlan) -> list[dict[str, Any]]:
 
 
 class _Curves:
-    """Finished runs of a study, each read once."""
+    """The finished runs of a study, each read once."""
 
     def __init__(self, plan: StudyPlan) -> None:
         self._plan = plan
@@ -429,7 +429,7 @@ class _Curves:
 
 
 def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
-    """Unperturbed episodes."""
+    """Return unperturbed episodes."""
     return [
         row
         for row in read_evaluations(path).to_pylist()
@@ -446,7 +446,7 @@ def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[
 
 
 def _measured(episodes: list[dict[str, Any]], planner_s: dict[Any, float]) -> dict[str, float]:
-    """One run's measures; NaN where nothing tells."""
+    """Return one run's measures; NaN if unknown."""
     cells: dict[str, list[float]] = {}
     for row in episodes:
         if row["success"] is not None:
@@ -479,7 +479,7 @@ def _over_seeds(runs: Sequence[dict[str, float]]) -> dict[str, list[float | None
 
 
 def _range(name: str) -> tuple[float, float]:
-    """Return what a measure of `_measured` can be."""
+    """Return the range of a measure of `_measured`."""
     if name.startswith("success "):
         return 0.0, 1.0
     return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf

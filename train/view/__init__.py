@@ -1,1 +1,1 @@
-"""A moment of a recording in the tools that people look with: Foxglove and Rerun."""
+"""Show a moment of a recording in Foxglove and Rerun."""

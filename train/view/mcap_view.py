@@ -1,9 +1,9 @@
-"""A moment as an MCAP file: the recording's own topics, and Restock's beside them.
+"""Write a moment as an MCAP file: the recording's own topics, and Restock's beside them.
 
 Restock's are ROS 2 messages under `/restock/`, in frames of their own (`map` > `restock_base` >
 `restock_laser`, `restock_sectors`), so that they are drawn whatever transforms the robot publishes.
-If a run is named, its critic is shown along the steps: what it expects of the action taken, and how
-wrong it was.
+If a run is named, its critic is shown along the steps: the value of the action taken, and its TD
+error.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from restock.train.twin.recording.bag_writer import build, serialise, stamp, typ
 
 @dataclass(frozen=True)
 class Critic:
-    """A critic's values over T steps, by the last checkpoint of a run, else by its kept policy."""
+    """A critic's values over T steps, from the last checkpoint of a run, else its kept policy."""
 
     run: str
     weights: str  # which networks: a text for people
@@ -47,7 +47,7 @@ class Critic:
 
 
 def critic_along(path: str | Path, moment: Moment) -> Critic:
-    """Compute what a run's critic says of a moment's steps.
+    """Compute a run's critic along a moment's steps.
 
     The target is that of one step, by the target network of the last checkpoint; a run of which
     only its best policy is left bootstraps from that.
@@ -158,7 +158,7 @@ def write_mcap(
             channels[message.channel] = -1 if number is None else number
         if channels[message.channel] < 0:
             continue
-        # What was in force before begins with the moment: a viewer starts there.
+        # Values from before the moment are repeated at its start, where a viewer begins.
         log_ns = max(message.log_time_ns, moment.window_ns[0])
         number = channels[message.channel]
         writer.add_message(number, log_ns, message.payload, message.publish_time_ns)
@@ -202,7 +202,7 @@ def _schema(
 
 
 def _shown(moment: Moment, critic: Critic | None) -> Iterator[_Shown]:
-    """Restock's messages of every step, then of every tick of the recording."""
+    """Yield Restock's messages of every step, then of every tick of the recording."""
     sectors = moment.sector_scans()
     for index, (step, log_ns) in enumerate(zip(moment.steps, moment.log_ns, strict=True)):
         yield (

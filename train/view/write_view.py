@@ -17,7 +17,7 @@ from restock.train.view.mcap_view import Critic, critic_along, write_mcap
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How much of a moment is shown, and by which critic."""
+    """How much of a moment to show, and which critic."""
 
     before_s: float = 5.0
     after_s: float = 5.0
@@ -29,7 +29,7 @@ class ViewOptions:
 def write_view(
     trace: Trace, path: Path | str, options: ViewOptions | None = None
 ) -> dict[str, Any]:
-    """Write the seconds around a traced row; returns what is in the file.
+    """Write the seconds around a traced row; return the file's content by topic.
 
     Args:
         trace: of a row that lies in a store.
@@ -75,7 +75,7 @@ def write_view(
 
 
 def check_view(path: Path) -> None:
-    """Raise ConfigError if nothing can be written to `path`, before anything is looked up."""
+    """Raise ConfigError if `path` cannot be written."""
     if path.suffix != ".mcap":
         raise ConfigError(
             f"{path.name!r} must end in .mcap",
@@ -105,7 +105,7 @@ def _write(
 
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-# What is drawn of Restock's topics, and how.
+# How Restock's topics are drawn.
 _DRAWN: dict[str, dict[str, Any]] = {
     "/restock/scan": {"pointSize": 4, "colorMode": "flat", "flatColor": "#d0312dff"},
     "/restock/seen": {"pointSize": 8, "colorMode": "flat", "flatColor": "#1f6fb2ff"},
@@ -207,7 +207,7 @@ def _plot(topics: Collection[str], *names: str) -> dict[str, Any]:
 
 
 def _column(names: list[str]) -> Any:
-    """Panels one below the other, of equal height."""
+    """Stack panels of equal height."""
     if len(names) == 1:
         return names[0]
     return {
