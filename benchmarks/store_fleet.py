@@ -21,10 +21,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.stores import manifest, recording_transitions
 
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.compaction import fold_if_many
 from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.transitions import replaced
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import StoreWriter, fold_if_many
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task
 

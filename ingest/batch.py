@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union
 
 from restock.errors import TRACEBACK, ConfigError, RecordingError, RestockError, print_traceback
-from restock.imports import import_extra
+from restock.process import import_extra
 
 if TYPE_CHECKING:
     from restock.errors import RestockError

@@ -17,7 +17,7 @@ from typing import Any, get_args
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import ConfigError, RecordingError, expect, visible
+from restock.errors import ConfigError, RecordingError, counted, expect, visible
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
@@ -47,8 +47,7 @@ from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
-from restock.interrupts import interrupts_raised
-from restock.words import counted
+from restock.process import interrupts_raised
 
 
 @interrupts_raised

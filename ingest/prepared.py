@@ -19,13 +19,12 @@ from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
-from restock.errors import RecordingError, RestockError, StoreError, expect
+from restock.errors import RecordingError, RestockError, StoreError, counted, expect, quoted
 from restock.ingest.profile.tag_rules import in_words
 from restock.ingest.store.lineage import Ingest
 from restock.ingest.store.summary import RepeatedDrive
 from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.label_scores import LabelScore
-from restock.words import counted, quoted
 
 GROUP_S = 5.0
 MAX_WAITING = 64

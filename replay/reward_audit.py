@@ -15,17 +15,16 @@ from typing import Any
 
 import duckdb
 
-from restock.errors import ConfigError, RunError
+from restock.errors import ConfigError, RunError, quoted
 from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.replay.places import RUN_CONFIG, open_place
 from restock.replay.store.audit import Audit, Finding, Thresholds, check_thresholds, run_audits
 from restock.replay.store.definitions import install_named
 from restock.replay.store.query import found
 from restock.replay.store.store import Store
-from restock.words import quoted
 
 DISCOUNT = 0.99  # of a store's rows, unless another is asked for
 NAMES = ("reward_order", "reward_undetermined")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from restock.arrays import Bools
 from restock.errors import ExitCode, RestockError
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.config import GIVEN, Hard
 from restock.train.dqn.network import clone

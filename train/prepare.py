@@ -17,7 +17,7 @@ from restock.arrays import F32, Bools, Ints
 from restock.errors import ConfigError, PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.conditions import Condition
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.toml import read_toml

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
-from restock.files import cores
 from restock.ingest.containers import mcap_records
 from restock.ingest.containers.mcap_contents import ROSBAG2, resume, survey
 from restock.ingest.containers.mcap_records import (
@@ -42,6 +41,7 @@ from restock.ingest.containers.storage import (
     unwatched,
 )
 from restock.ingest.decoding.columns import Channel, MessageBatch
+from restock.process import cores
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 _Room: TypeAlias = tuple[Chunk, int, bytes | None]  # its bytes; of the cut one, what it still holds

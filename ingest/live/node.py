@@ -27,9 +27,8 @@ import msgspec
 
 from restock.errors import ConfigError
 from restock.ingest.live.pilot import Decision, Pilot, PolicyFile
-from restock.ingest.profile.inputs import Input, is_motion
 from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.tables import CustomSignal
+from restock.ingest.profile.tables import CustomSignal, Input, is_motion
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.robot import RULES, Limiter, Limits
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, expect
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile, not_live
 from restock.ingest.profile.signal_paths import conventions_of, element_of
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS, TOLERANCE_S, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.clocks import JUMP_S, WINDOW_NS, ClockMap, median

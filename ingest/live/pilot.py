@@ -22,13 +22,13 @@ import numpy as np
 from restock.arrays import F32
 from restock.errors import ConfigError, RecordingError, RestockError
 from restock.files import first_line
-from restock.imports import import_extra
 from restock.ingest.live.observer import LiveObserver, Observed, value_of
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS
 from restock.ingest.task.robot import NONE, RULES, UNKNOWN, Limits, limit
 from restock.ingest.task.task import nearest_action
+from restock.process import import_extra
 
 FORMAT = "restock-policy/1"
 _REMEDY = "give the file that `restock export RUN --to onnx --out policy.onnx` wrote"

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.profile.description import with_robot_file
-from restock.ingest.profile.inputs import (
+from restock.ingest.profile.tables import (
     COMMAND_FALLBACK,
     COMMAND_SOURCES,
     COMMAND_THROUGH,
@@ -44,22 +44,20 @@ from restock.ingest.profile.inputs import (
     SCANS,
     STEERED,
     WHEELS_FALLBACK,
-    Input,
-    Inputs,
-    check_command_source,
-    check_input,
-    check_scans,
-    is_motion,
-)
-from restock.ingest.profile.tables import (
     Camera,
     Clock,
     CustomSignal,
     Episodes,
     Frames,
+    Input,
+    Inputs,
     Motion,
     Zone,
     camera_name_problem,
+    check_command_source,
+    check_input,
+    check_scans,
+    is_motion,
     name_problem,
 )
 from restock.ingest.profile.tag_rules import TagRules

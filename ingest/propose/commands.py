@@ -25,7 +25,7 @@ from restock.arrays import F64, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.inputs import is_motion
+from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import Gaps
 from restock.ingest.propose.robot_choice import (
     DriveEvidence,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, counted
 from restock.ingest.profile.description import (
     BASE_FRAMES,
     F64,
@@ -27,7 +27,6 @@ from restock.ingest.profile.description import (
     extent,
     number,
 )
-from restock.words import counted
 
 MIN_M = 0.005  # of a wheel's radius
 MAX_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's

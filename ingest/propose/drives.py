@@ -28,7 +28,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.description import read_description
-from restock.ingest.profile.inputs import is_motion
+from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.commands import (
     CommandHold,

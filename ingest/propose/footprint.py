@@ -34,8 +34,7 @@ from restock.ingest.profile.description import (
     extent,
     read_description,
 )
-from restock.ingest.profile.inputs import Input
-from restock.ingest.profile.tables import Clock, Frames
+from restock.ingest.profile.tables import Clock, Frames, Input
 from restock.ingest.propose.pose_choice import named_frames, transform_topics
 from restock.ingest.propose.roles import Kind, shared, sort_own_first
 from restock.ingest.steps.align import align

@@ -11,8 +11,8 @@ import numpy as np
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.description import BASE_FRAMES
-from restock.ingest.profile.inputs import HINDSIGHT, Input, is_motion
 from restock.ingest.profile.signal_paths import conventions_of
+from restock.ingest.profile.tables import HINDSIGHT, Input, is_motion
 from restock.ingest.propose.candidates import (
     CameraTopic,
     Candidate,

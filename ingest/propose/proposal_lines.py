@@ -14,9 +14,9 @@ from restock.errors import ConfigError, visible
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.live.node import with_node_topics
-from restock.ingest.profile.inputs import FALLBACKS, Input
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.signal_paths import pressed_in
+from restock.ingest.profile.tables import FALLBACKS, Input
 from restock.ingest.propose.candidates import camera_lines
 from restock.ingest.propose.clock_choice import ClockChoice
 from restock.ingest.propose.commands import Commands

@@ -16,8 +16,8 @@ from pathlib import Path
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
+from restock.ingest.profile.tables import Input
 from restock.ingest.propose.clock_choice import by_log_time
 from restock.ingest.propose.commands import off_the_floor
 from restock.ingest.propose.footprint import UPSIDE_DOWN, Footprint

@@ -11,10 +11,10 @@ from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.signal_paths import (
     last_part,
 )
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.needs import field_paths
 
 T = TypeVar("T")

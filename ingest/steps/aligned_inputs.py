@@ -12,16 +12,16 @@ from typing import TypeVar
 import numpy as np
 
 from restock.arrays import Bools, Ints
-from restock.errors import RecordingError
+from restock.errors import RecordingError, counted
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
-from restock.ingest.profile.inputs import (
+from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.tables import (
     COMMAND_SOURCES,
     COMMAND_THROUGH,
     FALLBACKS,
     POSE_FALLBACK,
     Input,
 )
-from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import (
     NS,
     ClockReport,
@@ -35,7 +35,6 @@ from restock.ingest.steps.align import (
 from restock.ingest.steps.cameras import CameraFrames, usable_frames
 from restock.ingest.steps.frames import Edges, Placement, PoseSeries, Tree, plain, poses_along
 from restock.ingest.steps.input_columns import InputColumns
-from restock.words import counted
 
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used
 # for provenance alone, never for what the robot knew.

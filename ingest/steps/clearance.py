@@ -12,7 +12,7 @@ from restock.arrays import F64, Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, cut, take
-from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.tables import Input
 from restock.ingest.task.scan import MovedMap, SectorMap
 from restock.ingest.task.task import Task
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from restock.arrays import Ints
+from restock.errors import counted
 from restock.ingest.decoding.columns import TopicColumns
-from restock.words import counted
 
 JUMP_S = 1.0  # a change of (log time - stamp) by more means that a clock was set
 STAMP = "header.stamp"

@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
+from restock.errors import counted
 from restock.ingest.steps.align import NS, ClockReport
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.task.signals import Signals, wrap_angle
-from restock.words import counted
 
 WINDOW_S = 3.0  # in which two sources of a speed are compared
 MIN_WINDOWS = 5  # in which the robot moves; fewer say nothing

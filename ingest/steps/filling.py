@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.topic_reading import Fields
-from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.clearance import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction

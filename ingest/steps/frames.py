@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.decoding.columns import Ragged, TopicColumns
-from restock.ingest.profile.inputs import Input
-from restock.ingest.profile.tables import Frames
+from restock.ingest.profile.tables import Frames, Input
 from restock.ingest.steps.align import ClockSegment, LatestMessages
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.task.signals import wrap_angle

@@ -29,7 +29,6 @@ from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import (
     Convention,
@@ -39,6 +38,7 @@ from restock.ingest.profile.signal_paths import (
     pressed_in,
     said_in,
 )
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.frames import Placement, frame_path, plain
 from restock.ingest.task.signals import yaw_of

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from restock.errors import RecordingError
+from restock.errors import RecordingError, counted
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
-from restock.ingest.profile.inputs import SCANS, Input
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import element_of, offer, pressed_paths
-from restock.ingest.profile.tables import CustomSignal
+from restock.ingest.profile.tables import SCANS, CustomSignal, Input
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.cameras import TYPES, frame_reduction, other_field
@@ -25,7 +24,6 @@ from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
 from restock.ingest.steps.frames import FIELDS, frame_path, transform_fields
 from restock.ingest.steps.input_columns import estimate_reduction
-from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf

@@ -23,7 +23,7 @@ from urllib.parse import unquote
 import pyarrow as pa
 import pyarrow.fs
 
-from restock.errors import StoreError
+from restock.errors import StoreError, counted, quoted
 from restock.ingest.store.commits import READ_ROWS, merge
 from restock.ingest.store.lineage import (
     OWN_PATH,
@@ -45,7 +45,6 @@ from restock.ingest.store.location import (
     open_parquet,
 )
 from restock.ingest.store.writer import StoreWriter
-from restock.words import counted, quoted
 
 OPERATION = "restock store compact --drop-damaged"
 READ_AT_ONCE = 4  # files, of each of which a row group may be in memory

@@ -23,13 +23,12 @@ from urllib.parse import unquote
 import pyarrow as pa
 from deltalake import DeltaTable
 
-from restock.errors import StoreError
+from restock.errors import StoreError, quoted
 from restock.files import first_line
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
 from restock.ingest.store.summary import UNREADABLE, Hashes, Sketch, read_sketch, with_ends
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
-from restock.words import quoted
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a compacted file

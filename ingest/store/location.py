@@ -26,7 +26,7 @@ from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.fs import DeltaStorageHandler
 
-from restock.errors import StoreError, expect
+from restock.errors import StoreError, expect, quoted
 from restock.files import first_line
 from restock.ingest.store.version import (
     LOG,
@@ -39,7 +39,6 @@ from restock.ingest.store.version import (
     unsupported,
     version_at,
 )
-from restock.words import quoted
 
 if TYPE_CHECKING:
     import pyarrow.compute as pc

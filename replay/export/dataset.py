@@ -20,9 +20,8 @@ from typing import Any
 
 from restock.errors import StoreError
 from restock.files import building, expect_place
-from restock.imports import install_command, installed
 from restock.ingest.store.version import Version
-from restock.interrupts import interrupts_raised
+from restock.process import install_command, installed, interrupts_raised
 from restock.replay.export import FORMATS
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories

@@ -9,11 +9,10 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-from restock.errors import ConfigError, expect
-from restock.interrupts import interrupts_raised
+from restock.errors import ConfigError, counted, expect
+from restock.process import interrupts_raised
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
-from restock.words import counted
 
 PERIODS = ("day", "week", "month", "year", "decade")
 OWN, OTHERS = "own reference", "other robots"

@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError, expect
 from restock.ingest.task.conditions import NOMINAL, Condition, shipped
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
 from restock.replay.plan.plan import LOGS, PanelPlan, plan_panel

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from restock.arrays import F64
 from restock.errors import StoreError, expect
 from restock.ingest.task.signals import STORED_SIGNALS
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.replay.store.query import values
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval

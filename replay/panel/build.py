@@ -32,7 +32,7 @@ from restock.ingest.task.conditions import (
 )
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.task import Task
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.replay.mixture.mixture import Mixture, load_mixture
 from restock.replay.panel.pack import Packer
 from restock.replay.panel.panel import (

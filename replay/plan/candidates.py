@@ -19,9 +19,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from restock import words
 from restock.arrays import Bools, Codes, Ints
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
+from restock.errors import uncertain_labels as uncertain_text
 from restock.ingest.task.condition_sql import not_an_expression, not_repeatable
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
@@ -446,7 +446,7 @@ def uncertain_labels(
         " FROM recordings",
         {"names": list(names)},
     ).fetchall()
-    return (words.uncertain_labels(*found),) if found[1] else ()
+    return (uncertain_text(*found),) if found[1] else ()
 
 
 def episodes_met(

@@ -14,13 +14,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints, splitmix64
-from restock.errors import MixtureError
+from restock.errors import MixtureError, counted
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.plan.candidates import Places, bools, codes
 from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import GOLDEN
 from restock.replay.store.definitions import install_repeated_rows
-from restock.words import counted
 
 DAY_NS = 86_400 * 10**9
 # What an evaluation split is by, where that is not an episode: column and name.

@@ -23,7 +23,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Codes, Ints
-from restock.errors import MixtureError
+from restock.errors import MixtureError, counted
 from restock.ingest.task.conditions import NOMINAL
 from restock.replay.mixture.mixture import Mixture, StratumRule, knots
 from restock.replay.mixture.shares import (
@@ -44,7 +44,6 @@ from restock.replay.plan.weights import (
     importance_weights,
     stands_for,
 )
-from restock.words import counted
 
 _NEARLY_NONE = 0.1  # of what a stratum could have: it has less than that …
 _TAKEN = 0.5  # … because a condition holds in at least this much

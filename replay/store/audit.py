@@ -30,7 +30,7 @@ import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError, expect
 from restock.files import first_line
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.renamed import AUDITS
 from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.parquet_views import damage

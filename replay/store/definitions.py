@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from restock.ingest.store.summary import with_included
 from restock.ingest.task.schema import COLUMNS, FRAME_COLUMNS, RECORDING_COLUMNS
-from restock.interrupts import was_interrupted
+from restock.process import was_interrupted
 from restock.replay.store.same_drives import install_same_drives
 
 HELD_CONDITIONS = "held_conditions"  # has every column of `transitions`, and `condition`

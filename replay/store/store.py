@@ -39,7 +39,7 @@ from restock.ingest.store.writer import RETENTION_HOURS
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.replay.store.definitions import Definitions, install_common
 from restock.replay.store.parquet_views import StoredTable, damage, manifest_tables, register
 from restock.replay.store.query import query

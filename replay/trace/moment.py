@@ -15,8 +15,8 @@ from restock.errors import RecordingError, StoreError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import RawMessage, Recording
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.clearance import angle_keys, beam_angles
 from restock.ingest.steps.needs import read_topics

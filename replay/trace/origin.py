@@ -27,7 +27,7 @@ from restock.ingest.steps.needs import read_topics
 from restock.ingest.store.location import FRAMES
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
-from restock.interrupts import was_interrupted
+from restock.process import was_interrupted
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store, is_store
 

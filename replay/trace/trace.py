@@ -15,7 +15,7 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import PanelError, RunError, StoreError
+from restock.errors import PanelError, RunError, StoreError, quoted
 from restock.files import read_json, read_table
 from restock.ingest.store.version import Version
 from restock.replay.panel.panel import HEADER, Panel
@@ -23,7 +23,6 @@ from restock.replay.places import RUN_CONFIG
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store, is_store
 from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_of, sql_file
-from restock.words import quoted
 
 
 @dataclass

@@ -13,7 +13,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 from restock.errors import RestockError
-from restock.imports import when_imported
+from restock.process import when_imported
 
 if TYPE_CHECKING:
     from types import ModuleType

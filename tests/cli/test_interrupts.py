@@ -19,7 +19,7 @@ import restock.replay.plan.plan as plan
 from restock.cli import main
 from restock.cli.learning.train import _stop_on_interrupt
 from restock.errors import ExitCode, StoreError
-from restock.interrupts import (
+from restock.process import (
     ended_with_us,
     interrupt_running,
     interrupts_raised,

@@ -13,7 +13,7 @@ import pytest
 from restock.cli import main
 from restock.cli.data import info
 from restock.errors import ConfigError
-from restock.imports import import_extra, install_command
+from restock.process import import_extra, install_command
 
 
 def reported(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:

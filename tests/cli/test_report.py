@@ -23,7 +23,7 @@ from support.panels import panel_of
 from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
-from restock.errors import RunError
+from restock.errors import RunError, policy_words
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.store.store import Store
 from restock.report import build_report
@@ -41,7 +41,6 @@ from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdic
 from restock.train.twin.floors.floor_files import write_floor
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.occupancy_grid import into_frame
-from restock.words import policy_words
 
 HOSTILE = "<script>alert(1)</script>"
 

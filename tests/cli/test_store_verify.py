@@ -15,9 +15,8 @@ from support.stores import recording_transitions, write_store
 from restock import cli
 from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.compaction import compact
 from restock.ingest.store.damaged_files import VERIFIED, verify_store
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
 FLIPS = 60

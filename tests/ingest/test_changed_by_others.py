@@ -15,9 +15,8 @@ from support.stores import one, shown
 from restock import cli
 from restock.errors import StoreError
 from restock.ingest.store import commits
-from restock.ingest.store.compaction import compact
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
 

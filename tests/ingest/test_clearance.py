@@ -11,8 +11,8 @@ from support.profile_texts import WAREHOUSE
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
-from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps import clearance
 from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.scan import SectorMap

@@ -15,11 +15,10 @@ from support.stores import manifest, one, shown, views_over
 
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.store import compaction
-from restock.ingest.store.compaction import OPERATION, compact, fold
+from restock.ingest.store import writer as writer_module
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.transitions import ENDS, packed, replaced
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import OPERATION, StoreWriter, compact, fold
 from restock.replay.store.audit import Finding, run_audits, shipped_audits
 from restock.replay.store.store import Store
 
@@ -352,16 +351,16 @@ def test_an_ingest_into_a_joined_file_that_fails_leaves_no_file(tmp_path, monkey
 @pytest.mark.long
 def test_manifests_are_written_again_a_bounded_number_of_times(tmp_path, monkeypatch):
     """However many there are: files of enough of them are left alone."""
-    monkeypatch.setattr(compaction, "FULL_MANIFESTS", 4)
+    monkeypatch.setattr(writer_module, "FULL_MANIFESTS", 4)
     written: list[int] = []
-    merge = compaction.merge
+    merge = writer_module.merge
 
     def counted(*args, **given):
         made = merge(*args, **given)
         written.append(made.rows)
         return made
 
-    monkeypatch.setattr(compaction, "merge", counted)
+    monkeypatch.setattr(writer_module, "merge", counted)
     writer = StoreWriter(tmp_path / "s")
     for recording in range(1, 13, 2):
         writer.write_all([one(recording), one(recording + 1)])
@@ -377,7 +376,7 @@ def test_manifests_are_written_again_a_bounded_number_of_times(tmp_path, monkeyp
 def test_files_that_others_add_meanwhile_are_not_counted(tmp_path, monkeypatch):
     writer = StoreWriter(tmp_path / "s")
     writer.write_all([one(1), one(2)])
-    monkeypatch.setattr(compaction, "fold", lambda *_: writer.write_all([one(3), one(4)]))
+    monkeypatch.setattr(writer_module, "fold", lambda *_: writer.write_all([one(3), one(4)]))
     done = compact(writer)
     assert (done.files_before, done.files_after) == (2, 1)
 

@@ -16,13 +16,12 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import QueryError, StoreError
-from restock.ingest.store import commits, compaction, lineage
+from restock.ingest.store import commits, lineage
 from restock.ingest.store import writer as writer_module
 from restock.ingest.store.commits import recording_columns
-from restock.ingest.store.compaction import compact
 from restock.ingest.store.damaged_files import drop_damaged
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.query import fetch
 from restock.replay.store.store import Store
 
@@ -197,7 +196,7 @@ def test_files_without_checksums_are_read_as_before(tmp_path, monkeypatch):
     """Another tool may write them."""
     options = commits.parquet_options
     without = {"write_page_checksum": False}
-    for module in (commits, writer_module, compaction):
+    for module in (commits, writer_module):
         monkeypatch.setattr(module, "parquet_options", lambda schema: options(schema) | without)
     writer = StoreWriter(tmp_path / "s")
     writer.write_all([one(1), one(2)])
@@ -247,9 +246,9 @@ def test_an_ingest_is_not_failed_by_a_damaged_manifest_of_another_recording(tmp_
     frames.parent.mkdir(parents=True)
     frames.write_text("frames")
     os.utime(frames, (0, 0))
-    monkeypatch.setattr(compaction, "FOLD_FILES", 2)
+    monkeypatch.setattr(writer_module, "FOLD_FILES", 2)
     assert writer.clean() == []
-    compaction.fold_if_many(writer)
+    writer_module.fold_if_many(writer)
     assert frames.is_file()
 
 

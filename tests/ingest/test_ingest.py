@@ -278,8 +278,8 @@ def test_a_recording_of_another_robot_is_refused_with_its_topics(tmp_path, run):
 
 
 def test_the_page_names_every_input_and_what_stands_in_for_it():
-    from restock.ingest.profile.inputs import FALLBACKS, INPUT_FIELDS
     from restock.ingest.profile.profile import shipped_profiles
+    from restock.ingest.profile.tables import FALLBACKS, INPUT_FIELDS
     from restock.ingest.task.conditions import shipped
 
     page = (ROOT / "docs" / "ingest.md").read_text()

@@ -9,8 +9,7 @@ import msgspec
 import pytest
 from support.paths import ROOT
 
-from restock.ingest.profile.inputs import Input
-from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
+from restock.ingest.profile.tables import Clock, Episodes, Frames, Input, Motion, Zone
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Rewards, Task
 

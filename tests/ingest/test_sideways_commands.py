@@ -9,7 +9,7 @@ import pytest
 from support.driven_robot import Drive, typed_topics, write_topics
 
 from restock.cli import main
-from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 
 

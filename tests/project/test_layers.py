@@ -19,8 +19,8 @@ from support.paths import ROOT
 MAX_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
 SHARED = {
-    *("arrays", "errors", "files", "imports", "interrupts", "native", "public"),
-    *("renamed", "state", "stats", "toml", "words"),
+    *("arrays", "errors", "files", "native", "process", "public"),
+    *("renamed", "state", "stats", "toml"),
 }
 MAY_IMPORT = {
     "ingest": "containers decoding profile steps store task",

@@ -31,7 +31,7 @@ from support.stores import TASK, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import ExitCode, PanelError, QueryError, StoreError
-from restock.imports import install_command
+from restock.process import install_command
 from restock.replay.export import FORMATS
 from restock.replay.export.dataset import export_dataset
 from restock.replay.export.selection import open_selection

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
-from restock.errors import ConfigError
+from restock.errors import ConfigError, figure
 from restock.replay.fleet.gaps import Gap, Yields, find_gaps
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_toml, read_missions
 from restock.replay.fleet.shopping_list import shopping_list
@@ -23,7 +23,6 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.places import add_computed_tables
 from restock.replay.plan.source_plan import forecast, missions_to_see_one, probability_to_close
 from restock.replay.store.store import Store
-from restock.words import figure
 
 KINDS = ("nominal", "wheel_slip", "blocked_aisle")
 

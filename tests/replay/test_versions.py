@@ -12,9 +12,8 @@ from support.stores import one
 import restock
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.store.compaction import compact
 from restock.ingest.store.lineage import _read
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("summaries_once")

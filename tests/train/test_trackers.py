@@ -15,7 +15,7 @@ from support.toy_run import config as toy_config
 from support.toy_run import run_to_end
 
 from restock import cli
-from restock.imports import install_command
+from restock.process import install_command
 from restock.train.dqn.config import TrainConfig
 from restock.train.run.events import GIVE_UP_AFTER, Events, tracked, tracker_sinks
 from restock.train.run.run import Run

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 import pyarrow as pa
 
-from restock.errors import ConfigError, RunError
+from restock.errors import ConfigError, RunError, quoted
 from restock.ingest.task.robot import Limiter, Limits
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.toml import read_toml, typed
 from restock.train.dqn.config import LAST_SEED, TrainConfig, parse_config
 from restock.train.dqn.network import torch_threads
@@ -60,7 +60,6 @@ from restock.train.twin.physics.perturbation import (
     find_perturbation,
     is_schedule,
 )
-from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv

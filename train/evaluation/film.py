@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from restock.arrays import F32, Ints
-from restock.errors import RestockError, RunError
+from restock.errors import RestockError, RunError, policy_words, quoted
 from restock.files import write_bytes, write_text
 from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy
 from restock.train.evaluation.evaluate import EpisodeResult, Stepper, run_episodes
@@ -30,7 +30,6 @@ from restock.train.twin.env.interface import Step
 from restock.train.twin.env.render import draw_map
 from restock.train.twin.floors.layout import PEOPLE
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.words import policy_words, quoted
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv

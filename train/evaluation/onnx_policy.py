@@ -20,10 +20,10 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
-from restock.imports import import_extra
 from restock.ingest.live.pilot import FORMAT, open_session
 from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
+from restock.process import import_extra
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
 from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.policies import load_agent

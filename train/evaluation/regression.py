@@ -18,13 +18,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.errors import RunError
+from restock.errors import RunError, counted, quoted
 from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.run.kept_evaluations import cell_name, shown_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.words import counted, quoted
 
 AGENT = "agent"
 FOLDER = Path("baselines")  # in the working directory: names are looked up there

@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
-from restock.errors import RestockError, RunError
+from restock.errors import RestockError, RunError, counted, quoted
 from restock.replay.fleet.panel_difference import diff_panels
 from restock.replay.panel.panel import Panel
 from restock.stats import (
@@ -50,7 +50,6 @@ from restock.train.judge.comparability import (
 )
 from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run
-from restock.words import counted, quoted
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates

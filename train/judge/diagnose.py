@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from restock.errors import RestockError, RunError, expect
+from restock.errors import RestockError, RunError, counted, expect
 from restock.train.dqn.config import Polyak, TargetRule, apply_overrides, as_overrides, parse_config
 from restock.train.judge.before_training import RowDiagnosis, diagnose_before_training
 from restock.train.judge.comparability import refuse_dependent
@@ -39,7 +39,6 @@ from restock.train.prepare import prepare_new
 from restock.train.run.run import Run, check_free
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
-from restock.words import counted
 
 WINDOWS = 3  # the last, that figures are the median of
 _SETTLED_LAGS = 10  # updates, in mean ages of the target: then even a young critic's L is low

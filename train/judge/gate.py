@@ -19,9 +19,9 @@ from xml.etree import ElementTree
 
 import pyarrow as pa
 
-from restock.errors import ConfigError, RunError
+from restock.errors import ConfigError, RunError, counted, quoted
 from restock.files import read_json, write_table, write_text
-from restock.interrupts import interrupts_raised
+from restock.process import interrupts_raised
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.eval_run import (
     CLEAN,
@@ -48,7 +48,6 @@ from restock.train.twin.calibration.twin_gap import TwinGap, gap_folder, read_ga
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS, MISSIONS
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS
-from restock.words import counted, quoted
 
 Document = dict[str, Any]
 FOLDER = "gate"  # in a run

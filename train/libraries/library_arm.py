@@ -21,10 +21,9 @@ import msgspec
 
 from restock.errors import ConfigError, RestockError
 from restock.files import write_text
-from restock.imports import installed
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
-from restock.interrupts import kill_as_interrupt
+from restock.process import installed, kill_as_interrupt
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import Hard, NetworkConfig, TrainConfig, describe, load_config
 from restock.train.dqn.network import QNetwork

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 from restock.errors import ConfigError
 from restock.files import first_line, write_text
-from restock.imports import install_command, installed
+from restock.process import install_command, installed
 from restock.toml import by_path
 from restock.train.run.run import Run
 

@@ -20,11 +20,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from restock.errors import RunError
+from restock.errors import RunError, counted, quoted
 from restock.files import read_table, write_table
 from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_ratio, mean_over_strata, wilson
 from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
-from restock.words import counted, quoted
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run

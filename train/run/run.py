@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pyarrow as pa
 
-from restock.errors import RunError
+from restock.errors import RunError, quoted
 from restock.files import (
     expect_place,
     read_json,
@@ -37,7 +37,6 @@ from restock.files import (
     write_text,
 )
 from restock.train.run.run_tables import TABLES
-from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel

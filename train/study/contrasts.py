@@ -19,12 +19,11 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
-from restock.errors import RunError
+from restock.errors import RunError, counted
 from restock.stats import MIN_PAIRS, holm, nothing_varies, paired_t
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
 from restock.train.twin.missions import MISSIONS
-from restock.words import counted
 
 CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {  # what a measure may name
     **{

@@ -23,7 +23,7 @@ import numpy as np
 
 from restock.errors import RestockError, RunError
 from restock.files import write_text
-from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
+from restock.process import ended_with_us, interrupt_running, kill_as_interrupt
 from restock.replay.panel.build import plan_only
 from restock.stats import paired_t
 from restock.train.judge.compare import Comparison, compare

@@ -2,22 +2,23 @@
 
 A verb or job is a dataclass, `IngestCommand` for `restock ingest`: its docstring is the
 help, its fields are the flags, and `run()` does the work and returns an exit code. stdout is data,
-stderr is progress and messages.
+stderr is progress and messages. Both are written as they are: not UTF-8, on a full disk, or read by
+nobody any more.
 """
 
 from __future__ import annotations
 
+import codecs
 import importlib
+import io
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from typing import Any, NoReturn, TextIO, cast
 
-from restock.cli.streams import drop, substitute_what_cannot_be_shown, work_goes_on
-from restock.errors import ExitCode, RestockError
-from restock.imports import hidden, when_imported
-from restock.interrupts import kill_as_interrupt, was_interrupted
+from restock.errors import ConfigError, ExitCode, RestockError
+from restock.process import hidden, kill_as_interrupt, was_interrupted, when_imported
 
 # verb -> what it does, in the order of the work
 VERBS = {
@@ -290,3 +291,84 @@ def _complain(message: str) -> None:
     red = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
     name = "\x1b[1;31mrestock:\x1b[0m" if red else "restock:"
     sys.stderr.write(f"{name} {message}\n")
+
+
+def substitute_what_cannot_be_shown() -> None:
+    """Replace characters that a terminal or pipe cannot show, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            with suppress(OSError):  # a stream that became a pipe under Python's eyes
+                stream.reconfigure(errors=SUBSTITUTED)
+
+
+def _substituted(error: UnicodeError) -> tuple[str, int]:
+    """Replace lines and dots by ASCII, and other characters by their numbers, as JSON does."""
+    import json
+
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    text = error.object[error.start : error.end]
+    return "".join(_IN_ASCII.get(one) or json.dumps(one)[1:-1] for one in text), error.end
+
+
+SUBSTITUTED = "restock.substituted"
+_IN_ASCII = {"─": "-", "…": "...", "–": "-", "—": "-", "×": "x", "→": "->"}
+codecs.register_error(SUBSTITUTED, _substituted)
+
+
+@contextmanager
+def work_goes_on() -> Iterator[None]:
+    """While the block runs, a reader of stdout who goes away (`| head`) does not end the work.
+
+    Raises:
+        ConfigError: at the end, where stdout could not be written for another reason.
+    """
+    patient = _Patient(sys.stdout)
+    sys.stdout = cast(TextIO, patient)
+    try:
+        yield
+        patient.flush()
+    finally:
+        sys.stdout = patient.stream
+    if patient.failed is not None and not isinstance(patient.failed, BrokenPipeError):
+        raise ConfigError(
+            f"cannot be written: {patient.failed.strerror}; all else is done",
+            where="what it prints (stdout)",
+        ) from patient.failed
+
+
+class _Patient:
+    """A stream that drops what it is given once it cannot be written."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+        self.failed: OSError | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        self._do(lambda: self.stream.write(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+    def flush(self) -> None:
+        self._do(self.stream.flush)
+
+    def _do(self, print_: Callable[[], object]) -> None:
+        if self.failed is None:
+            try:
+                print_()
+            except OSError as error:
+                self.failed = error
+                drop(self.stream)
+
+
+def drop(stream: TextIO) -> None:
+    """Let what is still buffered, and all that follows, go nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)

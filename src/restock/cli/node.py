@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.words import quoted
+from restock.errors import quoted
 
 if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile

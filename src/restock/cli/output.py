@@ -13,8 +13,7 @@ from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
-from restock.errors import visible
-from restock.words import counted, quoted
+from restock.errors import counted, quoted, visible
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from restock.arrays import F64
-from restock.errors import ConfigError, StoreError
+from restock.errors import ConfigError, StoreError, counted
 from restock.ingest.task.robot import Robot
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
@@ -59,7 +59,6 @@ from restock.train.twin.calibration.open_loop import (
     whole_periods_s,
 )
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.words import counted
 
 Report = Callable[[str], None]
 

@@ -19,10 +19,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from restock.errors import ConfigError, RunError
+from restock.errors import ConfigError, RunError, quoted
 from restock.files import write_table, write_text
 from restock.stats import ConfidenceInterval
-from restock.words import quoted
 
 Rows = list[dict[str, Any]]
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from restock.arrays import F64, Bools
-from restock.errors import RecordingError, RestockError, StoreError
+from restock.errors import RecordingError, RestockError, StoreError, counted
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
@@ -45,7 +45,6 @@ from restock.train.twin.survey.poses import (
     candidate_poses,
     choose_poses,
 )
-from restock.words import counted
 
 TYPE = "nav_msgs/msg/OccupancyGrid"
 FREE_BELOW, OCCUPIED_ABOVE = 25, 65  # percent

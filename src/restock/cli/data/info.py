@@ -21,10 +21,8 @@ import tyro
 
 from restock import native
 from restock.cli.failures import GL, NO_GL
-from restock.errors import ExitCode, RecordingError, visible
-from restock.files import cores
-from restock.imports import install_command
-from restock.words import counted, quoted
+from restock.errors import ExitCode, RecordingError, counted, quoted, visible
+from restock.process import cores, install_command
 
 if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording

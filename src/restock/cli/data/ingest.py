@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RecordingError, RestockError, StoreError, visible
-from restock.words import counted
+from restock.errors import (
+    ConfigError,
+    ExitCode,
+    RecordingError,
+    RestockError,
+    StoreError,
+    counted,
+    visible,
+)
 
 if TYPE_CHECKING:
     from restock.ingest.prepared import IngestResult
@@ -86,8 +93,7 @@ class IngestCommand:
         from restock.cli import output
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.decoding.definitions import choose_definitions
-        from restock.ingest.store.compaction import fold_if_many
-        from restock.ingest.store.writer import StoreWriter
+        from restock.ingest.store.writer import StoreWriter, fold_if_many
 
         store = None if self.dry_run else self.store
         if store is not None:

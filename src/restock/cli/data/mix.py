@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import tyro
 
-from restock.errors import MixtureError
-from restock.words import counted, figure
+from restock.errors import MixtureError, counted, figure
 
 if TYPE_CHECKING:
     from restock.replay.plan.plan import PanelPlan

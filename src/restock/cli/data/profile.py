@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RecordingError, visible
+from restock.errors import ConfigError, ExitCode, RecordingError, counted, visible
 from restock.files import write_text
-from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from restock.errors import QueryError, StoreError
-from restock.interrupts import went_on_after_interrupt
+from restock.process import went_on_after_interrupt
 
 if TYPE_CHECKING:
     import duckdb

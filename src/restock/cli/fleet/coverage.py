@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ExitCode, visible
-from restock.words import figure, plural
+from restock.errors import ExitCode, figure, plural, visible
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
@@ -54,10 +53,10 @@ class CoverageCommand:
         """Ask, print, and write the page."""
         from restock.cli import output
         from restock.cli.command_line import refuse
+        from restock.errors import by_priority, uncertain_labels
         from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
-        from restock.words import by_priority, uncertain_labels
 
         if self.out is None:
             options, why = ("figures", "mixture", "every"), "applies only to the page"

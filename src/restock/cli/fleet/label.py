@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, LabelError
-from restock.words import quoted
+from restock.errors import ConfigError, ExitCode, LabelError, quoted
 
 if TYPE_CHECKING:
     from restock.ingest.relabel import Corrected, Relabelled

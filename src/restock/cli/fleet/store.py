@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode
-from restock.words import counted, quoted
+from restock.errors import ConfigError, ExitCode, counted, quoted
 
 if TYPE_CHECKING:
     from restock.ingest.prepared import Removed
@@ -48,8 +47,7 @@ class CompactCommand:
     def run(self) -> ExitCode:
         """Compact, and say what became of the files."""
         from restock.cli import output
-        from restock.ingest.store.compaction import compact
-        from restock.ingest.store.writer import StoreWriter
+        from restock.ingest.store.writer import StoreWriter, compact
 
         store = StoreWriter(self.store)
         store.expect_store()

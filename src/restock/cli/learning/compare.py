@@ -151,7 +151,7 @@ def _show(comparison: Comparison) -> None:
 
 
 def _check(check: Check, *, decides: bool) -> dict[str, Any]:
-    from restock.words import verdict_said
+    from restock.errors import verdict_said
 
     return {
         "check": check.name,

@@ -168,7 +168,7 @@ class EvalCommand:
 
     def _show(self, document: dict[str, Any]) -> None:
         from restock.cli.output import say
-        from restock.words import policy_words
+        from restock.errors import policy_words
 
         if (rows := document.get("results")) is not None:
             show_measures(rows)
@@ -189,9 +189,8 @@ class EvalCommand:
 
     def _evaluate_off_policy(self, logs: str) -> int:
         from restock.cli.output import print_json, progress, say
-        from restock.errors import ConfigError
+        from restock.errors import ConfigError, counted
         from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
-        from restock.words import counted
 
         if self.horizon is not None and self.horizon < 1:
             raise ConfigError(f"must be at least 1, got {self.horizon}", where="--horizon")
@@ -222,7 +221,7 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
     A table that is too wide is split, so that no measure is left out.
     """
     from restock.cli.output import print_parted, say
-    from restock.words import policy_words
+    from restock.errors import policy_words
 
     names = policy_words(row["policy"] for row in rows)
     for perturbation in dict.fromkeys(row["perturbation"] for row in rows):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.words import quoted
+from restock.errors import quoted
 
 if TYPE_CHECKING:
     from restock.replay.trace import trace as tracing

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.words import quoted
+from restock.errors import quoted
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
@@ -120,7 +120,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     """Train to the end; then flush the twin's episodes if a store is given."""
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
-    from restock.interrupts import went_on_after_interrupt
+    from restock.process import went_on_after_interrupt
     from restock.train.feed.fresh_log import flush
     from restock.train.loop import TrainingInterrupted, nothing_to_do, train
     from restock.train.run.run import resuming

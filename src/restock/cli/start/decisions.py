@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from restock.cli.start.outcomes import Document, of_nominal
 from restock.cli.start.stages import Settings, Stop
 from restock.cli.start.work import FOLDER, Ended
-from restock.errors import ConfigError, StoreError
+from restock.errors import ConfigError, StoreError, counted, quoted
 from restock.files import read_json
-from restock.words import counted, quoted
 
 if TYPE_CHECKING:
     from restock.cli.start.start import StartCommand

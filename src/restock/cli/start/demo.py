@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from restock.cli.start import stages
 from restock.cli.start.stages import Settings, Stage, fed_uniformly, from_logs_alone
 from restock.cli.start.work import Work, escape
-from restock.errors import ConfigError, ExitCode
+from restock.errors import ConfigError, ExitCode, policy_words, quoted
 from restock.stats import wilson
-from restock.words import policy_words, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console

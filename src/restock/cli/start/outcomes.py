@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from restock.errors import counted
 from restock.stats import interval_text
-from restock.words import counted
 
 Document = Mapping[str, Any]  # what a verb prints with --json; empty if it has not run
 ESTIMATORS = (

@@ -38,8 +38,7 @@ from restock.cli.start.decisions import (
 from restock.cli.start.outcomes import Document
 from restock.cli.start.stages import Settings, Stop
 from restock.cli.start.work import Ended, Work, escape
-from restock.errors import ConfigError, ExitCode, RecordingError
-from restock.words import counted, quoted
+from restock.errors import ConfigError, ExitCode, RecordingError, counted, quoted
 
 HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
 ODOMETRY = "--odometry-as-command"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.words import counted
+from restock.errors import counted
 
 if TYPE_CHECKING:
     from restock.ingest.task.robot import Robot

@@ -11,6 +11,7 @@ import altair as alt
 from markupsafe import Markup
 
 from restock import __version__
+from restock.errors import by_priority, counted, plural, uncertain_labels
 from restock.replay.fleet.drift import Drift
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
@@ -29,7 +30,6 @@ from restock.report.look.blocks import (
     statements,
     words,
 )
-from restock.words import by_priority, counted, plural, uncertain_labels
 
 MAX_DOTS = 1500
 MAX_CELLS_ACROSS = 90  # cells of the map along an axis

@@ -9,12 +9,12 @@ from typing import Any
 import altair as alt
 
 from restock import __version__
+from restock.errors import counted, plural
 from restock.replay.fleet.drift import OWN, Drift
 from restock.replay.store.definitions import UNITS
 from restock.replay.store.definitions import unit as unit_of
 from restock.report.look import charts
 from restock.report.look.blocks import MAX_ROWS, Figure, Rows, Section, Table, words
-from restock.words import counted, plural
 
 MAX_ROBOTS = 12  # in a chart: those with findings first
 MAX_PERIODS = 26  # the newest

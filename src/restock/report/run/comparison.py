@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 from typing import Any
 
 from restock import __version__
+from restock.errors import counted, verdict_said
 from restock.report.look import charts
 from restock.report.look.blocks import Figure, Rows, Section, Table, count, number, span, words
 from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
-from restock.words import counted, verdict_said
 
 MAX_NAMED = 3
 MAX_SETTINGS = 4  # differing settings that are named in a line

@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from restock.errors import RestockError
+from restock.errors import RestockError, counted, policy_words
 from restock.files import read_json
 from restock.report.look import charts, floor_map
 from restock.report.look.blocks import (
@@ -22,7 +22,6 @@ from restock.report.look.floor_map import SCALE, Box, FloorMap
 from restock.report.run.facts import CELL_M, Facts
 from restock.train.run.kept_evaluations import cell_name
 from restock.train.twin.floors.floors import open_floors
-from restock.words import counted, policy_words
 
 
 def floor_section(facts: Facts) -> Section | None:

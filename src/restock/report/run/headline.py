@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from restock.errors import RunError
+from restock.errors import RunError, quoted
 from restock.report.look.blocks import Rows, Section, Table, estimate, span, words
 from restock.report.run.facts import Facts, mean_success
 from restock.report.run.twin_gap import find_gap
 from restock.train.evaluation.regression import EVERY, read_run_evaluation, regression
 from restock.train.twin.calibration.twin_gap import TRUSTED
-from restock.words import quoted
 
 BASELINES = {
     "planner": "the planner",

@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
+from restock.errors import counted, policy_words
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Figure,
@@ -24,7 +25,6 @@ from restock.report.run.floor import films_section, floor_section
 from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
 from restock.stats import interval_text, wilson
-from restock.words import counted, policy_words
 
 
 def page(facts: Facts) -> dict[str, Any]:

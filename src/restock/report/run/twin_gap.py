@@ -11,7 +11,7 @@ from typing import Any
 import altair as alt
 
 from restock import __version__
-from restock.errors import RestockError
+from restock.errors import RestockError, counted
 from restock.report.look import charts
 from restock.report.look.blocks import (
     MAX_ROWS,
@@ -36,7 +36,6 @@ from restock.train.twin.calibration.twin_gap import (
     TwinGap,
     read_gap,
 )
-from restock.words import counted
 
 COLOURS = {
     "nominal twin": "#b45309",
