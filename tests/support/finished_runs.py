@@ -66,7 +66,7 @@ def make_run(
                 {
                     **clocks,
                     "source": "logs",
-                    "stratum": stratum,
+                    "stratum": "all",
                     "condition": stratum,
                     "episode": [f"a/{key}" for key in range(50)],
                     "drawn_rows": round(1000 * share),

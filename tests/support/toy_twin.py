@@ -61,6 +61,9 @@ class ToyTwin:
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
         self._fixed, self._taken = list(specs), 0
 
+    def set_conditions(self, conditions: Mapping[str, float]) -> None:
+        self._names, self._shares = list(conditions), np.array(list(conditions.values()))
+
     def _next(self, place: int) -> EpisodeSpec:
         self.number[place] = -1
         if self._fixed and self._taken < len(self._fixed):

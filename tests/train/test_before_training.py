@@ -34,7 +34,6 @@ from restock.train.judge.before_training import (
     drive_twin,
     gap_evidence,
     open_rows,
-    unlike_recordings,
     untrusted,
 )
 from restock.train.judge.causes import findings
@@ -235,14 +234,6 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(
     assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
 
 
-def test_short_recordings_of_one_group_are_not_compared_with_all_rows(logs: FedRows) -> None:
-    some = logs.take(logs.episode < 4)
-    few = replace(some, recording=some.episode.astype(str))
-    found, (compared,) = unlike_recordings(few, None)
-    assert (found, compared.status) == ([], "not run")
-    assert compared.note == "there are no two groups of recordings with 500 rows"
-
-
 def test_a_lidar_whose_ranges_are_scaled_is_named(logs: FedRows, twin: FedRows) -> None:
     names = logs.task.observation_names
     sectors = [
@@ -281,16 +272,6 @@ def test_half_of_the_rows_swapped_is_seen(logs: FedRows, twin: FedRows) -> None:
 def test_rows_that_say_little_are_not_called_healthy(logs: FedRows, twin: FedRows) -> None:
     few = logs.take(np.arange(len(logs)) < 200)
     assert diagnose_rows(few, twin).verdict != "HEALTHY"
-
-
-@pytest.mark.long
-def test_rows_of_which_some_episodes_never_change_can_be_judged(
-    logs: FedRows, twin: FedRows
-) -> None:
-    """Of a part of these rows, a bootstrap draw had no change at all: a singular matrix."""
-    for first in range(0, 1000, 100):
-        part = np.arange(first, first + 200)
-        assert diagnose_rows(logs.take(np.isin(np.arange(len(logs)), part)), twin).comparisons
 
 
 def test_one_episode_without_spread_is_not_a_broken_sensor(logs: FedRows, twin: FedRows) -> None:

@@ -19,7 +19,6 @@ from restock.ingest.profile.profile import (
     load_profile,
     profile_toml,
     read_profile_toml,
-    with_conditions,
 )
 from restock.ingest.profile.tables import CustomSignal
 from restock.replay.panel.panel import Panel
@@ -118,11 +117,6 @@ def test_a_trace_reads_the_messages_by_the_carried_profile(
     assert traced["notes"] == []
 
 
-def test_another_task_than_the_panels_is_refused(folder: Path) -> None:
-    with pytest.raises(PanelError, match="leave out `profile` in the config"):
-        prepare_new(folder / "other", folder / "panel", None, [*TINY, "profile=warehouse_amr"])
-
-
 def test_mix_says_which_of_two_profiles_a_panel_carries(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -160,11 +154,6 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(
     assert "--set profile=mine.toml" in error.value.remedy
 
 
-def test_a_panel_without_the_text_needs_the_file_as_before(folder: Path) -> None:
-    with pytest.raises(PanelError, match=r"no shipped profile has this task\n"):
-        profile_of_panel(carrying(folder, ""))
-
-
 @settings(max_examples=12)
 @given(
     doc=st.text(),
@@ -179,12 +168,3 @@ def test_a_profile_comes_back_from_its_text_as_it_was(
         load_profile("warehouse_amr"), signals={"voltage_v": signal}, doc=doc
     )
     assert read_profile_toml(profile_toml(profile), where="test") == profile
-
-
-def test_conditions_that_come_with_restock_go_by_their_names() -> None:
-    profile = load_profile("warehouse_amr")
-    assert with_conditions(profile, profile.definitions) == profile
-    other = msgspec.structs.replace(profile.conditions[0], sql="false")
-    changed = with_conditions(profile, [other])
-    assert (changed.shipped_conditions, changed.own_conditions) == ([], [other])
-    assert changed.hash == profile.hash

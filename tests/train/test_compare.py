@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.finished_runs import UPDATES, document, make_run
-from support.toy_run import config, run_to_end
-from support.toy_run import logs as toy_logs
 
 from restock.cli import main
-from restock.train.feed.logs import Coded, Logs
-from restock.train.judge.compare import diff_runs
-from restock.train.run.run import FORMAT, Run
+from restock.train.run.run import Run
 
 EXTRA = ("update_path",)
 
@@ -56,14 +49,6 @@ def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
     assert slip["improvement"] > 0.7
 
 
-def test_no_difference_has_an_interval_around_zero(tmp_path, capsys) -> None:
-    first = arm(tmp_path, "a", range(3))
-    second = arm(tmp_path, "b", range(3, 6), config__network__layer_norm=False)
-    _, found = compared(capsys, first, second)
-    for row in found["outcomes"]:
-        assert row["difference_low"] < 0 < row["difference_high"]
-
-
 @pytest.mark.parametrize(
     ("changes", "setting"),
     [
@@ -83,15 +68,6 @@ def test_what_the_treatment_does_not_name_may_not_differ(tmp_path, capsys, chang
     assert found["outcomes"] == []
 
 
-@pytest.mark.long
-def test_the_target_rule_is_compared_when_it_is_the_treatment(tmp_path, capsys) -> None:
-    first = arm(tmp_path, "a", range(3))
-    second = arm(tmp_path, "b", range(3, 6), config__target__tau=0.1)
-    assert compared(capsys, first, second, "--treatment", "target")[0] == 0
-    third = arm(tmp_path, "c", range(3), config__target__tau=0.1, config__optimizer__lr=1)
-    assert compared(capsys, first, third, "--treatment", "target")[0] == 1
-
-
 def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
     second = arm(tmp_path, "b", range(3, 6), slip_share=0.15)
@@ -105,61 +81,6 @@ def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) ->
     assert "share of logs/wheel_slip" in failed
     code, found = compared(capsys, first, second, "--treatment", "mixture")
     assert (code, found["verdict"]) == (0, "comparable")
-
-
-def logs_by(unit: str) -> Logs:
-    """Return steps of 20 episodes, three of which slip.
-
-    Strata are by the condition of steps, or of episodes: that of a whole episode if a step of it
-    slips.
-    """
-    logs, episodes = toy_logs(), np.arange(200) // 10
-    slips = np.zeros(200, np.bool_)
-    slips[[3, 57, 58, 121]] = True
-    of_stratum = slips if unit == "step" else np.isin(episodes, episodes[slips])
-    return dataclasses.replace(
-        logs,
-        stratum_rows=[np.flatnonzero(~of_stratum), np.flatnonzero(of_stratum)],
-        shares=np.array([1 - of_stratum.mean(), of_stratum.mean()]),
-        condition=Coded.of(pa.chunked_array([np.where(slips, "wheel_slip", "nominal").tolist()])),
-        episode=Coded.of(pa.chunked_array([[f"a/{key}" for key in episodes]])),
-    )
-
-
-def test_conditions_are_compared_whatever_the_strata_of_that_name_are(tmp_path, capsys) -> None:
-    paths = [tmp_path / unit for unit in ("step", "episode")]
-    for seed, path in enumerate(paths):
-        run_to_end(path, config(schedule={"env_steps": 800}), logs=logs_by(path.name))
-        shares = {"nominal": 0.98 - 0.13 * seed, "wheel_slip": 0.02 + 0.13 * seed}
-        forecast = [{"stratum": name, "wanted_share": share} for name, share in shares.items()]
-        panel = {"panel__id": path.name, "panel__strata": shares, "panel__forecast": forecast}
-        whole = document(seed, **panel) | {"format": FORMAT}
-        (path / "config.json").write_text(json.dumps(whole), "utf-8")
-
-    def slipping(column: str) -> list[int]:
-        """Return the logged rows that either run drew."""
-        counts = []
-        for path in paths:
-            fed = Run.open(path).table("sampled_episodes").to_pylist()
-            logged = (row for row in fed if row["source"] == "logs" and row[column] == "wheel_slip")
-            counts.append(sum(row["drawn_rows"] for row in logged))
-        return counts
-
-    by_step, by_episode = slipping("stratum")
-    assert by_episode > 7 * by_step  # of one name, and not the same
-    code, found = compared(capsys, *([str(path)] for path in paths), "--treatment", "mixture")
-    assert code == 0
-    assert [difference["setting"] for difference in found["differences"]] == ["panel.id"]
-    (check,) = [c for c in found["checks"] if c["name"] == "share of logs/wheel_slip"]
-    drawn = slipping("condition")
-    assert check["value"] == pytest.approx(max(drawn) / min(drawn))
-    assert check["value"] < 1.25
-    (fed,) = [
-        row
-        for row in diff_runs(*paths)["fed"]
-        if (row["source"], row["condition"]) == ("logs", "wheel_slip")
-    ]
-    assert [fed["drawn_a"], fed["drawn_b"]] == drawn
 
 
 def test_replay_and_practice_may_differ_together_where_the_data_are_the_treatment(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -60,13 +59,6 @@ def test_the_area_is_between_the_least_and_the_most(values: list[float], level: 
     found = area(steps, np.array(values))
     assert min(values) - 1e-9 <= found <= max(values) + 1e-9
     assert area(steps, np.full(len(values), level)) == pytest.approx(level)
-
-
-def test_the_area_by_hand() -> None:
-    steps, values = np.array([0.0, 10.0, 30.0]), np.array([0.0, 1.0, 0.5])
-    assert area(steps, values) == pytest.approx((5 + 15) / 30)
-    assert area(steps, values, (5.0, 20.0)) == pytest.approx((3.75 + 8.75) / 15)
-    assert np.isnan(area(steps[:1], values[:1]))
 
 
 def test_blocked_aisles_count_by_half_each_whatever_was_drawn(tmp_path: Path) -> None:
@@ -165,34 +157,6 @@ def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: P
     for text in (page, html):
         assert "Treatment: mixture; what differs: replay.logs_share." in text
         assert "The primary contrast was named before the runs" in text
-
-
-def two_seeds(tmp_path: Path) -> dict[str, Any]:
-    """Of a study without a primary contrast, whose arms differ alike in both seeds."""
-    plan = study(tmp_path, STUDY.replace("[0, 1, 2, 3]", "[0, 1]").replace(PRIMARY, ""))
-    for job in plan.jobs:
-        level = 0.3 + 0.4 * job.seed + (0.1 if job.arm.name == "quotas" else 0.0)
-        make_run(job.path, document(job.seed), success=level)
-        add_evaluation(job.path, driven("agent", level, 12.0))
-        job.done.write_text(plan.fingerprint(job))
-    one, other = plan.study.arms
-    return findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
-
-
-def test_of_two_seeds_there_are_values_alone_and_the_pages_say_why(tmp_path: Path) -> None:
-    found = two_seeds(tmp_path)
-    (row,) = [row for row in found["contrasts"] if row["measure"] == "success_rare"]
-    assert row["difference"] == pytest.approx(0.1)
-    assert [row[name] for name in ("low", "high", "p", "p_holm")] == [None] * 4
-    for arm in found["arms"]:
-        assert all(value[1:] == [None, None] for value in arm.values() if isinstance(value, list))
-    html = write_study_page(found, tmp_path / "study.html").read_text(encoding="utf-8")
-    for page in ((tmp_path / "study.md").read_text(encoding="utf-8"), html):
-        assert "no interval: 2 seeds, at least 3 are needed" in page
-        assert "named before the runs; p" not in page
-        assert "None of these contrasts was named as primary before the runs" in page
-        assert "&lt; .001" not in page
-        assert "< .001" not in page
 
 
 def test_an_interval_of_an_arm_stays_in_the_range_of_its_measure(tmp_path: Path) -> None:

@@ -22,15 +22,6 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.missions import KINDS
 
 
-@pytest.mark.parametrize("policy", ["run:", "onnx:", "supervisor"])
-def test_an_unknown_policy_is_refused(
-    policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = kept_run(tmp_path / "a")
-    assert main(["eval", str(run), "--policies", policy, "--dry-run"]) == 2
-    assert f"there is no {policy!r}" in capsys.readouterr().err
-
-
 def test_a_policy_of_another_task_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,24 +77,6 @@ def test_what_was_recorded_is_shown_again_or_its_lack_is_said(
     assert "1 of 1 episodes" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("seed", [-1, 2**31 - 20, 10**20])
-def test_seeds_that_no_generator_takes_are_refused(
-    seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = kept_run(tmp_path / "a")
-    assert main(["eval", str(run), "--dry-run", "--seed", str(seed), "--episodes", "21"]) == 2
-    assert "must be from 0 to 2147483627 (21 seeds" in capsys.readouterr().err
-
-
-def test_a_kind_of_episode_that_is_named_twice_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = kept_run(tmp_path / "a")
-    requested = ["--episodes", "nominal=2, wheel_slip=1,nominal=3", "--dry-run"]
-    assert main(["eval", str(run), *requested]) == 2
-    assert "--episodes: names 'nominal' twice" in capsys.readouterr().err
-
-
 @pytest.mark.long
 def test_evaluations_add_up_and_the_newest_floors_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -139,18 +112,6 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(
     capsys.readouterr()
     assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_episodes", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [{"n": 10}]
-
-
-def test_what_an_earlier_restock_evaluated_is_still_shown(tmp_path: Path) -> None:
-    run = kept_run(tmp_path / "a")
-    assert shown_evaluation(run)[0].num_rows == 0
-    names = [name for name in EVAL_EPISODES.names if name not in ("version", "layouts")]
-    row = {"policy": "agent", "condition": "nominal", "episode_seed": 3, "success": True}
-    schema = pa.schema([EVAL_EPISODES.field(name) for name in names])
-    write_table(pa.Table.from_pylist([row], schema=schema), run / "eval" / "episodes.parquet")
-    shown, said = shown_evaluation(run)
-    assert shown.num_rows == 1
-    assert "floors not named, policy not named, seeds 3 to 3" in said
 
 
 def test_references_drive_the_same_missions(

@@ -14,16 +14,12 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.report.run.floor import films_section
-from restock.train.evaluation import film
 from restock.train.evaluation.eval_run import (
-    EvaluationPlan,
     drive_evaluation,
-    make_policy,
     plan_evaluation,
 )
 from restock.train.evaluation.film import RESCUE, WORST, differing_fields, drive_again, scenes
 from restock.train.run.kept_evaluations import FILE, read_evaluations
-from restock.train.twin.env.interface import Policy
 
 KINDS = "wheel_slip=2,blocked_aisle=1"
 
@@ -101,37 +97,3 @@ def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(
     (run / "eval" / "films" / "films.json").write_text("{}")
     assert films_section(cast(Any, facts)) is None
     assert "could not be read" in facts.missing[0]
-
-
-@pytest.mark.long
-def test_a_rescue_shows_who_failed_beside_who_arrived(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The planner, as if it were the agent, beside a network that fails, as another run's."""
-    path = kept_run(tmp_path / "run")
-    plan = plan_evaluation(path, policies=("agent", "planner"), episodes="nominal=1")
-    drive_evaluation(plan)
-    table = read_evaluations(path)
-    rows = table.to_pylist()
-    version = next(row["version"] for row in rows if row["policy"] == "agent")
-    swapped = {"agent": "run:out/before", "planner": "agent"}
-    for row in rows:
-        row |= {"policy": swapped[row["policy"]], "version": version}
-    pq.write_table(table.from_pylist(rows, schema=table.schema), path / FILE)
-    drivers = {"run:out/before": "agent", "agent": "planner"}
-
-    def driver(name: str, plan: EvaluationPlan) -> Policy:
-        policy = make_policy(drivers[name], plan)
-        policy.version = version
-        return policy
-
-    monkeypatch.setattr(film, "make_policy", driver)
-    paths, missing = film.film_evaluation(plan)
-    assert [file.name for file in paths] == ["nominal-rescue.webp"]
-    assert missing == []
-    alone = len(film.drive_again(plan, next(r for r in rows if r["policy"] == "agent"))[1])
-    with Image.open(paths[0]) as shown:
-        assert shown.width > 1.9 * shown.height  # two floors of 12 x 9 m, about
-        assert getattr(shown, "n_frames", 1) == min(film.MAX_FRAMES, max(alone, 2))
-    (document,) = json.loads((path / film.FOLDER / film.DOCUMENT).read_text())["films"]
-    assert document["rescued_from"] == "run:out/before"

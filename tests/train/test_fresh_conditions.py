@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import duckdb
@@ -10,11 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.toy_run import config, run_to_end, session, tables
+from support.toy_run import config, run_to_end, tables
 from support.toy_twin import TASK
 
 from restock.train.feed.fresh_log import NEVER, WAITING, EpisodeLabels
-from restock.train.loop import TrainingInterrupted, train
 from restock.train.session import Session
 
 # Every batch is audited, so that the sums can be counted from the audited rows.
@@ -145,26 +143,6 @@ def test_actions_are_counted_with_what_the_policy_wants(live: Session) -> None:
         " GROUP BY gradient_steps, source, stratum, condition)",
     )
     assert shares["off"] < 1e-9
-
-
-def test_waiting_rows_are_written_on_interrupt_and_taken_back(
-    live: Session, tmp_path: Path
-) -> None:
-    calls = iter(range(200))
-    cut = session(tmp_path / "cut", config(**EVERY_BATCH))
-    with pytest.raises(TrainingInterrupted):
-        train(cut, stop=lambda: next(calls, None) is None)
-    cut.close()
-    count = "SELECT sum(drawn_rows)::BIGINT AS n FROM strata"
-    assert rows(cut, count) == rows(
-        cut, f"SELECT (sum(updates) * {cut.config.replay.batch_size})::BIGINT AS n FROM progress"
-    )
-    again = session(tmp_path / "cut", config(**EVERY_BATCH), resume=True)
-    train(again)
-    again.close()
-    whole = tables(live.run.path)
-    for name, table in tables(again.run.path).items():
-        assert table.equals(whole[name]), name
 
 
 @given(st.data())

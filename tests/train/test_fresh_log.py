@@ -22,8 +22,6 @@ from restock.ingest.store.manifest import definitions
 from restock.ingest.store.transitions import episode_ends
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS
-from restock.replay.mixture.mixture import load_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.collector import Collector, ring_conditions
 from restock.train.feed.fresh_log import (
@@ -244,25 +242,6 @@ def episodes_of(rows: pa.Table, profile: Profile) -> list[FreshEpisode]:
             )
         )
     return episodes
-
-
-def test_a_panel_can_be_mixed_from_it(collecting: Collecting, tmp_path: Path) -> None:
-    flush(collecting.folder, StoreWriter(tmp_path / "store"), collecting.profile)
-    with restock.open(tmp_path / "store") as store:
-        panel = build_panel(store, load_mixture("uniform"), tmp_path / "panel")
-    assert len(panel) >= ENVS * LONGEST
-    assert panel.task == collecting.profile.task
-
-
-def test_ends_of_episodes_are_kept_for_labels_that_look_ahead(
-    collecting: Collecting, tmp_path: Path
-) -> None:
-    writer = StoreWriter(tmp_path / "store")
-    done = flush(collecting.folder, writer, collecting.profile)
-    (manifest,) = writer.live(done.recording_id).to_pylist()
-    ends = episode_ends(writer.rows(done.recording_id, manifest["ingest_id"]))
-    assert ends is not None
-    assert ends["step_index"].to_pylist() == [LONGEST] * 2 * ENVS
 
 
 def test_the_same_episodes_are_flushed_once(collecting: Collecting, tmp_path: Path) -> None:

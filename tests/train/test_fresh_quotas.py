@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.panels import by_priority
 from support.stores import CONDITIONS, EXPOSURES, recording_transitions
-from support.toy_run import assert_same_run, config, run_to_end, session
+from support.toy_run import config, run_to_end, session
 from support.toy_twin import CONDITIONS as TOY_CONDITIONS
 from support.toy_twin import TASK as TOY_TASK
 
@@ -29,7 +29,7 @@ from restock.replay.store.audit import load_audits, load_thresholds
 from restock.train.dqn.config import TrainConfig
 from restock.train.feed.collector import FreshStrata
 from restock.train.feed.logs import Logs
-from restock.train.loop import TrainingInterrupted, time_left, train
+from restock.train.loop import time_left
 from restock.train.prepare import refuse_short_budget
 from restock.train.resolve import planned_draws
 from restock.train.run.replay_audit import fed_shares, shortfalls
@@ -155,22 +155,6 @@ def test_a_run_is_fed_its_quotas_from_logs_and_ring(panel: Panel, tmp_path: Path
     assert {row["stratum"] for row in fresh} >= {"nominal", "wheel_slip"}
     # Whole episodes: a row of the stratum need not slip itself.
     assert {row["condition"] for row in fresh if row["stratum"] == "wheel_slip"} >= {"nominal"}
-
-
-@pytest.mark.parametrize("stop_after", [40, 230])
-def test_a_run_that_fills_quotas_resumes_bit_for_bit(
-    panel: Panel, tmp_path: Path, stop_after: int
-) -> None:
-    whole = run_to_end(tmp_path / "whole", SETTINGS, logs=fed_by(panel))
-    requested = iter(range(stop_after))
-    live = session(tmp_path / "cut", SETTINGS, logs=fed_by(panel))
-    with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: next(requested, None) is None)
-    live.close()
-    again = session(tmp_path / "cut", SETTINGS, logs=fed_by(panel), resume=True)
-    train(again)
-    again.close()
-    assert_same_run(whole, again)
 
 
 def audited(run: Path) -> list[dict[str, Any]]:

@@ -83,13 +83,6 @@ def test_other_tables(rows: torch.Tensor) -> None:
     assert same(gather_rows(rows, index), rows, index)
 
 
-def test_gradients_flow_where_they_are_asked_for() -> None:
-    rows = torch.ones(4, 2, requires_grad=True)
-    gather_rows(rows, torch.tensor([1, 1, 3])).sum().backward()
-    assert rows.grad is not None
-    assert rows.grad[:, 0].tolist() == [0.0, 2.0, 0.0, 1.0]
-
-
 def wrong(rows: torch.Tensor, index: torch.Tensor, _: torch.Tensor) -> tuple[torch.Tensor]:
     return (rows[index].bfloat16().float(),)
 

@@ -126,15 +126,6 @@ def test_the_clocks_of_dqn_are_the_configs() -> None:
     assert (given["train_freq"], given["gradient_steps"]) == (5, 1)
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [],
-)
-def test_settings_without_a_counterpart_are_refused(setting: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        resolve((setting,), "sb3-dqn")
-
-
 def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(ConfigError, match="pip install stable-baselines3"):

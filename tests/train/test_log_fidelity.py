@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from restock.train.feed.logs import LogFidelity, Probe, discriminant
+from restock.train.feed.logs import LogFidelity, Probe
 
 SIZE, ROWS = 12, 200
 CONDITIONS = ["nominal", "wheel_slip", "blocked_aisle"]
@@ -72,16 +72,3 @@ def test_conditions_of_few_rows_are_not_judged() -> None:
     assert set(logs.unexplained) == {"nominal", "wheel_slip"}
     assert set(logs.agreement(probe(levels(1)))) == {"nominal", "wheel_slip"}
     assert logs.agreement(probe([nominal])) == {}
-
-
-def test_the_discriminant_takes_covariance_into_account() -> None:
-    """Two classes that differ along a direction of little spread, beside one of much."""
-    rng = np.random.default_rng(0)
-    spread = np.array([[3.0, 0.0], [2.9, 1.0]])  # the second follows the first but for a little
-    first, second = (
-        rng.normal(size=(500, 2)) @ spread.T + np.array([0.0, offset]) for offset in (-2.0, 2.0)
-    )
-    said = discriminant([first[:250], second[:250]], np.concatenate([first[250:], second[250:]]))
-    assert min((said[:250] == 0).mean(), (said[250:] == 1).mean()) > 0.93
-    by_height = np.concatenate([first[250:], second[250:]])[:, 1] > 0
-    assert by_height[250:].mean() < 0.85  # what the nearer mean would say

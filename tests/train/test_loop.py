@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -12,21 +14,21 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from support.long import one_in
-from support.toy_run import SMALL, assert_same_run, config, logs, run_to_end, session
+from support.toy_run import assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
 from restock.cli.learning.train import no_update
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
+from restock.train import session as session_module
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.evaluate import EpisodeResult, EvaluationBuffer, fixed_episodes
+from restock.train.evaluation.evaluate import EvaluationBuffer, fixed_episodes
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.feed.batches import LogTerms
 from restock.train.feed.logs import Coded, Logs
 from restock.train.loop import TrainingInterrupted, nothing_to_do, train
 from restock.train.run import checkpoint
-from restock.train.run.checkpoint import earlier, go_back
+from restock.train.run.checkpoint import earlier
 from restock.train.run.run import Run
 from restock.train.session import Session
 
@@ -63,38 +65,20 @@ def test_run_out_of_time_still_makes_an_interval_of_updates(
     assert (live.progress.env_steps == 0) == with_logs
 
 
-def test_run_drives_for_half_of_its_time(tmp_path: Path) -> None:
+def test_run_drives_for_half_of_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a robot of few logs and a slow twin ends with a policy that never drove in it."""
-    settings = config(schedule={"seconds": 1.0, "offline_updates": 10**6, "env_steps": 10**6})
-    live = run_to_end(tmp_path / "a", settings)
-    assert live.progress.driving_from_s is not None
+    seconds = count(step=0.01)  # by a clock that each look moves on
+    monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
+    settings = config(schedule={"seconds": 3.0, "offline_updates": 10**6, "env_steps": 10**6})
+    live = session(tmp_path / "a", settings)
+    live._started = 0.0
+    train(live)
+    live.close()
+    assert live.progress.driving_from_s == pytest.approx(1.5, abs=0.1)
     assert live.progress.env_steps > 0
     assert live.learner.gradient_steps < 10**6
     # The evaluation after it is in the budget too.
     assert live.progress.planned_env_steps < 10**6
-
-
-@pytest.mark.long  # test_algorithms has the shorter ones
-def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> None:
-    """Rows of a corridor that never slips: Q of the logged actions is known in closed form."""
-    shelf = logs(600)
-    keep = shelf.condition.codes == shelf.condition.names.index("nominal")
-    live = session(
-        tmp_path / "a",
-        config(schedule={"offline_updates": 3000, "env_steps": 0}),
-        logs=one_stratum(shelf, stratum_rows=[np.flatnonzero(keep)], shares=np.ones(1)),
-    )
-    train(live)
-    live.close()
-    value = np.zeros(CELLS)  # of the state; the last cell is terminal
-    for cell in range(CELLS - 2, -1, -1):
-        value[cell] = 1.0 if cell == CELLS - 2 else -0.05 + 0.9 * value[cell + 1]
-    cells = torch.zeros(CELLS - 1, TASK.observation_size)
-    cells[torch.arange(CELLS - 1), torch.arange(CELLS - 1)] = 1
-    q = live.learner.network(cells).detach().numpy()
-    back = np.array([-0.05 + 0.9 * value[max(cell - 1, 0)] for cell in range(CELLS - 1)])
-    stop = -0.05 + 0.9 * value[: CELLS - 1]
-    np.testing.assert_allclose(q, np.stack([stop, value[: CELLS - 1], back], axis=1), atol=0.04)
 
 
 def one_stratum(shelf: Logs, **changes: Any) -> Logs:
@@ -102,104 +86,8 @@ def one_stratum(shelf: Logs, **changes: Any) -> Logs:
     return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
 
 
-def test_the_same_seed_gives_the_same_run(undisturbed: Session, tmp_path: Path) -> None:
-    assert_same_run(undisturbed, run_to_end(tmp_path / "again", config()))
-
-
 def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_path: Path) -> None:
     assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config(env={"overlap": False})))
-
-
-@pytest.mark.parametrize("calls", one_in(4, [20, 61, 150, 333]))
-def test_interrupted_and_resumed_is_bit_exact(
-    undisturbed: Session, tmp_path: Path, calls: int
-) -> None:
-    requested = iter(range(calls))
-    path = tmp_path / "a"
-    live = session(path, config())
-    with pytest.raises(TrainingInterrupted, match="restock train --resume"):
-        train(live, stop=lambda: next(requested, None) is None)
-    live.close()
-
-    again = session(path, config(), resume=True)
-    train(again)
-    again.close()
-    assert_same_run(undisturbed, again)
-
-
-@pytest.mark.parametrize("evaluation", one_in(3, [2, 1, 3]))
-def test_an_evaluation_is_abandoned_and_made_by_the_resumed_run(
-    undisturbed: Session, tmp_path: Path, evaluation: int
-) -> None:
-    """After the logs, among online updates, and at the end."""
-    path = tmp_path / "a"
-    live = session(path, config())
-    steps = iter(range(4))
-    begun, drive = [], live.evaluation_buffer.drive
-
-    def driving(*args: Any, **kwargs: Any) -> list[EpisodeResult]:
-        begun.append(live.progress.env_steps)
-        return drive(*args, **kwargs)
-
-    live.evaluation_buffer.drive = driving  # type: ignore[method-assign]
-    with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: len(begun) == evaluation and next(steps, None) is None)
-    live.close()
-    assert len(begun) == evaluation
-    assert live.progress.env_steps == begun[-1] == [0, 800, 1600][evaluation - 1]
-    evaluated = pq.read_table(path / "evaluations.parquet")["env_steps"].unique().to_pylist()
-    assert evaluated == begun[:-1]
-
-    again = session(path, config(), resume=True)
-    train(again)
-    again.close()
-    assert_same_run(undisturbed, again)
-
-
-def test_killed_after_a_checkpoint_and_resumed_is_bit_exact(
-    undisturbed: Session, tmp_path: Path
-) -> None:
-    class Killed(Exception):
-        pass
-
-    path = tmp_path / "a"
-    live = session(path, config())
-    rows = iter(range(6))
-
-    def kill(event: str, values: dict[str, Any]) -> None:
-        if event == "progress" and next(rows, None) is None:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(live, notify=kill)
-    live.close()
-    assert 0 < checkpoint.load(live.run.latest)["progress"]["env_steps"] < live.progress.env_steps
-    again = session(path, config(), resume=True)
-    train(again)
-    again.close()
-    assert_same_run(undisturbed, again)
-
-
-@pytest.mark.long
-def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_path: Path) -> None:
-    path = tmp_path / "run"
-    live = run_to_end(path, config())
-    kept = earlier(live.run.latest)
-    steps = live.config.record.checkpoint_every_env_steps
-    end = live.progress.env_steps
-    assert list(kept) == [(end - 1) // steps * steps - steps, (end - 1) // steps * steps]
-    with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
-        go_back(live.run.latest, 7)
-    live.run.latest.write_bytes(b"half a file")
-    with pytest.raises(RunError, match=f"use an earlier one: --from-env-steps {max(kept)}"):
-        session(path, config(), resume=True)
-    go_back(live.run.latest, min(kept))
-    assert earlier(live.run.latest) == {}
-    again = session(path, config(), resume=True)
-    assert again.progress.env_steps == min(kept)
-    train(again)
-    again.close()
-    assert_same_run(undisturbed, again)
 
 
 def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
@@ -394,27 +282,6 @@ def test_warmup_collects_without_learning(
     assert "schedule.warmup_env_steps=400" in said
 
 
-def test_a_run_whose_updates_were_all_on_the_logs_says_so(tmp_path: Path) -> None:
-    settings = config(schedule={"env_steps": 40, "warmup_env_steps": 400, "offline_updates": 5})
-    live = session(tmp_path / "a", settings, logs=logs())
-    outcome = train(live)
-    live.close()
-    assert outcome.gradient_steps == 5
-    said = no_update(outcome, settings)
-    assert said is not None
-    assert said.startswith("no update was made in 40 environment steps, so the policy is that of")
-    assert no_update(dataclasses.replace(outcome, env_steps=0), settings) is None
-
-
-def test_updates_in_the_twin_are_counted_apart(tmp_path: Path) -> None:
-    settings = config(schedule={"env_steps": 600, "offline_updates": 10_000})
-    live = session(tmp_path / "a", settings, logs=None)
-    outcome = train(live)
-    live.close()
-    assert 0 < outcome.online_updates == outcome.gradient_steps < 10_000
-    assert no_update(outcome, settings) is None
-
-
 def test_resumed_run_says_that_its_budget_is_used_up(undisturbed: Session, tmp_path: Path) -> None:
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
 
@@ -474,19 +341,6 @@ def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
     assert undisturbed.learner.gradient_steps == 60 + progress.online_updates
 
 
-def test_a_learner_fits_a_batch_it_sees_again_and_again() -> None:
-    learner = Learner(config(), TASK.observation_size, 3)
-    rows = logs().rows[:32].clone()
-    rows[:, -1] = 0  # terminal: the target is the reward
-    for _ in range(400):
-        loss = learner.update(rows)
-    assert float(loss.td.abs().max()) < 0.9
-    expected = rows[:, -2]
-    td, q, _ = learner.td_error(rows)
-    chosen = q.gather(1, rows[:, -3:-2].long()).squeeze(1)
-    assert torch.allclose(td, chosen - expected, atol=1e-5)
-
-
 def test_the_policy_that_is_kept_is_an_average_of_the_weights() -> None:
     rows = logs().rows[:32].clone()
     for rate in (1.0, 0.25):
@@ -528,21 +382,6 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
     assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
 
 
-def spoilt(live: Session, at: int) -> Any:
-    """Return a `stop` that makes the policy stand still from an environment step on."""
-
-    def stop() -> bool:
-        if live.progress.env_steps >= at and not getattr(stop, "done", False):
-            stop.done = True  # type: ignore[attr-defined]
-            for network in (live.learner.network, live.learner.policy_network):
-                with torch.no_grad():
-                    network.advantage.weight.zero_()
-                    network.advantage.bias.copy_(torch.tensor([50.0, -50.0, -50.0]))
-        return False
-
-    return stop
-
-
 def test_the_margin_is_for_rows_of_the_named_policy() -> None:
     shelf = logs()
     operator = shelf.behaviour_policy.codes == shelf.behaviour_policy.names.index("operator")
@@ -552,11 +391,6 @@ def test_the_margin_is_for_rows_of_the_named_policy() -> None:
     np.testing.assert_array_equal(expert.numpy(), operator)
 
 
-def test_a_margin_for_a_policy_that_the_logs_lack_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="have no 'nobody'"):
-        session(tmp_path / "r", config(loss={"margin": 1.0, "margin_policies": ["nobody"]}))
-
-
 def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
     shelf = logs()
     nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # named so by a profile
@@ -564,25 +398,6 @@ def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
     loss = config(loss={"margin": 1.0}).loss
     with pytest.raises(ConfigError, match=r"choose from what they have: unknown$"):
         LogTerms.of(loss, shelf, torch.device("cpu"))
-
-
-@pytest.mark.long
-def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
-    settings = config(
-        loss={"margin": 0.5, "conservative": 0.1},
-        network={"hidden": [16]},
-        schedule={**SMALL["schedule"], "env_steps": 800},
-    )
-    whole = run_to_end(tmp_path / "whole", settings)
-    first = session(tmp_path / "cut", settings)
-    steps = iter(range(10_000))
-    with pytest.raises(TrainingInterrupted):
-        train(first, stop=lambda: next(steps) > 150)
-    first.close()
-    second = session(tmp_path / "cut", settings, resume=True)
-    train(second)
-    second.close()
-    assert_same_run(whole, second)
 
 
 def test_condition_that_cannot_run_is_refused_first(tmp_path: Path) -> None:

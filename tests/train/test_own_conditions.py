@@ -12,9 +12,6 @@ from support.paths import ROOT
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
-from restock.errors import ConfigError
-from restock.ingest.task.conditions import Condition
-from restock.train.feed.collector import conditions_in_twin
 
 OWN = """
 [[condition]]
@@ -114,9 +111,3 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
     (row,) = json.loads(capsys.readouterr().out)
     assert row["fresh"] > 0
     assert row["sagging"] == 0
-
-
-def test_a_condition_that_no_signal_explains_is_refused() -> None:
-    wrong = Condition("wrong", "pre", "no_such_column > 1")
-    with pytest.raises(ConfigError, match="no_such_column"):
-        conditions_in_twin([wrong], ["battery_v"])

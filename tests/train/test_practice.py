@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.finished_runs import document, make_run
-from support.toy_run import assert_same_run, config, session
+from support.toy_run import config, session
 from support.toy_twin import ToyTwin
 
-from restock.cli import main
 from restock.cli.learning.train import unmoved
 from restock.errors import ConfigError, RunError
 from restock.replay.fleet.missions_file import MissionOrder
@@ -27,14 +25,10 @@ from restock.train.feed.practice import (
     HALF_LIFE_EPISODES,
     MAX_CHANGE,
     Practice,
-    moved,
     unordered,
     with_floor,
 )
-from restock.train.judge.comparability import differences
-from restock.train.loop import train
-from restock.train.prepare import prepare_new, prepare_resumed
-from restock.train.run.run import Run
+from restock.train.prepare import prepare_new
 from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.perturbation import Schedule
@@ -62,8 +56,6 @@ def at(env_steps: int) -> dict[str, int]:
 
 # -- shares ---------------------------------------------------------------------------------------
 
-parts = st.lists(st.floats(0, 1), min_size=1, max_size=12)
-
 
 @st.composite
 def floor_of(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float]:
@@ -86,17 +78,6 @@ def test_shares_sum_to_one_and_keep_their_floor(given: Any) -> None:
         np.testing.assert_allclose(
             shares[free] / shares[free].sum(), weights[free] / weights[free].sum(), atol=1e-9
         )
-
-
-@given(floor_of(), st.floats(0.001, 1))
-def test_a_share_moves_at_most_so_far(given: Any, most: float) -> None:
-    first, second, floor = given
-    before, wanted = with_floor(first, floor), with_floor(second, floor)
-    after = moved(before, wanted, most)
-    assert np.abs(after - before).max() <= most + 1e-12
-    assert math.isclose(after.sum(), 1.0)
-    assert (after >= floor - 1e-9).all()
-    assert np.abs(wanted - after).max() <= np.abs(wanted - before).max() + 1e-12
 
 
 def test_fixed_rules_give_what_they_say() -> None:
@@ -183,18 +164,6 @@ def test_a_run_too_short_for_its_shares_to_move_says_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"rule": "success", "floor": 0.3}, r"floors of 4 arms sum to 1\.2, above 1"),
-        ({"rule": "missions"}, "but none is given"),
-    ],
-)
-def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        practice(**settings)
-
-
-@pytest.mark.parametrize(
     ("override", "message"),
     [
         ("practice.by=['friction_scale']", "cannot be distinguished by 'friction_scale'"),
@@ -209,11 +178,6 @@ def test_nothing_is_written_for_a_practice_that_cannot_be(
     with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, load_config(None, [shares, override]))
     assert not (tmp_path / "run").exists()
-
-
-def test_twin_without_shares_allows_only_the_natural_rule(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="ToyTwin cannot be given shares"):
-        session(tmp_path / "even", config(practice={"rule": "even"}))
 
 
 def test_success_of_a_task_without_a_goal_is_refused() -> None:
@@ -238,25 +202,6 @@ PRACTICE = {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2}
 @pytest.fixture
 def with_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("support.toy_run.ToyTwin", KindsToy)
-
-
-@pytest.mark.usefixtures("with_shares")
-def test_a_resumed_run_practises_as_an_undisturbed_one(tmp_path: Path) -> None:
-    whole = session(tmp_path / "whole", config(practice=PRACTICE))
-    train(whole)
-    cut = session(tmp_path / "cut", config(practice=PRACTICE))
-    with pytest.raises(Exception, match="interrupted"):
-        train(cut, stop=lambda: cut.progress.env_steps >= 750)
-    cut.close()
-    resumed = session(tmp_path / "cut", config(practice=PRACTICE), resume=True)
-    train(resumed)
-    assert_same_run(whole, resumed)
-    rows = whole.run.table("practice").to_pylist()
-    assert {row["arm"] for row in rows} == {"nominal", "wheel_slip"}
-    assert len({row["wanted_share"] for row in rows}) > 2  # they did move
-    assert sum(row["episodes"] for row in rows) == whole.run.table("episodes").num_rows
-    whole.close()
-    resumed.close()
 
 
 @pytest.mark.usefixtures("with_shares")
@@ -310,41 +255,4 @@ def test_an_order_is_an_arm_and_says_so() -> None:
     assert (info["episode_condition"][0], info["mission_arm"][0]) == ("near_collision", 1)
 
 
-@pytest.mark.slow
-def test_practice_repeats_from_an_earlier_checkpoint(tmp_path: Path) -> None:
-    settings = [
-        *("env.num_envs=4", "schedule.env_steps=1600", "schedule.warmup_env_steps=200"),
-        *("replay.batch_size=16", "record.checkpoint_every_env_steps=800", "evaluation.episodes=1"),
-        "practice={rule='success', every_env_steps=200, warmup_episodes=1}",
-    ]
-    first = prepare_new(tmp_path / "run", None, None, settings).open()
-    train(first)
-    first.close()
-    names = ("practice", "episodes", "evaluations")
-    before = {name: first.run.table(name) for name in names}
-    again = prepare_resumed(tmp_path / "run", [], 800).open()
-    train(again)
-    again.close()
-    assert all(again.run.table(name).equals(table) for name, table in before.items())
-    assert len(set(before["practice"]["wanted_share"].to_pylist())) > 5
-    np.testing.assert_array_equal(first.ring.rows, again.ring.rows)
-
-
 # -- the gate -------------------------------------------------------------------------------------
-
-
-def test_different_practice_is_compared_as_practice_alone(tmp_path: Path, capsys) -> None:
-    first = str(make_run(tmp_path / "a", document(0)))
-    even = str(make_run(tmp_path / "b", document(1, config__practice__rule="even"), success=0.7))
-    for treatment, code in (("algorithm", 1), ("mixture", 1), ("practice", 0)):
-        assert main(["compare", first, even, "--treatment", treatment]) == code, treatment
-    assert "REFUSED: the runs differ in config.practice.rule" in capsys.readouterr().err
-    tuned = document(3, config__practice__floor=0.2)  # which the natural rule does not read
-    Run.create(tmp_path / "d", tuned)
-    found = differences(Run.open(Path(first)), Run.open(tmp_path / "d"))
-    assert [difference.setting for difference in found] == ["config.seed"]
-    other = str(
-        make_run(tmp_path / "c", document(2, config__practice__rule="even"), slip_share=0.5)
-    )
-    assert main(["compare", first, other, "--treatment", "practice"]) == 1
-    assert "fed differently in share of logs/" in capsys.readouterr().err

@@ -103,12 +103,6 @@ def test_regression_is_worse_better_or_left_open(baseline: Path, tmp_path: Path)
     assert every["difference"] == pytest.approx((0 - 0.4 + 0.4 + 0.4) / 4)
 
 
-def test_a_run_against_itself_shows_no_difference(baseline: Path) -> None:
-    rows = regression(read_run_evaluation(baseline), read_run_evaluation(baseline))
-    assert {row["verdict"] for row in rows} == {"no difference shown"}
-    assert {row["improvement"] for row in rows} == {0.5}
-
-
 def test_pairing_tells_what_unpaired_shares_would_not(tmp_path: Path) -> None:
     """Six of sixty fell and none rose: paired that is sure, for two shares it is not."""
     first = evaluated(tmp_path / "a", GOOD)

@@ -14,13 +14,11 @@ from support.toy_run import config, logs, run_to_end
 from support.toy_twin import TASK
 
 from restock import cli
-from restock.errors import RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 from restock.train import replay_audit
 from restock.train.run.replay_audit import ReplayAuditRecord
-from restock.train.run.run_profile import profile_document
 
 FIELDS = (
     *("transition_id", "age_steps", "age_days", "condition"),
@@ -114,26 +112,6 @@ def test_the_view_is_the_record(run: Path, capsys: pytest.CaptureFixture[str]) -
     assert all(row["meaning"] for row in json.loads(capsys.readouterr().out))
 
 
-def test_an_older_run_has_the_index_of_an_action_and_no_more(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    older = tmp_path / "older"
-    older.mkdir()
-    document = json.loads((run / "config.json").read_text("utf-8"))
-    del document["actions"]
-    (older / "config.json").write_text(json.dumps(document), "utf-8")
-    audit = pq.read_table(run / "audit.parquet").drop_columns(["last_target_sync", "age_days"])
-    pq.write_table(audit, older / "audit.parquet")
-    first = replay_audit(older)[0]
-    assert first.action in {f"action {index}" for index in range(len(TASK.actions))}
-    assert first.target_sync_step is None
-    (older / "audit.parquet").unlink()
-    with pytest.raises(RunError, match=r"no audit\.parquet"):
-        replay_audit(older)
-    with pytest.raises(RunError, match="not a run"):
-        replay_audit(tmp_path)
-
-
 @pytest.mark.parametrize(
     "actions",
     [load_profile("warehouse_amr").task.actions, ((0.0, 0.0), (-0.125, 0.3456), (12.0, -1 / 3))],
@@ -151,8 +129,3 @@ def test_a_store_names_actions_as_runs_do(
         connection.execute(view)
         names = connection.sql("SELECT name FROM actions ORDER BY action").fetchall()
     assert [name for (name,) in names] == task.action_names
-
-
-def test_a_run_says_how_its_actions_are_called() -> None:
-    profile = load_profile("warehouse_amr")
-    assert profile_document(profile)["actions"] == profile.task.action_names

@@ -103,28 +103,6 @@ def test_a_long_table_waits_until_it_has_grown(tmp_path: Path) -> None:
     assert on_disk() == 5401
 
 
-def test_a_row_with_a_missing_or_unknown_column_is_refused(tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "a", {})
-    with pytest.raises(KeyError, match="row_count"):
-        run.append("policies", [{**policies(1, 1), "row_count": 1}])
-    with pytest.raises(KeyError, match="source"):
-        run.append_columns("policies", {"rows": [1]})
-
-
-def test_run_is_named_by_path_or_text(
-    tmp_path: Path,
-) -> None:
-    Run.create(str(tmp_path / "a"), {"seed": 1})
-    run = Run.open(str(tmp_path / "a"))
-    assert run.path == tmp_path / "a"
-    with pytest.raises(RunError, match=r"a: there is no table 'audits'\n  it has .*audit"):
-        run.table("audits")
-
-
-def test_a_run_shows_where_it_is(tmp_path: Path) -> None:
-    assert repr(Run.create(tmp_path / "a", {})) == f"<Run {tmp_path / 'a'}>"
-
-
 def test_reopening_truncates_to_the_checkpoint(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {})
     run.append("policies", [policies(1, 10)])

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pyarrow.compute as pc
 import pytest
 from support.finished_runs import document, make_run
 
 from restock.cli import main
 from restock.errors import RunError
-from restock.files import write_table
 from restock.train.judge.compare import diff_runs
 from restock.train.run.run import Run
 
@@ -55,20 +53,6 @@ def test_runs_that_share_no_episode_or_have_no_evaluation_say_so(tmp_path: Path)
     assert "has no evaluation" in found["evaluation_note"]
     assert found["comparable"]["algorithm"].startswith("not compared")
     assert all(row["drawn_b"] == 0 for row in found["fed"])
-
-
-def test_a_task_without_a_goal_is_compared_by_its_returns(tmp_path: Path) -> None:
-    paths = [make_run(tmp_path / name, document(seed)) for seed, name in enumerate("ab")]
-    for path in paths:
-        run = Run.open(path)
-        table = run.table("evaluations")
-        place = table.schema.get_field_index("success")
-        unknown = pc.if_else(pc.is_null(table["success"]), table["success"], None)
-        table = table.set_column(place, table.schema.field(place), unknown)
-        write_table(table, path / "evaluations.parquet")
-    for row in diff_runs(*paths)["evaluation"]:
-        assert row["difference"] is None
-        assert row["return_difference"] == pytest.approx(row["return_b"] - row["return_a"])
 
 
 def test_runs_of_two_tasks_are_refused(tmp_path: Path) -> None:

@@ -137,17 +137,3 @@ def test_training_goes_on_in_the_same_run(saved: Any, tmp_path: Path, place: Pla
         begin = place[row[ring.columns["observation"]].tobytes()]
         end = place[row[ring.columns["next_observation"]].tobytes()]
         assert end & {(episode, step + horizon) for episode, step in begin}
-
-
-def test_training_goes_on_in_another_run(saved: Any, tmp_path: Path) -> None:
-    saved.replay_buffer.close()
-    before = content(tmp_path / "run")
-    options = saved.replay_buffer_kwargs | {"run": str(tmp_path / "second")}
-    model = sb3.DQN.load(
-        tmp_path / "model", env=saved.env, device="cpu", replay_buffer_kwargs=options
-    )
-    model.learn(40, reset_num_timesteps=False)
-    model.replay_buffer.close()
-    rows = run_tables(tmp_path / "second")["progress"]
-    assert sum(row["updates"] for row in rows) == model._n_updates - saved._n_updates > 0
-    assert content(tmp_path / "run") == before

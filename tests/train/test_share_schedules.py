@@ -10,21 +10,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.stores import CONDITIONS, recording_transitions
-from support.toy_run import assert_same_run, config, run_to_end, session
+from support.toy_run import config, run_to_end
 from support.toy_twin import TASK as TOY_TASK
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Prioritised, parse_mixture
+from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.mixture.share_controller import PlannedDraws, SampledStratum, ShareController
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.logged_sampler import LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import rules_of
 from restock.replay.sampling.ring import FreshRing
-from restock.replay.sampling.sampler import QuotaSampler
 from restock.train.feed.batches import Batches
 from restock.train.feed.logs import Logs
-from restock.train.loop import TrainingInterrupted, train
 from restock.train.session import Session
 
 HALVES = "[[strata]]\nname = 'nominal'\nshare = 0.5\n[[strata]]\nname = 'rare'\nshare = 0.5\n"
@@ -211,34 +209,6 @@ within = "uniform"
 """
 
 
-def test_draws_go_on_exactly_where_they_were_saved(table: pa.Table, tmp_path: Path) -> None:
-    built = panel(table, tmp_path / "p", EVERYTHING)
-    planned = PlannedDraws(640, 20_000, 0, 1200)
-
-    def some(draws: LoggedSampler, batches: int, seed: int) -> list[Any]:
-        rng = np.random.default_rng(seed)
-        found: list[Any] = []
-        for number in range(batches):
-            draws.move_to(number * 2)
-            count = max(round(64 * draws.controller.logs_share), 1)
-            batch = draws.draw(count)
-            draws.update(batch.rows, batch.strata, rng.random(len(batch.rows)) * (1 + batch.strata))
-            found.append((batch.rows, batch.strata, batch.weight, batch.quota.copy()))
-        return found
-
-    draws = draws_of(built, planned)
-    some(draws, 50, 1)
-    state = draws.state_dict()
-    going_on = some(draws, 450, 2)
-    assert len({tuple(quota) for *_, quota in going_on}) > 5  # shares did move
-    again = draws_of(built, planned)
-    again.load_state_dict(state)
-    for one, two in zip(going_on, some(again, 450, 2), strict=True):
-        for a, b in zip(one, two, strict=True):
-            np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(draws.replays, again.replays)
-
-
 def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> None:
     """Full correction keeps P(outcome) what it was, however the shares move."""
     text = EVERYTHING.replace("density_ratio", "full")
@@ -265,30 +235,6 @@ def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> 
             draws.update(batch.rows, batch.strata, 1.0 + 3 * (batch.strata == step + 1))
 
 
-def test_mixed_rules_keep_exact_quotas_and_their_own_ways() -> None:
-    members = [np.arange(0, 50), np.arange(50, 90), np.arange(90, 100)]
-    sampler = QuotaSampler(
-        members,
-        [0.5, 0.3, 0.2],
-        30,
-        np.random.default_rng(0),
-        within=["without_replacement", "per", "uniform"],
-        prioritised=Prioritised(per_alpha=1.0),
-    )
-    counts = np.zeros(100, np.int64)
-    for _ in range(400):
-        rows, strata = sampler.draw()
-        assert np.bincount(strata, minlength=3).tolist() == [15, 9, 6]
-        np.add.at(counts, rows, 1)
-        sampler.update(rows, np.where(rows == 60, 10.0, 0.1))
-    assert np.ptp(counts[:50]) <= 1
-    assert counts[60] > 5 * np.median(counts[50:90])
-    weights = sampler.drawn_weights
-    assert weights is not None
-    assert (weights[:15] == 1).all()
-    assert (weights[24:] == 1).all()
-
-
 def toy_logs(built: Panel) -> Logs:
     return Logs.of_panel(built, PlannedDraws(60 * 32, 350 * 32, 200, 1600))
 
@@ -302,23 +248,6 @@ def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Se
     path = tmp_path_factory.mktemp("runs")
     built = panel(table, path / "panel", EVERYTHING)
     return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
-
-
-@pytest.mark.long
-def test_a_run_on_everything_at_once_resumes_bit_for_bit(
-    whole: tuple[Session, Panel], tmp_path: Path
-) -> None:
-    undisturbed, built = whole
-    requested = iter(range(150))
-    path = tmp_path / "cut"
-    live = session(path, SETTINGS, logs=toy_logs(built))
-    with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: next(requested, None) is None)
-    live.close()
-    again = session(path, SETTINGS, logs=toy_logs(built), resume=True)
-    train(again)
-    again.close()
-    assert_same_run(undisturbed, again)
 
 
 def test_the_run_records_the_shares_in_force(whole: tuple[Session, Panel]) -> None:

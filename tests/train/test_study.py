@@ -13,11 +13,10 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RunError
-from restock.train.judge.comparability import Check, Difference, Treatment
+from restock.train.judge.comparability import Difference
 from restock.train.judge.compare import Comparison
 from restock.train.study import study_run
 from restock.train.study.study import StudyPlan, load_study
-from restock.train.study.study_run import findings
 
 SMALL = """
 treatment = "algorithm"
@@ -206,26 +205,6 @@ def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypat
     assert why in (out / "study.html").read_text()
 
 
-def test_updates_that_differ_are_the_one_cause_that_is_named(tmp_path: Path) -> None:
-    """A feed that follows from them is not listed, nor is one that the treatment allows."""
-    (tmp_path / "s.toml").write_text(SMALL.replace('"algorithm"', '"mixture"'))
-    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
-    updates = Check.exact("updates", 51_500, 49_500, 51_500 / 49_500, 1.02)
-    fed = [Check.exact(f"share of fresh/{n}", 0.1, 0.9, 9.0, 1.25) for n in range(9)]
-
-    def page(totals: list[Check], treatment: Treatment = "mixture") -> str:
-        made = Comparison(treatment, "incomparable", [], [], totals, fed, None, [])
-        (one,) = findings(plan, [made])["comparisons"]
-        return one["why"]
-
-    said = page([updates])
-    assert "dueling made 49,500 updates and plain 51,500" in said
-    assert "share of fresh" not in said
-    many = page([], "algorithm")
-    assert "incomparable in share of fresh/0, " in many
-    assert "share of fresh/3 and 5 more" in many
-
-
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
@@ -245,25 +224,6 @@ def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -
     (tmp_path / "s.toml").write_text(f"{study}schedule.offline_updates = 0\n{with_logs}")
     with pytest.raises(ConfigError, match=r"schedule\.offline_updates is 0"):
         load_study(tmp_path / "s.toml")
-
-
-def test_an_arm_without_a_teacher_has_no_settings_of_one(tmp_path) -> None:
-    study = "[settings]\nteacher.ratio = 0.2\n[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
-    (tmp_path / "s.toml").write_text(f"{study}settings = {{ teacher.source = 'none' }}\n")
-    with pytest.raises(ConfigError, match=r"arm 'b': teacher\.ratio: has no effect"):
-        load_study(tmp_path / "s.toml")
-
-
-def test_an_interrupted_study_says_how_to_continue(tmp_path: Path, capsys, monkeypatch) -> None:
-    def stopped(plan, job, say):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(study_run, "run_job", stopped)
-    (tmp_path / "s.toml").write_text(SMALL)
-    assert main(["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out")]) == 130
-    said = " ".join(capsys.readouterr().err.split())
-    assert "interrupted; finished runs are kept" in said
-    assert "continue with the same command" in said
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
@@ -298,12 +258,6 @@ def test_after_a_run_failed_none_is_begun_and_those_that_run_can_be_interrupted(
     assert "here: ran out of disk" in said
 
 
-def test_a_panel_that_is_not_there_is_refused_before_the_runs(tmp_path: Path, capsys) -> None:
-    (tmp_path / "s.toml").write_text(f"{TWO}panel = 'p'\n")
-    assert main(["train", str(tmp_path / "s.toml"), "--out", str(tmp_path), "--dry-run"]) == 2
-    assert "p: arm 'b': there is no panel here" in capsys.readouterr().err
-
-
 def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\nmixture = "b.toml"\n'
     (tmp_path / "s.toml").write_text(f'store = "s"\ntreatment = "mixture"\n{arms}')
@@ -317,24 +271,6 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     (tmp_path / "b.toml").write_text("where = 'reward > -99'\n[each_condition]\n")
     assert main(argv) == 0
     assert not (tmp_path / "o").exists()
-
-
-def test_a_study_is_not_put_into_its_store(tmp_path: Path, capsys) -> None:
-    (tmp_path / "s.toml").write_text(SMALL)
-    write_store(tmp_path / "s", [recording_transitions(1)])
-    for out, why in ((tmp_path / "s" / "o", "within the store"), (tmp_path / "s.toml", "a file")):
-        assert main(["train", str(tmp_path / "s.toml"), "--out", str(out), "--dry-run"]) == 2
-        assert why in " ".join(capsys.readouterr().err.split())
-
-
-def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
-    arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\npanel = "p"\n'
-    (tmp_path / "s.toml").write_text(f'store = "../s"\n{arms}')
-    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "o")
-    a, b = plan.study.arms
-    assert plan.panel(a) == tmp_path / "o" / "panels" / "a"
-    assert plan.panel(b) == tmp_path / "p"
-    assert plan.study.base is a
 
 
 @pytest.mark.parametrize(

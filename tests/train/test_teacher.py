@@ -15,7 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.paths import ROOT
-from support.toy_run import assert_same_run, config, logs, run_to_end, session
+from support.toy_run import config, logs, run_to_end, session
 from support.toy_twin import CELLS, TASK
 from torch import Tensor, tensor
 
@@ -37,17 +37,14 @@ from restock.train.dqn.behaviour import (
     make_policy,
     plausible_actions,
 )
-from restock.train.dqn.config import GIVEN, TeacherConfig, parse_config
-from restock.train.dqn.fitted_q import soft_greedy
+from restock.train.dqn.config import TeacherConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.feed.teacher import (
     Imitation,
     TeacherFailed,
     open_teacher,
-    refuse_nothing_to_learn,
 )
-from restock.train.judge.comparability import differences
-from restock.train.loop import TrainingInterrupted, train
+from restock.train.loop import train
 from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.prepare import train as train_new
 from restock.train.run import checkpoint
@@ -72,18 +69,6 @@ def test_plausible_is_what_the_ratio_says_of_the_probabilities(ratio: float, see
     assert bool(((probability >= ratio * largest) == found)[~near].all())
     assert bool(found.any(dim=1).all())
     assert bool(found.gather(1, probability.argmax(dim=1, keepdim=True)).all())
-
-
-def test_the_ends_of_the_ratio_are_all_and_the_likeliest() -> None:
-    logits = of([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]])
-    assert bool(plausible_actions(logits, tensor(0.0)).all())
-    assert plausible_actions(logits, tensor(1.0)).tolist() == [
-        [True, False, False],
-        [False, False, True],
-    ]
-    # .2 / .7 = .29: just short of .3
-    assert plausible_actions(logits, tensor(0.3)).tolist()[0] == [True, False, False]
-    assert plausible_actions(logits, tensor(0.25)).tolist()[0] == [True, True, False]
 
 
 def test_the_target_looks_among_the_plausible_alone() -> None:
@@ -160,46 +145,6 @@ def test_every_step_has_the_teachers_answer_for_its_own_state(taught: Any) -> No
     chosen = ring.rows[:count, -3][late] == FORWARD
     assert probability[chosen].min() == pytest.approx(1 - epsilon + epsilon / 3)
     assert probability[~chosen].max() == pytest.approx(epsilon / 3)  # explores over all actions
-
-
-@pytest.mark.long
-def test_interrupted_and_resumed_is_bit_exact(taught: Any, tmp_path: Path) -> None:
-    class Walker:
-        """Draws, so that its state matters."""
-
-        def __init__(self) -> None:
-            self.rng = np.random.default_rng(1)
-
-        def act(self, env: Any, observation: np.ndarray) -> np.ndarray:
-            return self.rng.integers(3, size=len(observation))
-
-        def state_dict(self) -> dict[str, Any]:
-            return dict(self.rng.bit_generator.state)
-
-        def load_state_dict(self, state: dict[str, Any]) -> None:
-            self.rng.bit_generator.state = state
-
-    loosened = {"schedule": "linear", "start": 0.9, "end": 0.1, "to_env_steps": 1600}
-    settings = config(teacher={**TAUGHT["teacher"], "ratio": loosened})
-    whole = run_to_end(tmp_path / "whole", settings, teacher=Walker())
-    live = session(tmp_path / "cut", settings, teacher=Walker())
-    requested = iter(range(300))
-    with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: next(requested, None) is None)
-    assert 0 < live.progress.env_steps < 1600
-    live.close()
-    again = session(tmp_path / "cut", settings, teacher=Walker(), resume=True)
-    assert again.learner.behaviour is not None
-    assert 0.1 < again.learner.behaviour.in_force < 0.9
-    train(again)
-    again.close()
-    assert_same_run(whole, again)
-    assert again.learner.behaviour.in_force == pytest.approx(0.1)
-
-
-def test_with_and_without_a_thread_it_is_the_same_run(taught: Any, tmp_path: Path) -> None:
-    settings = config(**TAUGHT, env={"overlap": not taught.config.env.overlap})
-    assert_same_run(taught, run_to_end(tmp_path / "other", settings, teacher=forward))
 
 
 def test_logged_rows_alone_make_a_filter_before_the_first_step(tmp_path: Path) -> None:
@@ -321,18 +266,6 @@ def test_a_teacher_that_gives_no_action_is_refused(
     assert live.progress.online_updates == 0
 
 
-def test_what_a_teacher_does_to_its_observations_stays_with_it() -> None:
-    def answer(env: Any, observation: Any) -> Any:
-        observation[:] = 0
-        return np.ones(len(observation), np.int64)
-
-    requested = open_teacher(TeacherConfig(source=GIVEN), TASK, seed=0, given=answer)
-    assert requested is not None
-    observation = np.ones((4, 3), np.float32)
-    assert requested.ask(None, observation).tolist() == [1, 1, 1, 1]
-    assert observation.all()
-
-
 TEACHERS = """
 import numpy as np
 
@@ -412,19 +345,6 @@ def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(tmp_path: Path) -> 
     )
 
 
-def test_whoever_watches_is_told_of_a_teacher_without_opinions(tmp_path: Path) -> None:
-    reported: list[tuple[str, int]] = []
-    live = session(
-        tmp_path / "a",
-        config(**TAUGHT),
-        teacher=lambda env, observation: np.full(len(observation), UNKNOWN),
-    )
-    train(live, notify=lambda event, values: reported.append((event, values.get("asked", 0))))
-    live.close()
-    early, last = (requested for event, requested in reported if event == "teacher")
-    assert early < last == 1600
-
-
 def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config(teacher={"source": "operator"}))
     with pytest.raises(ConfigError, match="needs the warehouse twin, but this is a ToyTwin"):
@@ -450,16 +370,6 @@ def test_logs_without_a_row_to_clone_are_refused(
     settings = config(teacher={"source": "logs", "policies": ["teleop"]})
     with pytest.raises(ConfigError, match=f"clones the rows of teleop, but {message}"):
         session(tmp_path / "a", settings, **parts)
-
-
-def test_queried_teacher_may_lack_only_the_default_rows() -> None:
-    named = TeacherConfig(source="operator", policies=("opertor",))
-    with pytest.raises(ConfigError, match="clones the rows of opertor, but the logs have planner"):
-        refuse_nothing_to_learn(named, ["planner"])
-    for allowed in (TeacherConfig(source="operator"), msgspec.structs.replace(named, policies=())):
-        refuse_nothing_to_learn(allowed, ["planner"])
-    refuse_nothing_to_learn(named, None)
-    refuse_nothing_to_learn(msgspec.structs.replace(named, source="none"), ["planner"])
 
 
 def test_onnx_is_torch(taught: Any) -> None:
@@ -521,15 +431,6 @@ def test_the_replay_card_names_the_teacher(taught: Any) -> None:
     assert "rows of operator cloned, half of its rows mirrored; an action" in mirrored
 
 
-def test_a_teacher_is_part_of_the_algorithm(taught: Any, tmp_path: Path) -> None:
-    def opened(name: str, **settings: Any) -> Run:
-        document = {"config": msgspec.to_builtins(config(**settings))}
-        return Run.create(tmp_path / name, document)
-
-    found = differences(opened("a", **TAUGHT), opened("b"))
-    assert {(d.setting.split(".")[1], d.kind) for d in found} == {("teacher", "algorithm")}
-
-
 def test_a_kept_policy_comes_back_with_its_filter(taught: Any) -> None:
     weights = checkpoint.load(taught.run.best)["network"]
     policy = make_policy(taught.config, TASK.observation_size, len(TASK.actions))
@@ -547,15 +448,6 @@ def test_a_kept_policy_comes_back_with_its_filter(taught: Any) -> None:
     ):
         for name, value in one.state_dict().items():
             assert torch.equal(value, other.state_dict()[name]), name
-
-
-def test_off_policy_evaluation_is_of_the_filtered_policy(taught: Any) -> None:
-    observation = np.eye(TASK.observation_size, dtype=np.float32)[: CELLS - 1]
-    policy = taught.learner.policy
-    chosen = greedy_actions(policy, observation)
-    probability = soft_greedy(policy, observation, 0.1)
-    assert probability.argmax(axis=1).tolist() == chosen.tolist()
-    np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-6)
 
 
 def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:

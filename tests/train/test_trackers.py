@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import json
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -158,64 +156,3 @@ def test_mlflow_has_the_curves_config_and_panel(
     assert tracked(run.path)["mlflow"] == known
     history = client.get_metric_history(known["run_id"], "train/loss")
     assert [metric.step for metric in history] == [100, 200, 300]
-
-
-def wandb_records(folder: Path) -> list[Any]:
-    """Return the records of a run's offline file, once W&B's process has written the last."""
-    for _ in range(300):
-        records = list(_records(folder))
-        if "exit" in (record.WhichOneof("record_type") for record in records):
-            return records
-        time.sleep(0.1)
-    raise AssertionError(f"{len(records)} records, and no end")
-
-
-def _records(folder: Path) -> Iterator[Any]:
-    """LevelDB's log format after a header of 7 bytes."""
-    from wandb.proto.wandb_internal_pb2 import Record
-
-    (file,) = folder.glob("wandb/offline-run-*/run-*.wandb")
-    content, at, part = file.read_bytes(), 7, b""
-    assert content[:4] == b":W&B"
-    block = 32 << 10
-    while at + 7 <= len(content):
-        if block - at % block < 7:  # no header fits into what is left of a block
-            at += block - at % block
-            continue
-        size, kind = int.from_bytes(content[at + 4 : at + 6], "little"), content[at + 6]
-        if at + 7 + size > len(content):
-            return  # still being written
-        part += content[at + 7 : at + 7 + size]
-        at += 7 + size
-        if kind in (1, 4):  # a whole record, or the last part of one
-            record = Record()
-            record.ParseFromString(part)
-            part = b""
-            yield record
-
-
-def test_wandb_has_the_curves_config_and_panel_offline(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("wandb", reason="wandb is not installed: restock[track]")
-    for name in ("WANDB_MODE", "WANDB_PROJECT"):
-        monkeypatch.delenv(name, raising=False)
-    run = a_run(tmp_path / "a")
-    events = follow(run, "wandb")
-    assert events.failures["wandb"].failed == 0
-    known = tracked(run.path)["wandb"]
-    assert known["project"] == "restock"
-    curves, config = [], dict[str, Any]()
-    for record in wandb_records(run.path):
-        kind = record.WhichOneof("record_type")
-        if kind == "history":
-            items = record.history.item
-            values = {(i.key or "/".join(i.nested_key)): json.loads(i.value_json) for i in items}
-            curves.append({k: v for k, v in values.items() if k.startswith("train/")})
-        elif kind == "run":
-            assert record.run.run_id == known["id"]
-            config |= {i.key: json.loads(i.value_json) for i in record.run.config.update}
-    assert curves == [{"train/loss": 2.0}, {"train/loss": 0.5, "train/q_mean": 1.5}]
-    assert config["panel"]["id"] == PANEL["id"]
-    assert config["panel"]["others"] == PANEL["others"]
-    assert config["loss"]["discount"] == 0.99

@@ -20,14 +20,12 @@ from support.long import one_in
 from support.paths import ROOT
 from support.stores import recording_transitions
 
-import restock
 from restock.cli import main
 from restock.cli.learning.train import describe_run
-from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
-from restock.train.dqn.config import ScheduleConfig, TrainConfig
+from restock.train.dqn.config import TrainConfig
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
 from restock.train.run.run import RunLock
@@ -240,57 +238,6 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
         assert one.equals(two), name
 
 
-@pytest.mark.slow
-def test_measures_on_fresh_steps_do_not_depend_on_a_kill(tmp_path: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    settings = [*TINY, "--env-steps", "120", "--set", "evaluation.every_env_steps=40"]
-    settings += ["--set", "record.checkpoint_every_env_steps=40", "--set", "evaluation.episodes=5"]
-    overrides = [value for value in settings if "=" in value]
-
-    def trained(path: Path, kill_at: int | None) -> list[dict[str, object]]:
-        def notify(event: str, values: dict[str, object]) -> None:
-            if event == "evaluation" and values["env_steps"] == kill_at:
-                raise Killed
-
-        given = [*overrides, "schedule.env_steps=120"]
-        if kill_at is not None:
-            with pytest.raises(Killed):
-                restock.train.train(out=path, settings=given, notify=notify)
-            assert main(["train", "--resume", str(path)]) == 0
-        else:
-            restock.train.train(out=path, settings=given)
-        return list(pq.read_table(path / "evaluation_buffer.parquet").to_pylist())
-
-    whole = trained(tmp_path / "whole", None)
-    assert {row["env_steps"] for row in whole} == {40, 80, 120}
-    assert trained(tmp_path / "killed", 80) == whole
-
-
-@pytest.mark.long  # test_film and test_eval_run have the shorter ones
-def test_python_trains_and_evaluates_like_the_commands(
-    trained: Path, panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = [word for word in TINY if word != "--set"]
-    config = TrainConfig(schedule=ScheduleConfig(env_steps=400))
-    outcome = restock.train.train(config, panel=panel, out=tmp_path / "a", settings=settings)
-    assert outcome.env_steps == 400
-    documents = [json.loads((run / "config.json").read_text()) for run in (tmp_path / "a", trained)]
-    assert documents[0]["config"] == documents[1]["config"]
-    assert documents[0]["panel"]["id"] == documents[1]["panel"]["id"]
-    with pytest.raises(RestockError, match="already exists"):
-        restock.train.train(config, out=str(tmp_path / "a"))
-
-    rows = restock.train.evaluate(
-        tmp_path / "a", policies=["agent", "planner"], episodes="nominal=1"
-    )
-    argv = ["eval", str(tmp_path / "a"), "--policies", "agent,planner"]
-    argv += ["--episodes", "nominal=1", "--perturbations", "none", "--json"]
-    assert main(argv) == 0
-    assert json.loads(capsys.readouterr().out)["results"] == json.loads(json.dumps(rows))
-
-
 @pytest.mark.parametrize(
     ("argv", "complaint"),
     [
@@ -363,26 +310,6 @@ def test_a_panel_of_a_task_that_no_profile_has_is_refused(
     assert "leave out `profile` in the config" in said
     assert load_profile("warehouse_amr").task.hash in said
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.long
-def test_a_panel_brings_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    task = load_profile("turtlebot3").task
-    rows = recording_transitions(1, episodes=40, task=task)
-    build_panel(rows, MIXTURE, tmp_path / "panel", task=task)
-    out = tmp_path / "run"
-    argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(out), *TINY]
-    argv += ["--set", f"loss.discount={MIXTURE.discount}"]
-    assert main([*argv, "--env-steps", "40"]) == 0
-    document = json.loads((out / "config.json").read_text())
-    assert document["config"]["profile"] == document["profile"]["name"] == "turtlebot3"
-    assert document["task_hash"] == task.hash
-    assert main(["train", "--resume", str(out), "--env-steps", "80"]) == 0
-    # One that the config names stays in force.
-    other = [*argv, "--out", str(tmp_path / "b"), "--set", "profile=warehouse_amr"]
-    capsys.readouterr()
-    assert main(other) == 2
-    assert "observation, action or reward differ" in capsys.readouterr().err
 
 
 def test_a_dry_run_writes_nothing(

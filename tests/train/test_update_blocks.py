@@ -15,7 +15,6 @@ from support.toy_run import assert_same_run, config, logs, run_to_end, session, 
 from support.toy_twin import TASK
 
 from restock.cli.failures import as_restock_error
-from restock.errors import MixtureError
 from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.logs import Logs
 from restock.train.feed.update_blocks import LONGEST, DeviceTable, UpdateBlocks
@@ -127,19 +126,6 @@ def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path)
     assert_same_run(whole, resumed)
 
 
-def test_behaviour_and_critic_learn_after_the_critic_alone(device: str, tmp_path: Path) -> None:
-    """Another graph than that of the offline updates, in the same run."""
-    changes = {**WAYS["teacher"], "schedule": {"env_steps": 600, "offline_updates": 2 * LONGEST}}
-    one = run_to_end(tmp_path / "one", config(**changes))
-    blocks = trained(in_blocks(tmp_path / "blocks", device, **changes))
-    assert one.learner.behaviour is not None
-    assert blocks.learner.behaviour is not None
-    assert blocks.learner.behaviour.updates == one.learner.behaviour.updates > 100
-    assert blocks.learner.gradient_steps == one.learner.gradient_steps
-    for value in blocks.learner.policy.state_dict().values():
-        assert torch.isfinite(value).all()
-
-
 @pytest.mark.parametrize("mixture", ["sampling = 'chunked'\n", "within = 'per'\n"])
 def test_panels_of_all_kinds_feed_blocks_as_they_feed_one_by_one(
     mixture: str, device: str, tmp_path: Path
@@ -184,28 +170,6 @@ def test_rows_on_the_device_follow_the_ring(device: str) -> None:
             table.follow()
             np.testing.assert_array_equal(table.rows[: table.logs].cpu(), shelf.rows)
             np.testing.assert_array_equal(table.rows[table.logs :].cpu(), ring.rows)
-
-
-def test_what_was_drawn_before_the_logs_are_used_up_is_learnt(device: str, tmp_path: Path) -> None:
-    live = in_blocks(tmp_path / "run", device)
-    left = iter(range(LONGEST + 3))
-
-    def draw() -> Any:
-        if next(left, None) is None:
-            raise MixtureError("used up")
-        return live.batches.draw_offline()
-
-    made = live.blocks.make(99, draw, conservative=0.0, labelled=False) if live.blocks else iter(())
-    counts = []
-
-    def make() -> None:
-        counts.extend(live.learner.gradient_steps for _ in made)
-
-    with pytest.raises(MixtureError, match="used up"):
-        make()
-    assert counts == list(range(1, LONGEST + 4))
-    assert live.learner.gradient_steps == LONGEST + 3
-    live.close()
 
 
 def test_a_learner_that_is_not_finite_names_its_update(device: str, tmp_path: Path) -> None:

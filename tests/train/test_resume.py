@@ -1,0 +1,225 @@
+"""A run that was cut goes on bit for bit, whatever its checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.long import one_in
+from support.stores import CONDITIONS, recording_transitions
+from support.toy_run import assert_same_run, config, run_to_end, session, tables
+from support.toy_twin import CONDITIONS as TOY_CONDITIONS
+from support.toy_twin import TASK
+
+from restock.errors import RunError
+from restock.ingest.task.conditions import Condition
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.mixture.share_controller import PlannedDraws
+from restock.replay.panel.build import build_panel
+from restock.train.dqn.config import TrainConfig
+from restock.train.evaluation.evaluate import EpisodeResult
+from restock.train.feed.logs import Logs
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.run import checkpoint
+from restock.train.run.checkpoint import earlier, go_back
+from restock.train.session import Session
+
+# Schedules, priorities, a cap a row, corrections and an age limit at once.
+EVERYTHING = """
+max_replays_per_row = 40
+max_age_env_steps = 900
+[sources]
+logs = { schedule = "linear", start = 0.75, end = 0.25, to_env_steps = 480 }
+[correction]
+post = "density_ratio"
+[[strata]]
+name = "nominal"
+share = { schedule = "linear", start = 0.4, end = 0.5, to_env_steps = 480 }
+[[strata]]
+name = "wheel_slip"
+within = "per"
+[[strata]]
+name = "recovery"
+[each_condition]
+share = "equal"
+within = "uniform"
+"""
+# So few logged rows that fresh ones fill the quotas too.
+QUOTAS = "max_replays_per_row = 8\n" + "".join(
+    f"[[strata]]\nname = '{name}'\nunit = 'episode'\nshare = 0.5\n"
+    for name in ("nominal", "wheel_slip")
+)
+SHORT = {"env_steps": 480}
+
+
+class Walker:
+    """A teacher that draws, so that its state matters."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(1)
+
+    def act(self, env: Any, observation: np.ndarray) -> np.ndarray:
+        return self.rng.integers(3, size=len(observation))
+
+    def state_dict(self) -> dict[str, Any]:
+        return dict(self.rng.bit_generator.state)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.rng.bit_generator.state = state
+
+
+def logs_by(text: str, conditions: Iterable[Condition]) -> Callable[[Path], Logs]:
+    def made(folder: Path) -> Logs:
+        rows = pa.concat_tables([recording_transitions(n, task=TASK) for n in (1, 2, 3)])
+        mixture = parse_mixture(f"discount = 0.9\n{text}")
+        panel = build_panel(rows, mixture, folder / "p", task=TASK, conditions=list(conditions))
+        return Logs.of_panel(panel, PlannedDraws(60 * 32, 70 * 32, 200, 480))
+
+    return made
+
+
+SCHEDULED = {"schedule": "linear", "start": 0.9, "end": 0.1, "to_env_steps": 480}
+CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[], Any]]] = {
+    # Each batch is audited, so rows wait for the labels of episodes under way.
+    "network, ring, twin, tables": ({"record": {"audit_share": 1.0}}, None, lambda: None),
+    "every term of the loss": (
+        {"loss": {"margin": 0.5, "conservative": 0.1}, "target": {"rule": "hard", "every": 13}},
+        None,
+        lambda: None,
+    ),
+    "a teacher and its filter": (
+        {"teacher": {"source": "given", "ratio": SCHEDULED, "offline_updates": 40}},
+        None,
+        Walker,
+    ),
+    "practice": (
+        {"practice": {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2}},
+        None,
+        lambda: None,
+    ),
+    "shares of logged rows": (
+        {"replay": {"logs_share": None}},
+        logs_by(EVERYTHING, CONDITIONS),
+        lambda: None,
+    ),
+    "quotas that fresh rows fill": (
+        {"replay": {"logs_share": None}},
+        logs_by(QUOTAS, TOY_CONDITIONS),
+        lambda: None,
+    ),
+}
+
+
+def interrupted(live: Session, stop: Callable[[], bool]) -> None:
+    with pytest.raises(TrainingInterrupted, match="restock train --resume"):
+        train(live, stop=stop)
+    live.close()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_cut_run_ends_as_an_undisturbed_one(case: str, tmp_path: Path) -> None:
+    changes, make_logs, teacher = CASES[case]
+    settings = config(**{**changes, "schedule": SHORT})
+    logs = {} if make_logs is None else {"logs": make_logs(tmp_path)}
+
+    def opened(name: str, *, resume: bool = False) -> Session:
+        return session(tmp_path / name, settings, teacher=teacher(), resume=resume, **logs)
+
+    whole = opened("whole")
+    train(whole)
+    whole.close()
+    # Once on the logs, once while it learns in the twin.
+    cut = opened("cut")
+    interrupted(cut, lambda: cut.learner.gradient_steps >= 20)
+    again = opened("cut", resume=True)
+    interrupted(again, lambda: again.progress.env_steps >= 350)
+    last = opened("cut", resume=True)
+    train(last)
+    last.close()
+    assert_same_run(whole, last)
+    if case == "practice":
+        rows = whole.run.table("practice").to_pylist()
+        assert len({row["wanted_share"] for row in rows}) > 2  # they did move
+        assert sum(row["episodes"] for row in rows) == whole.run.table("episodes").num_rows
+
+
+@pytest.fixture(scope="module")
+def settings() -> TrainConfig:
+    return config(schedule={"env_steps": 800}, evaluation={"every_env_steps": 400})
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, settings: TrainConfig) -> Session:
+    return run_to_end(tmp_path_factory.mktemp("runs") / "undisturbed", settings)
+
+
+def resumed(path: Path, settings: TrainConfig) -> Session:
+    live = session(path, settings, resume=True)
+    train(live)
+    live.close()
+    return live
+
+
+@pytest.mark.parametrize("evaluation", one_in(2, [1, 2, 3]))
+def test_an_abandoned_evaluation_is_made_by_the_resumed_run(
+    undisturbed: Session, settings: TrainConfig, tmp_path: Path, evaluation: int
+) -> None:
+    """After the logs, among online updates, and at the end."""
+    path = tmp_path / "a"
+    live = session(path, settings)
+    steps = iter(range(4))
+    begun, drive = [], live.evaluation_buffer.drive
+
+    def driving(*args: Any, **kwargs: Any) -> list[EpisodeResult]:
+        begun.append(live.progress.env_steps)
+        return drive(*args, **kwargs)
+
+    live.evaluation_buffer.drive = driving  # type: ignore[method-assign]
+    interrupted(live, lambda: len(begun) == evaluation and next(steps, None) is None)
+    assert begun == [0, 400, 800][:evaluation]
+    evaluated = pq.read_table(path / "evaluations.parquet")["env_steps"].unique().to_pylist()
+    assert evaluated == begun[:-1]
+    assert_same_run(undisturbed, resumed(path, settings))
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(
+    undisturbed: Session, settings: TrainConfig, tmp_path: Path
+) -> None:
+    class Killed(Exception):
+        pass
+
+    path = tmp_path / "a"
+    live = session(path, settings)
+
+    def kill(event: str, values: dict[str, Any]) -> None:
+        if event == "progress" and values["env_steps"] > 500:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(live, notify=kill)
+    live.close()
+    assert 0 < checkpoint.load(live.run.latest)["progress"]["env_steps"] < live.progress.env_steps
+    assert_same_run(undisturbed, resumed(path, settings))
+
+
+def test_an_earlier_checkpoint_leads_to_the_same_end(tmp_path: Path) -> None:
+    settings = config(schedule={"env_steps": 800}, record={"checkpoint_every_env_steps": 200})
+    path = tmp_path / "run"
+    live = run_to_end(path, settings)
+    before = tables(path)
+    kept = earlier(live.run.latest)
+    assert list(kept) == [400, 600]
+    with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
+        go_back(live.run.latest, 7)
+    live.run.latest.write_bytes(b"half a file")
+    with pytest.raises(RunError, match="--from-env-steps 600"):
+        session(path, settings, resume=True)
+    go_back(live.run.latest, 400)
+    assert earlier(live.run.latest) == {}
+    resumed(path, settings)
+    assert all(table.equals(before[name]) for name, table in tables(path).items())
