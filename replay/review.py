@@ -446,7 +446,7 @@ class LabelQuality:
 
 
 def label_quality(store: Store, by: str | None = None) -> list[LabelQuality]:
-    """Every condition that was labelled or true, over all recordings whose truth is known.
+    """Return every condition that was labelled or true, over recordings whose truth is known.
 
     `by` is a column of `recordings` (`source_file`, `robot`, `map`, …): one score for each value.
 

@@ -82,7 +82,7 @@ class ImageFeature:
 
 
 def colours(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Pixels as (H, W, 3): grey three times, alpha left out."""
+    """Return pixels as (H, W, 3): grey repeated three times, without alpha."""
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     return np.ascontiguousarray(image[..., :3], np.uint8)

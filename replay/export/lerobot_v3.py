@@ -174,7 +174,7 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
 
 
 def _features(selection: Selection, columns: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """info.json's `features`: dtype, shape and the names of entries of every column."""
+    """Return info.json's `features`: dtype, shape and entry names of every column."""
     names = {
         "observation.state": selection.provenance["observation_names"],
         "next.observation.state": selection.provenance["observation_names"],

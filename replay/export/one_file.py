@@ -80,7 +80,7 @@ def as_table(trajectory: Trajectory, number: int) -> pa.Table:
 
 
 def fixed_lists(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
-    """(n, k) float32 as n lists of k."""
+    """Return (n, k) float32 as n lists of k."""
     flat = np.ascontiguousarray(values, np.float32).ravel()
     return pa.FixedSizeListArray.from_arrays(pa.array(flat), values.shape[1])
 
@@ -88,7 +88,7 @@ def fixed_lists(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
 def write_npz(
     selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
-    """Arrays by the names that D4RL's data sets use; held in memory while written."""
+    """Write arrays under the names of D4RL's data sets; they are in memory while written."""
     all_of_them = list(trajectories)
     lengths = np.array([len(t) for t in all_of_them])
     last = np.zeros(lengths.sum(), np.bool_)
@@ -120,7 +120,7 @@ def write_npz(
 def write_d3rlpy(
     selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
-    """Episodes as d3rlpy dumps them."""
+    """Write episodes as d3rlpy dumps them."""
     import h5py  # type: ignore[import-untyped]
 
     number = -1

@@ -258,7 +258,7 @@ def _with_frames(
 
 
 def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Whose drives these recordings are, by their ids; those that nobody tagged are left out."""
+    """Return the robots of these recordings by id; untagged recordings are left out."""
     rows = store.connection.execute(
         "SELECT recording_id, tags FROM recordings WHERE recording_id IN (SELECT unnest(?))"
         " AND cardinality(tags) > 0 ORDER BY recording_id",

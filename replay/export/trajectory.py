@@ -58,7 +58,7 @@ class Trajectory:
 
     @property
     def whose(self) -> dict[str, str]:
-        """Its robot and site, as far as the rows have them and say: an episode has one of each."""
+        """Return its robot and site, if the rows have them; an episode has one of each."""
         said = {name: self.carried[name][0] for name in ("robot", "site") if name in self.carried}
         return {name: "" if value is None else str(value) for name, value in said.items()}
 
@@ -88,7 +88,7 @@ class Counts:
 def trajectories(
     batches: Iterable[pa.RecordBatch], *, continuous: bool, counts: Counts, where: str
 ) -> Iterator[Trajectory]:
-    """Trajectories of rows that come sorted by episode and step.
+    """Yield trajectories from rows sorted by episode and step.
 
     Args:
         batches: rows with the columns of REQUIRED; of COMMAND too, for continuous actions.
@@ -206,7 +206,7 @@ def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Iterator[T
 
 
 def count_episodes(trajectories: Iterable[Trajectory], counts: Counts) -> Iterator[Trajectory]:
-    """Pass trajectories on, counting the episodes they are of (they come episode by episode)."""
+    """Pass trajectories on, and count their episodes (they come episode by episode)."""
     before: str | None = None
     for trajectory in trajectories:
         counts.episodes += trajectory.episode_id != before

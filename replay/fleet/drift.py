@@ -36,7 +36,7 @@ class Drift:
 
     @property
     def own(self) -> Rows:
-        """The comparisons of robots with their own references: only these find changes."""
+        """Return the comparisons of robots with their own references; only these find changes."""
         return [row for row in self.tests if row["against"] == OWN]
 
     @property

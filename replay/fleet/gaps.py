@@ -63,13 +63,13 @@ class Yields:
         return np.flatnonzero(chosen)
 
     def amount(self, unit: Unit, zone: str | None = None) -> F64:
-        """(E,) what each episode was of: one mission, or so many hours (in the zone)."""
+        """Return the amount of each episode, (E,): one mission, or its hours (in the zone)."""
         if unit == "missions":
             return np.ones(len(self))
         return self.hours if zone is None else self._hours_in(zone)
 
     def rows_of(self, cell: dict[str, str | int]) -> F64:
-        """(E,) rows of each episode in a cell; what it does not name may be any."""
+        """Return each episode's rows in a cell, (E,); fields that it does not name may be any."""
         kept = np.ones(len(self.cells), np.bool_)
         for name, value in cell.items():
             kept &= self._is(name, value)
@@ -84,7 +84,7 @@ class Yields:
 
     @cached_property
     def total(self) -> F64:
-        """(E,) rows of each episode."""
+        """Return the rows of each episode, (E,)."""
         return self._sum(np.ones(len(self.cells), np.bool_))
 
     def _hours_in(self, zone: str) -> F64:
@@ -247,7 +247,7 @@ def _without_split(store: Store, mixture: Mixture) -> Mixture:
 
 
 def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
-    """Strata whose rows do not bear the share that the mixture wants for them."""
+    """Find strata with too few rows for the share that the mixture wants."""
     gaps = []
     names = plan.rows["episode_id"].combine_chunks().dictionary
     for code, line in enumerate(plan.strata):
@@ -262,7 +262,7 @@ def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
 
 
 def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
-    """Zones, by how far their rows of a stratum are below their part of all driving."""
+    """Rank zones by how far their rows of a stratum fall below their part of all driving."""
     column = plan.rows["zone"].combine_chunks()
     names, zone = column.dictionary.to_pylist(), column.indices.fill_null(len(column.dictionary))
     size = len(names) + 1
@@ -309,7 +309,7 @@ def _of_audits(
 def _of_cells(
     yields: Yields, conditions: Sequence[Condition], min_rows: int, by: Sequence[str]
 ) -> list[Gap]:
-    """Cells with fewer rows than that, empty ones included.
+    """Find cells with fewer rows, empty ones included.
 
     A cell of a robot counts that robot's rows, and is forecast by what any robot meets.
     """

@@ -50,7 +50,7 @@ def diff_panels(first: Panel, second: Panel) -> dict[str, Any]:
 
 
 def key_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Rows:
-    """Keys, dotted, whose values are not the same; null where one has no such key."""
+    """Return the dotted keys whose values differ; null if one side lacks the key."""
     a, b = dict(_flat(first)), dict(_flat(second))
     return [
         {"key": key, "a": a.get(key), "b": b.get(key)}

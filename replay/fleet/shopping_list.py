@@ -277,7 +277,7 @@ def _with_probability(
 
 
 def describe_cell(gap: Gap) -> str:
-    """`wheel_slip`, or `wheel_slip, turn left 1.2, aisle_2`."""
+    """Name a cell: `wheel_slip`, or `wheel_slip, turn left 1.2, aisle_2`."""
     cell = dict(gap.cell)
     words = [str(cell.pop(name)) for name in ("stratum", "condition") if name in cell]
     if (action := cell.pop("action", None)) is not None:
@@ -286,7 +286,7 @@ def describe_cell(gap: Gap) -> str:
 
 
 def document(found: ShoppingList) -> dict[str, Any]:
-    """Plain values: what `restock coverage gaps --json` prints of it."""
+    """Return plain values, as `restock coverage gaps --json` prints them."""
     return {
         "unit": found.unit,
         "confidence": found.confidence,

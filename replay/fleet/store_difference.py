@@ -65,7 +65,7 @@ def shift(first: NDArray[Any], second: NDArray[Any]) -> Shift:
 def standardised_difference(
     first: F64, second: F64, confidence: float = 0.95
 ) -> ConfidenceInterval:
-    """(mean(second) - mean(first)) / pooled spread, of two values each; 0 where all agree."""
+    """Return (mean(second) - mean(first)) / pooled spread, of two values each; 0 if all agree."""
     n, m = len(first), len(second)
     difference = float(second.mean() - first.mean())
     spread = np.sqrt(((n - 1) * first.var(ddof=1) + (m - 1) * second.var(ddof=1)) / (n + m - 2))
@@ -319,7 +319,7 @@ def _side(connection: duckdb.DuckDBPyConnection, store: Store, name: str) -> dic
 
 
 def _definitions(connection: duckdb.DuckDBPyConnection) -> Rows:
-    """Conditions whose definition differs, and labels, profiles and software of the rows."""
+    """Compare the rows' condition definitions, labels, profiles and software."""
     found = _rows(
         connection,
         "SELECT 'condition ' || condition AS what,"
@@ -391,7 +391,7 @@ def _shares(connection: duckdb.DuckDBPyConnection, rng: np.random.Generator) -> 
 
 
 def _signals(connection: duckdb.DuckDBPyConnection) -> tuple[dict[str, Any], Rows]:
-    """Episode means of each signal: those that are only in b against those of a.
+    """Compare episode means of each signal: those only in b against those of a.
 
     Where b has no episode of its own, those that are only in a against those of b.
     """

@@ -172,12 +172,12 @@ class SourceShares(Checked, frozen=True):
 
     @property
     def parts(self) -> dict[str, Portion]:
-        """The share of a batch of each source that is not fresh."""
+        """Return the share of a batch of each source except fresh rows."""
         return {"logs": self.logs, **{store.name: store.share for store in self.stores}}
 
     @property
     def said(self) -> dict[str, Represents | None]:
-        """What the rows of each source that is not fresh stand for; None: it does not say."""
+        """Return what the rows of each source except fresh ones represent; None if not stated."""
         return {"logs": self.represents, **{store.name: store.represents for store in self.stores}}
 
     def chosen(self, name: str) -> bool:
@@ -186,7 +186,7 @@ class SourceShares(Checked, frozen=True):
 
     @property
     def last_bend(self) -> int:
-        """The environment step at which the last schedule ends, 0 without one."""
+        """Return the environment step at which the last schedule ends, 0 without one."""
         return max((step for part in self.parts.values() for step in knots(part)), default=0)
 
 
@@ -340,7 +340,7 @@ class Mixture(Checked, frozen=True):
 
     @property
     def most_draws(self) -> int | None:
-        """The most draws of one row, rounded down."""
+        """Return the maximum number of draws of one row, rounded down."""
         return None if self.max_replays_per_row is None else int(self.max_replays_per_row)
 
     def check(self) -> None:
@@ -407,5 +407,5 @@ def _mixture(document: dict[str, Any], where: str) -> Mixture:
 
 
 def nanoseconds(moment: datetime) -> int:
-    """Since 1970, exactly."""
+    """Return nanoseconds since 1970, exactly."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000

@@ -196,7 +196,7 @@ class ShareController(Stateful):
         return any(map(knots, portions + (parts if len(parts) > 1 else [])))
 
     def at(self, env_steps: float, stock: F64 | None = None) -> bool:
-        """Before an online batch is drawn: move to its moment. True if the shares changed.
+        """Advance to the next online batch; return whether the shares changed.
 
         `stock` (S,) is how many fresh rows of each stratum may be drawn, in batches.
         """
@@ -227,7 +227,7 @@ class ShareController(Stateful):
         self.drawn += np.bincount(stratum, minlength=len(self.drawn))
 
     def give_up(self) -> bool:
-        """Redistribute shares once a stratum's draws are used up; return if they changed."""
+        """Redistribute shares once a stratum's draws are used up; return whether they changed."""
         return self._work_out("redistribute")
 
     def _work_out(self, shortfall: Shortfall) -> bool:
@@ -380,7 +380,7 @@ class ShareController(Stateful):
         ]
 
     def why_short(self, stratum: int) -> str:
-        """Why a stratum gets less of a batch than its quota, in words."""
+        """Return in words why a stratum gets less of a batch than its quota."""
         rows = sum(of.rows for of, i in zip(self.strata, self._of, strict=True) if i == stratum)
         limit = self.max_replays
         reason = "the logs have no row of it"
@@ -488,15 +488,15 @@ class ShareController(Stateful):
 
     @property
     def names(self) -> list[str]:
-        """Of the strata, (S,)."""
+        """Return the strata's shares, (S,)."""
         return [stratum.name for stratum in self.strata]
 
     def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values, for a checkpoint."""
+        """Return arrays and JSON values for a checkpoint."""
         return super().state_dict() | {"planned": asdict(self.planned)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where `state_dict` was taken, with the plan of then.
+        """Restore the state, with the plan of that time.
 
         Raises:
             MixtureError: the state is of other strata.

@@ -293,7 +293,7 @@ def within_limits(
 
 
 def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: float = 0) -> F64:
-    """Given shares as they are; the rest to "equal" and "natural" strata, within floor and cap.
+    """Keep given shares; divide the rest among "equal" and "natural" strata, in floor and cap.
 
     "natural" strata are divided by their rows (S,), or by what is in their place.
 
@@ -326,7 +326,7 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: flo
 
 
 def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints | F64) -> F64:
-    """Relative sizes: an equal part each, the natural strata's parts pooled and split by rows."""
+    """Return relative sizes: equal parts; the natural strata's are pooled and split by rows."""
     natural = np.array([share == "natural" for share in shares], np.bool_)
     parts = flexible.astype(np.float64)
     if natural.any():

@@ -181,7 +181,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         }
 
     def __getstate__(self) -> dict[str, object]:
-        """Workers open the panel themselves: its rows are mapped, not copied."""
+        """Leave out the panel's rows: workers map the files themselves."""
         state = {name: value for name, value in self.__dict__.items() if name != "panel"}
         return state | {"_sent_by": self._rank()}
 
@@ -191,7 +191,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
 
 
 def _shared(size: int) -> Tensor:
-    """Zeros (size,) that processes with a copy of the dataset share."""
+    """Return zeros (size,) in memory shared by processes with a copy of the dataset."""
     zeros = torch.zeros(size, dtype=torch.int64)
     zeros.share_memory_()  # type: ignore[no-untyped-call]
     return zeros

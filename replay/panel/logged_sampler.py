@@ -98,7 +98,7 @@ class LoggedSampler(Stateful):
         return isinstance(self.sampler, ChunkedSampler)
 
     def move_to(self, env_steps: int, stock: F64 | None = None) -> bool:
-        """Before an online batch is drawn: shares move. True if they changed.
+        """Advance the shares to the next online batch; return whether they changed.
 
         `stock` (S,): see `ShareController.at`.
         """
@@ -148,11 +148,11 @@ class LoggedSampler(Stateful):
             self.sampler.gather(out)
 
     def update(self, rows: Ints, strata: Ints, td_abs: NDArray[Any]) -> None:
-        """|TD error| (n,) of rows (n,) of these strata (n,) that were just learnt from."""
+        """Take |TD error| (n,) of rows (n,) of these strata (n,) that were just learnt from."""
         self.sampler.update(rows, td_abs)
 
     def _follow(self) -> None:
-        """Pass the controller's shares to the sampler and the weights."""
+        """Apply the controller's shares to the sampler and the weights."""
         self.sampler.set_shares(self.controller.shares)
         if isinstance(self._weights, WeightsInForce):
             self._weights.set_shares(self.controller.shares)

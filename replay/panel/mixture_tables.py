@@ -159,7 +159,7 @@ def _install_function(
 
 
 def _changed_ns(name: str) -> int:
-    """When a mixture's file was last written: it is planned again when that changes."""
+    """Return when a mixture's file was last written; a change makes it planned again."""
     path = Path(name)
     return path.stat().st_mtime_ns if path.is_file() else 0
 

@@ -139,7 +139,7 @@ class PackedFile:
         self._writing[number] = self._writers.submit(self._store, number, held, whole)
 
     def _wait(self, at_most: int) -> None:
-        """Until no more are being written. Raises their errors."""
+        """Wait until all writes have ended, and raise their errors."""
         while len(self._writing) > at_most:
             self._writing.pop(next(iter(self._writing))).result()
 
@@ -215,7 +215,7 @@ class Packer:
             at += len(rows)
 
     def _stretches(self) -> Iterator[tuple[int, int, Ints]]:
-        """Stretches of the source, and which of their rows are packed."""
+        """Yield stretches of the source, and which of their rows are packed."""
         for begin, end in stretches(self.steps.rows):
             yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
 

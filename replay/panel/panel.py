@@ -131,7 +131,7 @@ def checksum(path: Path, leaf_bytes: int) -> str:
 
 
 def sample_checksum(path: Path) -> str:
-    """blake2b of blocks spread evenly over a file, its first and last among them, 32 hex digits."""
+    """Return blake2b of evenly spread blocks of a file, first and last included, 32 hex digits."""
     digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
     room = max(path.stat().st_size - BLOCK_BYTES, 0)
     with path.open("rb") as file:
@@ -296,7 +296,7 @@ class Panel:
 
     @property
     def task(self) -> Task:
-        """The task that made these rows. Raises PanelError where the source did not say."""
+        """Return the task that made these rows; raise PanelError if the source did not say."""
         if not self.header.task_json:
             raise PanelError("it does not contain its task", where=str(self.path))
         try:
@@ -375,17 +375,17 @@ class Panel:
 
     @property
     def stratum_code(self) -> NDArray[np.int16]:
-        """The place of each row's stratum in `strata`, (n,)."""
+        """Return the place of each row's stratum in `strata`, (n,)."""
         return np.asarray(self.meta_column("stratum_code"), np.int16)
 
     @property
     def weights(self) -> F32:
-        """Importance weight of each row, (n,), of mean 1 over what the quotas draw."""
+        """Return each row's importance weight, (n,), with mean 1 over what the quotas draw."""
         return np.asarray(self.meta_column("weight"), np.float32)
 
     @property
     def return_to_go(self) -> F32:
-        """Discounted rewards to the end of each row's episode, (n,).
+        """Return discounted rewards to the end of each row's episode, (n,).
 
         Raises PanelError where the mixture did not ask for it.
         """
@@ -403,7 +403,7 @@ class Panel:
         return [np.flatnonzero(code == index) for index in range(len(self.strata))]
 
     def sampler(self, batch_size: int, *, seed: int) -> LoggedSampler:
-        """Draws batches as the mixture says, see `sampler_for`."""
+        """Return a sampler that follows the mixture, see `sampler_for`."""
         from restock.replay.panel.logged_sampler import sampler_for
 
         return sampler_for(self, batch_size, seed=seed)

@@ -144,7 +144,7 @@ class SourceSteps:
         return n_step_horizon(self._continues(begin, end + n_step - 1), n_step)[: end - begin]
 
     def returns(self, begin: int, end: int, horizon: Ints, discount: float) -> F64:
-        """n-step returns of the rows [begin, end), of those horizons."""
+        """Compute n-step returns of the rows [begin, end) with these horizons."""
         ahead = int(horizon.max(initial=1)) - 1
         reward = self.reward[begin : end + ahead]
         padded = np.concatenate([horizon, np.ones(len(reward) - len(horizon), np.int64)])

@@ -287,7 +287,7 @@ STORE_COLUMN = "mixture_store"
 
 
 def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
-    """META_COLUMNS of the connection's `transitions`, for a SELECT."""
+    """Return META_COLUMNS of the connection's `transitions`, for a SELECT."""
     has = connection.sql("FROM transitions LIMIT 0").columns
     named = dict.fromkeys((name for name in LATER if name not in has), "NULL::VARCHAR")
     named["condition"] = "primary_condition"
@@ -301,7 +301,7 @@ def read_candidates(
     *,
     several_stores: bool = False,
 ) -> pa.Table:
-    """Every row of the connection's `transitions`, by recording, episode and step.
+    """Read every row of the connection's `transitions`, by recording, episode and step.
 
     META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is too near to call), and one
     boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0` …, and `state_0` …

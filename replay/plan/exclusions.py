@@ -98,7 +98,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
 
 @contextmanager
 def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -> Iterator[None]:
-    """Have what `repeats_of` needs by the end of the block, which must leave the connection alone.
+    """Prepare what `repeats_of` needs while the block runs, which must not use the connection.
 
     Raises StoreError where manifests cannot be read.
     """
@@ -158,7 +158,7 @@ def leave_out_of_strata(
     stratum: NDArray[np.int16],
     out: LeftOut,
 ) -> Bools:
-    """Leave out rows without a stratum, and those beyond the cap per episode or recording.
+    """Exclude rows without a stratum, and those beyond the cap per episode or recording.
 
     Returns the latter, (N,): they still count for natural shares.
 
@@ -246,7 +246,7 @@ class EvaluationRows:
 
     @classmethod
     def none(cls, rows: int, note: str = "") -> EvaluationRows:
-        """Nothing is kept."""
+        """Return a choice without held-out rows."""
         return cls(np.zeros(rows, np.bool_), np.zeros(rows, np.bool_), "none", note)
 
 

@@ -220,7 +220,7 @@ def plan_panel(
     conditions: Sequence[Condition],
     others: Sequence[PinnedStore] = (),
 ) -> PanelPlan:
-    """Work a mixture out over the connection's `transitions`.
+    """Plan a mixture over the connection's `transitions`.
 
     `others` are the mixture's other stores, where the view holds their rows too (`all_stores`).
 
@@ -340,7 +340,7 @@ def _dealt(
     state_code: NDArray[np.int16],
     counted: Bools,
 ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Strata (N,) and those of the state alone with each episode at its rarest, store by store."""
+    """Return strata (N,) and those of the state alone, each episode at its rarest, by store."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     stratum, state_code = stratum.copy(), state_code.copy()
     numbers = pc.unique(table["store"]).to_pylist()
@@ -487,7 +487,7 @@ def _prefix(source: SourceRows) -> str:
 
 
 def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:
-    """`effective_count` of each row's share of the draws times its weight, (n,)."""
+    """Return `effective_count` of each row's share of the draws times its weight, (n,)."""
     total = squares = 0.0
     for begin, end in stretches(len(code)):
         sizes = drawn[code[begin:end]] * weight[begin:end]

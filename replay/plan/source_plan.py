@@ -155,7 +155,7 @@ class Forecast:
 
 
 def episode_hours(first_ns: Ints, last_ns: Ints, rows: Ints) -> F64:
-    """Hours that episodes (E,) took: the last step takes as long as the others."""
+    """Return the hours that episodes (E,) took; the last step takes as long as the others."""
     steps = np.maximum(rows - 1, 1)
     return np.asarray((last_ns - first_ns) / 3.6e12 * rows / steps, np.float64)
 
@@ -168,7 +168,7 @@ def forecast(
     rng: np.random.Generator,
     replicates: int = REPLICATES,
 ) -> Forecast:
-    """Forecast from the yields of E episodes (E,), each of so many missions or hours (E,).
+    """Forecast from the yields of episodes (E,), each of so many missions or hours (E,).
 
     Episodes of no length (of one step, say) count as none, and so do those without a yield (NaN).
     """
@@ -211,7 +211,7 @@ def _needed(
 
 
 def missions_to_see_one(without: int) -> int:
-    """Missions that would show what `without` missions did not, with 95 %, at best.
+    """Return the missions that would show, with 95 %, what `without` missions did not, at best.
 
     At best: at the highest rate that such a silence leaves likely, the exact (Clopper-Pearson)
     bound at which `without` missions show none with 5 %. As many again then show one with 95 %.
@@ -460,7 +460,7 @@ def _outcomes(
     kept: Bools,
     natural: F64 | None,
 ) -> tuple[F32 | None, RatioFit | None]:
-    """P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None for none."""
+    """Return P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None."""
     code = source.code[kept]
     by_ratio = [s.correction == "density_ratio" and s.timing == "post" for s in strata]
     estimated = np.flatnonzero(by_ratio & (np.bincount(code, minlength=len(strata)) > 0))

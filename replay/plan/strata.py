@@ -248,7 +248,7 @@ def as_dealt(
     episode: Codes,
     strata: Sequence[ResolvedStratum],
 ) -> NDArray[np.int16]:
-    """Strata (N,) by priority with those of `deal_episodes` in place of the other dealt ones."""
+    """Return strata (N,) by priority, with those of `deal_episodes` in place of the dealt ones."""
     dealt = [index for index, stratum in enumerate(strata) if stratum.dealt]
     of_episode = given[episode]
     return np.where(np.isin(code, dealt) & (of_episode != NO_STRATUM), of_episode, code)

@@ -104,7 +104,7 @@ class RowWeights:
         return np.asarray(weight / max(float(total), 1e-12), np.float32)
 
     def _table(self, boost: F64) -> tuple[F64, F64]:
-        """Weights by stratum and state's stratum (S, S + 1), and a state's density (S + 1,)."""
+        """Return weights by stratum and state's stratum (S, S + 1) and state densities (S + 1,)."""
         corrected = np.array([stratum.correction != "none" for stratum in self.strata])
         # The density at which rows of a state are to be drawn: boosted, or as they occur.
         aim = np.where(corrected | (boost == 0), 1.0, boost)
@@ -131,7 +131,7 @@ def importance_weights(
     outcome: F32 | None = None,
     natural: F64 | None = None,
 ) -> F32:
-    """Weights (N,) of the rows of one source, see `RowWeights`."""
+    """Return weights (N,) of the rows of one source, see `RowWeights`."""
     return RowWeights(code, state_code, strata, rule, outcome, natural).under(shares)
 
 
@@ -153,7 +153,7 @@ def effective_shares(code: NDArray[np.int16], weights: F32, shares: F64) -> F64:
 
 
 def effective_count(sizes: NDArray[Any]) -> float:
-    """(sum n)^2 / sum n^2: how many equal groups these would be worth."""
+    """Return (sum n)^2 / sum n^2: how many equal groups these would be worth."""
     total = float((np.asarray(sizes, np.float64) ** 2).sum())
     return float(np.asarray(sizes).sum()) ** 2 / total if total > 0 else 0.0
 
@@ -193,7 +193,7 @@ class WeightsInForce:
         self._weight: F32 = np.ones(len(code), np.float32)
 
     def set_shares(self, shares: F64) -> None:
-        """Weights under these shares (K * S,) from now on, of mean 1 in each source."""
+        """Set the shares (K * S,) that weights are under, with mean 1 in each source."""
         for at, span, weights in self._parts:
             total = shares[span].sum()
             if len(at) and total > 0:
@@ -217,7 +217,7 @@ class RatioFit:
 
 
 def density_ratio(outcome: F32, boost: F64, state_aim: F64, clip: float) -> F64:
-    """r(s, a) of each row (N,), in units of its state's own density and at most `clip`.
+    """Return r(s, a) of each row (N,), in units of its state's own density, at most `clip`.
 
     `outcome` (N, S) is P(k | s, a) of the strata it is estimated for, `boost` (S,) how much more
     often a stratum is drawn than it occurs, `state_aim` (N,) the same for rows of other outcomes.
@@ -268,7 +268,7 @@ class OutcomeModel:
         self.theta: F64 = fitted.x.reshape(x.shape[1], outcomes)
 
     def probability(self, features: NDArray[Any]) -> F64:
-        """P(outcome) of each row, (n, outcomes)."""
+        """Return P(outcome) of each row, (n, outcomes)."""
         from scipy.special import softmax
 
         return np.asarray(softmax(self._design(features) @ self.theta, axis=1), np.float64)
@@ -317,7 +317,7 @@ def estimate_outcomes(
     names: tuple[str, ...],
     source: str,
 ) -> tuple[F32, RatioFit]:
-    """P(k | s, a) (n, K) of the strata `estimated` (K,) for each row, and how good it is.
+    """Estimate P(k | s, a) (n, K) of the strata `estimated` (K,), and how good that is.
 
     The features are the observation, the action and the state's own stratum.
     """
@@ -377,7 +377,7 @@ def _log_loss(probability: F64, outcome: Ints, weight: F64) -> float:
 def _observations(
     connection: duckdb.DuckDBPyConnection, ids: Ints, at: Ints
 ) -> Iterator[tuple[NDArray[np.float32], Ints]]:
-    """Batches of observations (m, D) of the rows `at`, with the rows they are of."""
+    """Yield batches of observations (m, D) of the rows `at`, with their rows."""
     order = np.argsort(ids[at])
     wanted = ids[at][order]
     query = f"SELECT transition_id, observation FROM {as_stored(connection)}"

@@ -212,7 +212,7 @@ class _Buffer(StratumDraws):
 
 
 def _share_out(sizes: Ints, rows: int) -> Ints:
-    """Buffers (S,) of strata of `sizes`: the small ones whole, the others alike."""
+    """Return buffer sizes (S,) of strata of `sizes`: small ones whole, the others equal."""
     room = np.zeros(len(sizes), np.int64)
     left = rows
     for done, stratum in enumerate(np.argsort(sizes, kind="stable").tolist()):

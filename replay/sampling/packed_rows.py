@@ -33,7 +33,7 @@ SCALARS = ("action", "reward", "discount")
 
 
 def row_width(observation_size: int) -> int:
-    """Floats in a packed row."""
+    """Return the number of floats in a packed row."""
     return 2 * observation_size + len(SCALARS)
 
 
@@ -158,6 +158,6 @@ def read_into(out: F32, file: int, at: int) -> bool:
 
 
 def _advise(fd: int, offset: int, length: int, advice: str) -> None:
-    """posix_fadvise where the system has it."""
+    """Call posix_fadvise if the system has it."""
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(fd, offset, length, getattr(os, advice))

@@ -139,7 +139,7 @@ class Reserve(Stateful):
         self._victims: Ints = np.empty(0, np.int64)  # slots that are overwritten next
 
     def take(self, count: int) -> Ints:
-        """Slots (count,) for new rows; those that held others belong to no condition any more."""
+        """Return slots (count,) for new rows; their old rows lose their conditions."""
         beyond = max(self.appended + count - self.capacity, 0)
         if beyond and self.rows.any():
             beyond = min(beyond, count)
@@ -367,12 +367,12 @@ class FreshRing(Stateful):
 
     @property
     def appended(self) -> int:
-        """Rows ever appended. Where none are reserved, the next slot is appended % capacity."""
+        """Return the rows ever appended. If none are reserved, the next slot is that % capacity."""
         return self._reserve.appended
 
     @appended.setter
     def appended(self, rows: int) -> None:
-        """For who filled `rows` themselves."""
+        """Set the count after `rows` was filled from outside."""
         self._reserve.appended = rows
 
     def __len__(self) -> int:
@@ -513,7 +513,7 @@ class FreshRing(Stateful):
         limit: int | None = None,
         since: int | None = None,
     ) -> Ints:
-        """Slots (n,) of so many rows of each stratum (S,), each of its rows alike.
+        """Draw slots (n,) by each stratum's number of rows (S,), uniformly within it.
 
         Args:
             limit: a row that was drawn so often is not drawn again.
@@ -541,7 +541,7 @@ class FreshRing(Stateful):
         return slots
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Ints:
-        """Slots (B,), every row in the ring with the same probability.
+        """Draw slots (B,) uniformly from the ring.
 
         Raises MixtureError when the ring is empty.
         """

@@ -157,7 +157,7 @@ class Per(StratumDraws):
 
     @property
     def priority(self) -> F32:
-        """Priorities of the rows (n,), as they are now."""
+        """Return the current priorities of the rows, (n,)."""
         return self._priority[: self.size]
 
     def _raised(self, td_abs: F32) -> F32:

@@ -26,7 +26,7 @@ MIN_BLOCK, MAX_BLOCK = 8, 128
 
 
 def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
-    """|TD error| (n,) of rows (n,): what a priority or a share can follow.
+    """Take |TD error| (n,) of rows (n,), which a priority or a share can follow.
 
     Raises:
         MixtureError: one that is negative or not finite, or not one a row.
@@ -69,13 +69,13 @@ class Sampler(Protocol):
         """Draw row numbers (B,) and the stratum of each (B,)."""
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """|TD error| (n,) of rows (n,) that were just learnt from."""
+        """Take |TD error| (n,) of rows (n,) that were just learnt from."""
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
         """Set the shares from the next batch on."""
 
     def set_batch_size(self, batch_size: int) -> None:
-        """Batches of another size from the next one on."""
+        """Change the batch size, from the next batch on."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return all state that decides later draws: arrays and JSON values."""
@@ -112,7 +112,7 @@ class Quotas(Stateful):
 
     @property
     def carry(self) -> F64:
-        """Rows that each stratum is still owed, (S,)."""
+        """Return the rows that each stratum is still owed, (S,)."""
         return np.array(self._carry)
 
     @carry.setter
@@ -188,7 +188,7 @@ class Quotas(Stateful):
         return np.array(quotas, np.int64)
 
     def give_back(self, quotas: Ints) -> None:
-        """Batches that were not handed out after all, (n, S): their strata are owed them again."""
+        """Take back batches that were not handed out, (n, S): their strata are owed them again."""
         back = self.carry + quotas.sum(axis=0) - len(quotas) * np.array(self._mean)
         self._carry = back.tolist()
 

@@ -64,7 +64,7 @@ class Audit:
 
     @property
     def parameters(self) -> set[str]:
-        """The thresholds that the query uses."""
+        """Return the thresholds that the query uses."""
         return set(re.findall(r"\$([A-Za-z_]\w*)", self.sql))
 
 
@@ -336,7 +336,7 @@ class Capacity:
 
     @property
     def reason(self) -> str:
-        """Why so many, in a sentence."""
+        """Return in a sentence why the capacity is so large."""
         cells = (
             f"{self.rows_for_cells:,} of {self.rows:,} rows keep {self.cells_share:.0%} of the"
             f" {self.cells} condition x zone x action cells ever seen"

@@ -47,7 +47,7 @@ def view_docs() -> dict[str, str]:
 
 
 def column_docs() -> dict[tuple[str, str], str]:
-    """(view, column) -> meaning, as far as they are named there; see `meaning` for the rest."""
+    """Return (view, column) -> meaning where the definitions name it; `meaning` has the rest."""
     meanings = {
         (view, column): text
         for view, table in _read().items()

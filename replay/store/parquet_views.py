@@ -50,7 +50,7 @@ _OTHER = (
 
 @contextmanager
 def passed_in(connection: duckdb.DuckDBPyConnection, **tables: pa.Table) -> Iterator[None]:
-    """Tables that the connection's SQL sees by their names, for as long as the block runs."""
+    """Make tables visible to the connection's SQL by their names while the block runs."""
     for name, table in tables.items():
         connection.register(name, table)
     try:
@@ -170,7 +170,7 @@ def _list(files: Sequence[str | os.PathLike[str]]) -> str:
 
 
 def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
-    """Columns of an Arrow schema with DuckDB's types."""
+    """Return the columns of an Arrow schema with DuckDB's types."""
     with passed_in(connection, columns_of_schema=schema.empty_table()):
         rows = connection.sql("DESCRIBE columns_of_schema").fetchall()
     return {str(row[0]): str(row[1]) for row in rows}
@@ -197,7 +197,7 @@ class StoredTable:
 
     @cached_property
     def addresses(self) -> list[str]:
-        """The files, as a reader of files names them."""
+        """Return the files' names as DuckDB's readers report them."""
         folder = self.place.table(self.table)
         return [f"{folder}/{path}" for path in self.paths]
 
@@ -260,7 +260,7 @@ class StoredTable:
         return dataset.FileSystemDataset(fragments, self.schema, parquet, self.place.files)
 
     def _read_each(self) -> pa.Table:
-        """File by file; a text that many recordings have stands once."""
+        """Read the manifests file by file; a text that many recordings share is kept once."""
         schema = pa.schema(
             [field.with_type(_TEXT) if field.name in DOCUMENTS else field for field in self.schema]
         )

@@ -156,7 +156,7 @@ def fetch(
     at_most: int | None = None,
     alone: bool = False,
 ) -> tuple[list[str], list[tuple[Any, ...]], int]:
-    """Column names, rows (the first `at_most`), and how many there are; Ctrl-C stops it.
+    """Return column names, the first `at_most` rows and the number of rows; Ctrl-C stops it.
 
     Of several columns of a name, as a join gives, the later ones are `name_1`, `name_2`, …
 
@@ -193,7 +193,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def found(
     connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
 ) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Column names and rows of a query with its `$name` parameters; times as `values` has them.
+    """Return column names and rows of a query with `$name` parameters; times as in `values`.
 
     It is bound once: over many views that takes longer than to run it over a small store.
     """
@@ -240,7 +240,7 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
 
 
 def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
-    """DuckDB's error as one worth reading: of the query, or of a file that it could not read."""
+    """Turn DuckDB's error into one about the query, or about a file that it could not read."""
     said = QueryError(_message(error), where=where, remedy=hint(error))
     return damage(error, where=where) or said
 

@@ -164,7 +164,7 @@ def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def same_drives(rows: MovingRows) -> pa.Table:
-    """Pairs of recordings with MIN_ROWS distinctive rows, and MIN_SHARE of them, in common.
+    """Find pairs of recordings that share MIN_ROWS distinctive rows, and MIN_SHARE of them.
 
     Columns: `recording_id`, `same_as` (the later name), `rows` of both within WITHIN_NS of the
     shift, `share` of the distinctive rows of the smaller one, and `later_s`, the shift. A content
@@ -256,7 +256,7 @@ def _distinctive(
 
 
 def _pairs(content: NDArray[np.uint64]) -> Iterator[tuple[Ints, Ints]]:
-    """Places of two rows that have one content (M,), which is ascending."""
+    """Return the places of two rows with equal content (M,); `content` is ascending."""
     begins = np.flatnonzero(np.concatenate([[True], content[1:] != content[:-1]]))
     begins = begins if len(content) else np.empty(0, np.int64)
     size = np.diff(begins, append=len(content))

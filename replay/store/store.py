@@ -310,7 +310,7 @@ class Store:
         return dict(rows)
 
     def _observation_type(self) -> str:
-        """Fixed-size where all tasks agree on the size: DuckDB reads Delta's lists as FLOAT[].
+        """Make lists fixed-size if all tasks agree on the size: DuckDB reads Delta's as FLOAT[].
 
         The size of another version's observation is not known.
         """
@@ -363,14 +363,14 @@ class Store:
         return True
 
     def _install_shared_rows(self) -> None:
-        """`shared_rows` of what the manifests keep, in place of the view over rows."""
+        """Make `shared_rows` from what the manifests keep, in place of the view over rows."""
         held = self._ingests.to_pylist()
         recordings = {one["ingest_id"]: one["recording_id"] for one in held}
         rows = sum(one["rows"] for one in held)
         install_shared_rows(self.bare, self._summaries.row_groups, recordings, rows)
 
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """`stored_ingests`, what the files hold, and a view `stored_…` of each table.
+        """Make `stored_ingests`, what the files hold, and a view `stored_…` of each table.
 
         Manifests are held in memory; transitions on S3 are read at each query.
         """

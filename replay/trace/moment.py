@@ -157,12 +157,12 @@ class Moment:
 
     @property
     def observations(self) -> F32:
-        """(T, D) float32."""
+        """Return the observations, (T, D) float32."""
         return np.asarray(self.column("observation"), np.float32)
 
     @property
     def log_ns(self) -> list[int]:
-        """When each step was by log time, (T,)."""
+        """Return each step's log time, (T,)."""
         return [int(stamp) + self.log_offset_ns for stamp in self.column("stamp_ns")]
 
     def sector_scans(self) -> list[SeenScan]:

@@ -372,7 +372,7 @@ def _interpret(origin: Origin, recording: Path | str | None, name: str | None) -
 
 
 def _moment(row: Mapping[str, Any], manifest: Mapping[str, Any] | None) -> dict[str, Any]:
-    """When a row was: its stamp, by log time, and the window its messages lie in."""
+    """Return a row's times: its stamp, its log time, and the window of its messages."""
     stamp = int(row["stamp_ns"])
     offset = (manifest or {}).get("clock_offset_ns") or 0
     logged = stamp + int(offset)

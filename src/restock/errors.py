@@ -18,7 +18,7 @@ TRACEBACK = "RESTOCK_TRACEBACK"  # environment variable that prints tracebacks
 
 
 def reported(text: str, keep: str = "") -> str:
-    """Mask the key and secret of an address such as `s3://KEY:SECRET@…`; else as `visible`."""
+    """Mask key and secret of an address such as `s3://KEY:SECRET@…`, and escape as `visible`."""
     return visible(_SECRET.sub(r"\1***:***@", text), keep)
 
 
@@ -128,12 +128,12 @@ _POLICIES = ("agent", "planner", "operator", "random", "cloned")  # a run's fold
 
 
 def plural(number: int, noun: str) -> str:
-    """`gap` of 1, else `gaps`."""
+    """Return the singular `gap` for 1, else `gaps`."""
     return noun if number == 1 else f"{noun}s"
 
 
 def counted(number: int, noun: str) -> str:
-    """`1 gap`, `1,200 gaps`."""
+    """Return a number with its noun: `1 gap`, `1,200 gaps`."""
     return f"{number:,} {plural(number, noun)}"
 
 

@@ -125,7 +125,7 @@ def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
 
 def interrupt_running() -> None:
-    """Interrupt those that other threads wait for: no interrupt reaches a thread."""
+    """Interrupt processes that other threads wait for, since no interrupt reaches a thread."""
     for process in list(_running):
         process.send_signal(signal.SIGTERM)
 

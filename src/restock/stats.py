@@ -87,7 +87,7 @@ def median(values: NDArray[Any]) -> float:
 
 
 def paired_improvement(better: NDArray[Any], worse: NDArray[Any]) -> float:
-    """P(a value of `better` (n,) beats that of `worse` at its place), ties counting half."""
+    """Return P(a value of `better` (n,) beats its partner in `worse`), ties counting half."""
     return _wins(np.asarray(better, np.float64) - np.asarray(worse, np.float64))
 
 
@@ -103,7 +103,7 @@ def improvement_of_arms(
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> ConfidenceInterval:
-    """P(a run of `better` beats one of `worse` on an episode), ties counting half.
+    """Return P(a run of `better` beats one of `worse` on an episode), ties counting half.
 
     The mean over episodes and all pairs of runs (arXiv:2108.13264), with a percentile bootstrap in
     which the runs of each arm and the episodes, common to both, are drawn whole: it holds what
@@ -349,7 +349,7 @@ def clustered_ratio(
 
 
 def _quantile_rows(values: F64, weights: F64, shares: Sequence[float]) -> F64:
-    """Weighted quantiles (R, Q) of sorted values (N,) under weights (R, N)."""
+    """Return weighted quantiles (R, Q) of sorted values (N,) under weights (R, N)."""
     total = np.cumsum(weights, axis=1)
     rows = np.empty((len(weights), len(shares)))
     for column, share in enumerate(shares):

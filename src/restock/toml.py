@@ -106,7 +106,7 @@ def typed(
     renamed: Mapping[str, str] | None = None,
     prefix: str = "",
 ) -> T:
-    """Plain values as a typed struct.
+    """Convert plain values to a typed struct.
 
     Args:
         renamed: keys of earlier versions, dotted, each with what became of it (restock.renamed).
@@ -234,7 +234,7 @@ def _inside(value: float, bounds: Mapping[str, float]) -> bool:
 
 
 def _range_in_words(bounds: Mapping[str, float]) -> str:
-    """`in [0, 1)`, `at least 1`, `above 0`, `at most 1`, `below 1`."""
+    """Describe a range: `in [0, 1)`, `at least 1`, `above 0`, `at most 1`, `below 1`."""
     low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
     if low is not None and high is not None:
         left, right = "[" if "ge" in bounds else "(", "]" if "le" in bounds else ")"
@@ -421,7 +421,7 @@ def _structs(kind: kinds.Type, seen: set[type]) -> Iterator[type]:
 
 
 def _without_null(value: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no null: what may be left out is a field without one."""
+    """Remove null from a field's type, since TOML has none: the key is left out instead."""
     choices = [choice for choice in value.get("anyOf", ()) if choice != {"type": "null"}]
     if len(choices) == len(value.get("anyOf", ())):
         return value

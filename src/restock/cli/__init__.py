@@ -318,7 +318,7 @@ codecs.register_error(SUBSTITUTED, _substituted)
 
 @contextmanager
 def work_goes_on() -> Iterator[None]:
-    """While the block runs, a reader of stdout who goes away (`| head`) does not end the work.
+    """Let the block finish its work even if stdout's reader goes away (`| head`).
 
     Raises:
         ConfigError: at the end, where stdout could not be written for another reason.

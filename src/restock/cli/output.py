@@ -119,7 +119,7 @@ def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None
 
 
 def print_skipped(reasons: Mapping[str, str | None]) -> None:
-    """Why topics' messages were skipped: sentences, which no column is wide enough for."""
+    """Print in sentences why topics' messages were skipped."""
     topics: dict[str, list[str]] = {}
     for topic, reason in reasons.items():
         if reason:

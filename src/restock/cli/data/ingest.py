@@ -73,7 +73,7 @@ class IngestCommand:
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 
     def run(self) -> int:
-        """Ingest each recording; the exit code for them all."""
+        """Ingest each recording; return the exit code for all."""
         if self.workers > 1 and self.engine == "processes":
             from restock.ingest.batch import warm_up
 

@@ -359,6 +359,6 @@ def _ends(low: float, high: float) -> str:
 
 
 def _short(value: Any) -> Any:
-    """On a terminal a definition's SQL is cut; --json has it whole."""
+    """Shorten a definition's SQL for a terminal; --json has it whole."""
     text = " ".join(str(value).split()) if value is not None else "(none)"
     return text if len(text) <= 100 or not sys.stdout.isatty() else f"{text[:99]}…"

@@ -45,7 +45,7 @@ class CompactCommand:
     {"joined_again", "dropped", "lost", "unnamed_transitions"}."""
 
     def run(self) -> ExitCode:
-        """Compact, and say what became of the files."""
+        """Compact, and report what became of the files."""
         from restock.cli import output
         from restock.ingest.store.writer import StoreWriter, compact
 

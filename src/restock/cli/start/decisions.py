@@ -135,7 +135,7 @@ def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bo
 
 
 def node_refuses(profile: Path | str | None) -> str | None:
-    """Why the node refuses this profile on a robot, and which one it needs; None: it takes it."""
+    """Return why the node refuses this profile, and which one it needs; None if it takes it."""
     from restock.ingest.profile.profile import load_profile, not_live
 
     if profile is None or not (lacking := not_live(load_profile(str(profile)))):
@@ -173,7 +173,7 @@ def _task(profile: Path | str | None) -> Task | None:
 
 
 def practice_settings(profile: Path | str | None) -> list[str]:
-    """Practise missions that go wrong, if the task has a goal."""
+    """Return settings that practise missions that go wrong, if the task has a goal."""
     return ["practice.rule=success"] if has_goal(profile) else []
 
 

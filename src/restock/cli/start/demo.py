@@ -393,7 +393,7 @@ def _draws(run: Path, panel: Panel, episode: str) -> tuple[int, float]:
 
 
 def _message(name: str, fields: dict[str, Any]) -> str:
-    """Summarize a message in a few words; "" if that would say little here."""
+    """Summarise a message in a few words; "" if that would be of little use."""
     if name == "scan":
         ranges = [r for r in fields.get("ranges", ()) if r is not None and math.isfinite(r)]
         return f"the nearest return is {min(ranges):.2f} m away" if ranges else "no return"

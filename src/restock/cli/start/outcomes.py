@@ -68,7 +68,7 @@ _TELLING = (
 
 
 def ingest(document: Document) -> list[str]:
-    """Rows, and what failed."""
+    """Describe the rows, and what failed."""
     rows = document["recordings"]
     held = [row for row in rows if row["status"] != "failed"]
     good = list({row["recording_id"]: row for row in reversed(held)}.values())[::-1]
@@ -259,7 +259,7 @@ def _estimate(row: Mapping[str, Any]) -> str:
 
 
 def report(document: Document) -> list[str]:
-    """Nothing: the page is the outcome."""
+    """Return no lines: the page is the outcome."""
     return []
 
 

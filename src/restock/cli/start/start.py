@@ -182,7 +182,7 @@ class Way:
             )
 
     def _panel(self) -> tuple[Document, Document]:
-        """Rows, what they cover, and what is drawn of them: coverage and panel."""
+        """Ingest and mix; return the documents of coverage and panel."""
         to, do = self.to, self.work.do
         if not do(stages.ingest(to)).good:
             raise Stopped("nothing could be ingested", f"edit {to.profile}", self.again)

@@ -420,12 +420,12 @@ def _no_rate(gap: dict[str, Any]) -> str:
 
 
 def _more_of(kind: str, episodes: int) -> str:
-    """`9 more episodes of blocked aisle`."""
+    """Return a need in words: `9 more episodes of blocked aisle`."""
     return f"{episodes:,} more {plural(episodes, 'episode')} of {kind}"
 
 
 def _without_empty(rows: Rows) -> Rows:
-    """Without the columns that say nothing in any row."""
+    """Remove columns that are empty in every row."""
     reported = {name for row in rows for name, value in row.items() if value != ""}
     return [{name: value for name, value in row.items() if name in reported} for row in rows]
 

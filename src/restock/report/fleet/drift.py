@@ -150,7 +150,7 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
 
 
 def _overview_section(drift: Drift, own: Rows) -> Section | None:
-    """Size of every hardware signal's change, by robot and period."""
+    """Chart the change of every hardware signal, by robot and period."""
     found = {row["robot"] for row in drift.findings}
     robots = _chosen({row["robot"] for row in own}, found)
     rows = _newest(
@@ -368,7 +368,7 @@ _MEANINGS = {  # what a signal measures; docs/coverage.md says how
 
 
 def signal_name(row: dict[str, Any]) -> str:
-    """`wheel pull (rad/m)`; of a condition its events, and the zone where there is one."""
+    """Name a signal with its unit, or a condition's events with their zone."""
     name, unit = row["signal"], unit_of(row["signal"])
     ending = next((ending for ending, _ in UNITS if unit and name.endswith(ending)), "")
     name = words(name.removesuffix(ending)) + (f" ({unit})" if unit else "")
@@ -394,7 +394,7 @@ def meanings(rows: Iterable[dict[str, Any]]) -> Rows:
 
 
 def change_text(row: dict[str, Any]) -> str:
-    """`× 0.942 [0.935, 0.950]`, or a difference with its sign."""
+    """Format a ratio as `× 0.942 [0.935, 0.950]`, or a difference with its sign."""
     if row["change"] is None:
         return ""
     ratio = row["compared"] == "ratio"

@@ -100,7 +100,7 @@ class Section:
 
 
 def words(name: str) -> str:
-    """`blocked_aisle` to `blocked aisle`."""
+    """Turn `blocked_aisle` into `blocked aisle`."""
     return name.replace("_", " ")
 
 

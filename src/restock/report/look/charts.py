@@ -100,7 +100,7 @@ def plot(rows: Sequence[Row]) -> Any:
 
 
 def _shown(value: Any) -> Any:
-    """JSON has no NaN and no infinity, and a page of one is none."""
+    """Replace NaN and infinity, which JSON lacks, by null."""
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value
@@ -169,7 +169,7 @@ def palette(
 
 
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
-    """Above the chart, in as many columns as fit beside the labels of its vertical axis."""
+    """Place a legend above the chart, in as many columns as fit beside its axis labels."""
     longest = max((len(name) for name in names), default=1) * LETTER_PX
     apart = 10 + WIDER_FONT * longest  # of columns: a reader's font may be wider than ours
     columns = max(1, min(len(names), int((width - labels_px) // (longest + 26 + apart))))
@@ -195,7 +195,7 @@ def coloured(
 
 
 def label_px(names: Sequence[str]) -> int:
-    """About how wide the labels of an axis are."""
+    """Estimate the width of an axis' labels."""
     return round(max((len(name) for name in names), default=0) * LETTER_PX) + 14
 
 
@@ -316,7 +316,7 @@ def x_axis(width: int, labels: str = SHORT_NUMBERS) -> alt.Axis:
 
 
 def ages(rows: Sequence[Row]) -> Drawing:
-    """Age histograms by source: rows of source, bucket (text), order, share."""
+    """Chart age histograms by source, from rows of source, bucket (text), order, share."""
     sources = ordered(rows, "source", SOURCE_COLOURS)
     buckets = [row["bucket"] for row in sorted(rows, key=lambda row: row["order"])]
 

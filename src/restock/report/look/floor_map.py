@@ -98,7 +98,7 @@ def events(
 
 
 def legend(conditions: Sequence[str], colours: Mapping[str, str]) -> str:
-    """Swatches, as HTML."""
+    """Return swatches as HTML."""
     return " ".join(
         f'<span class="key"><span class="swatch"'
         f' style="background:{colours[name]}"></span>{escape(words(name))}</span>'

@@ -324,7 +324,7 @@ def _field(name: str, channel: Spec, units: list[Spec], rows: Mapping[str, Any])
 
 
 def _end(name: str) -> str:
-    """`low` or `high` of the end of an interval."""
+    """Return `low` or `high` for the end of an interval."""
     return next((end for end in _ENDS[1:] if f"_{name}".endswith(f"_{end}")), "")
 
 
@@ -342,7 +342,7 @@ def _is_share(name: str, units: list[Spec]) -> bool:
 
 @cache
 def _runtime() -> str:
-    """Vega with all that it needs, as one script."""
+    """Return Vega and its dependencies as one script."""
     return _LICENCE + vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")
 
 

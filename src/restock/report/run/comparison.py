@@ -366,7 +366,7 @@ def _study_headline(study: dict[str, Any]) -> str:
 
 
 def _measure(name: str) -> str:
-    """`auc_rare` for people."""
+    """Name a measure such as `auc_rare` in words."""
     kind, _, what = name.partition("_")
     where = "the rare conditions" if what == "rare" else words(what)
     return f"{where}, " + (

@@ -108,7 +108,7 @@ SHARE_COLOURS = {
 
 
 def shares_figure(facts: Facts) -> Figure | None:
-    """Three bars a stratum; None for a run without a panel."""
+    """Chart three bars per stratum; None for a run without a panel."""
     rows = share_bars(facts)
     if not rows:
         return None

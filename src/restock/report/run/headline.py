@@ -292,7 +292,7 @@ def judged_section(facts: Facts) -> Section:
 
 
 def off_policy_table(rows: Rows) -> Table:
-    """Off-policy estimates, a row a measure and estimator."""
+    """Show off-policy estimates, a row per measure and estimator."""
     shown = [
         {
             "measure": row["measure"],

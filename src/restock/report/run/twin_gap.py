@@ -130,7 +130,7 @@ def headline(gap: TwinGap) -> str:
 
 
 def gap_section(gap: TwinGap) -> Section:
-    """Pose gaps by horizon and condition, the verdicts and what could not be done."""
+    """Show pose gaps by horizon and condition, the verdicts, and what could not be measured."""
     limits = gap.about["limits"]
     worst_first = [UNTRUSTED, UNDECIDED, UNKNOWN, TRUSTED]
     shown = [
@@ -306,7 +306,7 @@ def _by_source(rows: Rows, value: str, *keys: str) -> dict[tuple[Any, ...], dict
 
 
 def _observations(gap: TwinGap) -> Rows:
-    """Observation gaps in nominal driving, lidar sectors averaged."""
+    """Show observation gaps in nominal driving, lidar sectors averaged."""
     sums: dict[str, dict[str, list[float]]] = {}
     for row in gap.observations:
         if row["condition"] == "nominal" and row["mean_gap"] is not None:
