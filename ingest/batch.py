@@ -204,7 +204,7 @@ def side_by_side(
     context = _context()
 
     def begin(worker: _Worker[T]) -> None:
-        """Hand it its next recording, or let it go."""
+        """Give the worker its next recording, or end it."""
         worker.at_hand = ahead.popleft() if ahead else None
         if worker.at_hand is None:
             worker.pipe.close()
@@ -291,7 +291,7 @@ def _context() -> ForkServerContext | SpawnContext:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a recording, a folder's files together; 0 where it is gone."""
+    """Return the bytes of a recording, summed over a folder's files; 0 if it is gone."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
 
@@ -346,7 +346,7 @@ def _answer(ray: Any, result: Any, path: Path) -> Prepared | RestockError:
 
 @contextmanager
 def cluster(workers: int) -> Iterator[Any]:
-    """Ray, with a cluster to give tasks to."""
+    """Return Ray, connected to a cluster."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
     ray = import_extra("ray", "ray", "--engine ray needs Ray")
@@ -375,7 +375,7 @@ def cluster(workers: int) -> Iterator[Any]:
 
 
 def _expect(address: str | None) -> None:
-    """Knock at a cluster's door: Ray itself would wait for minutes."""
+    """Check that a cluster's address answers: Ray itself would wait for minutes."""
     match = re.fullmatch(r"(?:ray://)?([^:/]+):(\d+)", address or "")
     if match is None:  # none, or a word like "auto"
         return

@@ -178,7 +178,7 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
 
 
 def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
-    """Whether the profile that a recording was ingested with says something else in [robot]."""
+    """Return whether a recording was ingested with another [robot] in its profile."""
     try:
         return (
             read_profile_toml(before["profile_toml"], where="profile_toml").robot != profile.robot

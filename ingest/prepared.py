@@ -99,7 +99,7 @@ def _id(one: Prepared) -> str | None:
 def _refusal(
     store: StoreWriter, one: Prepared, before: Sequence[Prepared]
 ) -> RecordingError | StoreError | None:
-    """Why a recording is not to be committed: it is in the store, or before it in its group."""
+    """Return why a recording is not to be committed: it is in the store or earlier in its group."""
     if one.staged is None or one.repeated in (None, "keep"):
         return None
     ahead = [other.staged for other in before if other.staged]

@@ -344,7 +344,7 @@ def _within(at: int, chunks: list[Chunk]) -> bool:
 
 
 def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
-    """Go on at each next chunk that can be recognised, walking from it to the next damage."""
+    """Continue at each recognisable chunk, and walk from it to the next damage."""
     lost = []
     for at in _recognised(file, cut + 1):
         if at < cut:

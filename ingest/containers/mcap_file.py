@@ -463,7 +463,7 @@ class McapFile:
     # -- reading ---------------------------------------------------------------------------
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Loose messages first, then groups of chunks of about 8 MiB.
+        """Yield loose messages first, then groups of chunks of about 8 MiB.
 
         A batch is valid until the next one is read: its buffer is used again.
         """

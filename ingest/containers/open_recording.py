@@ -532,7 +532,7 @@ class _Opening:
         return container.bag_format if self.path.is_dir() else container.format
 
     def _refuse_serialisation(self, metadata: BagMetadata) -> None:
-        """rosbag2 can store what other middlewares serialise: only CDR can be decoded."""
+        """Refuse other serialisations than CDR, which rosbag2 can store, too."""
         ros2 = [storage for storage in self.storages if storage.from_ros2]
         encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
         claimed = {topic.serialization for topic in metadata.topics if topic.serialization}

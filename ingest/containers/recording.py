@@ -120,7 +120,7 @@ class Recording:
 
     @cached_property
     def recording_id(self) -> str:
-        """16 hex digits of BLAKE3 of its files' content, in order: the same wherever it lies."""
+        """Return 16 hex digits of BLAKE3 of its files' content, in order, wherever it lies."""
         digest = blake3()  # of a bag with images, blake2b was a third of an ingest
         done, whole = 0, self.size_bytes
         for file in self.files:
@@ -220,7 +220,7 @@ class Recording:
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """First and last log time; None in a recording without messages."""
+        """Return first and last log time; None for a recording without messages."""
         spans = [storage.span_ns for storage in self._storages if storage.span_ns]
         if not spans:
             return None
@@ -290,7 +290,7 @@ class Recording:
         wanted: Mapping[str, Sequence[str]],
         reductions: Mapping[str, Reduction] | None = None,
     ) -> dict[str, TopicColumns]:
-        """Columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
+        """Read columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
 
         A topic that cannot be decoded is left out; `accounts` has the reason. `reductions`
         names, of some of these topics, fields that are made into others as they are read: for

@@ -219,7 +219,7 @@ class SqliteFile:
         return counts, (min(stamps), max(stamps)) if stamps else None
 
     def _read_metadata(self) -> None:
-        """rosbag2 keeps its metadata.yaml here too; the last row is of when it was closed."""
+        """Read rosbag2's metadata.yaml from the database; the last row is from its closing."""
         try:
             refuse_programs(self._connection, ("metadata",))
             row = self._connection.execute(

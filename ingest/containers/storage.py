@@ -200,7 +200,7 @@ def most_bytes(stored: int, at_least: int = CHUNK) -> int:
 
 
 def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
-    """Decompress a storage file into `target`; what is wrong with it, if it is to be salvaged.
+    """Decompress a storage file into `target`; return its damage if it is to be salvaged.
 
     Raises:
         RecordingError: it is damaged, cut short, or decompresses to implausibly much.

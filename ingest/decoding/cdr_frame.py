@@ -161,7 +161,7 @@ def gather_sequences(
 
 
 def texts(frame: Frame, at: Ints, lengths: Position) -> FieldColumn:
-    """Texts of these byte lengths as an object array of str, (N,)."""
+    """Read texts of these byte lengths as an object array of str, (N,)."""
     count = len(at)
     out = np.empty(count, object)
     if not count:
@@ -220,7 +220,7 @@ class FixedField:
 
     @property
     def size(self) -> int:
-        """Bytes of all its values."""
+        """Return the bytes of all its values."""
         return self.dtype.itemsize * (1 if self.count is None else self.count)
 
 

@@ -62,7 +62,7 @@ FieldColumn: TypeAlias = "NDArray[Any] | Ragged"  # leading axis: the message
 
 
 def offsets_of(lengths: NDArray[Any]) -> Ints:
-    """Lengths (N,) to offsets (N + 1,)."""
+    """Turn lengths (N,) into offsets (N + 1,)."""
     offsets = np.zeros(len(lengths) + 1, np.int64)
     np.cumsum(lengths, out=offsets[1:])
     return offsets
@@ -82,7 +82,7 @@ def take(column: FieldColumn, rows: NDArray[Any]) -> FieldColumn:
 
 
 def join(columns: Sequence[FieldColumn]) -> FieldColumn:
-    """Columns of the same field, one after the other."""
+    """Concatenate columns of the same field."""
     if len(columns) == 1:
         return columns[0]
     ragged = [column for column in columns if isinstance(column, Ragged)]
@@ -149,7 +149,7 @@ class TopicColumns:
         return np.concatenate([np.diff(lap) for lap in laps]) * 1e-9
 
     def times(self, start: int, stop: int) -> TopicColumns:
-        """When messages `start` to `stop` came, without their fields, copied."""
+        """Copy the log times of messages `start` to `stop`, without their fields."""
         return TopicColumns(
             self.log_time_ns[start:stop].copy(), self.publish_time_ns[start:stop].copy()
         )
@@ -269,7 +269,7 @@ class Leaf:
 
     @property
     def dims(self) -> tuple[int | None, ...]:
-        """Per repetition along the path, outermost first: its fixed length, or None."""
+        """Return the fixed length of each repetition along the path, outermost first, or None."""
         return tuple(step.many.length for step in self.steps if step.many)
 
 
@@ -422,7 +422,7 @@ class MessageBatch:
 
     @classmethod
     def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> MessageBatch:
-        """Payloads laid one after the other."""
+        """Concatenate payloads."""
         offsets = offsets_of(np.fromiter(map(len, payloads), np.int64, len(payloads)))
         return cls(
             np.frombuffer(b"".join(payloads), np.uint8),

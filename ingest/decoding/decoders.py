@@ -97,7 +97,7 @@ def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
 
 
 def wrap(column: FieldColumn, length: int | None, rows: int, offsets: Ints) -> FieldColumn:
-    """Elements to rows: a fixed repetition of an array is a further axis, others are Ragged."""
+    """Turn elements into rows: a fixed repetition becomes an axis, others are Ragged."""
     if length is not None and not isinstance(column, Ragged):
         return column.reshape(rows, length, *column.shape[1:])
     return Ragged(column, offsets)
@@ -194,7 +194,7 @@ class Repeat:
             out[path] = wrap(column, self.length, len(frame), offsets)
 
     def _fixed(self, frame: Frame, counts: Ints, offsets: Ints) -> Columns | None:
-        """Elements of one fixed size lie at known places: one gather for all of them."""
+        """Gather elements of one fixed size, whose places are known."""
         fields = self._only_fixed
         if fields is None:
             return None

@@ -173,7 +173,7 @@ def column_of(messages: Sequence[Any], leaf: Leaf, parser: Parser) -> FieldColum
 
 
 def _wrap(column: FieldColumn, levels: list[tuple[int | None, list[int]]]) -> FieldColumn:
-    """Flat values to their nesting, from the innermost repetition out."""
+    """Nest flat values, from the innermost repetition out."""
     for length, counts in reversed(levels):
         if length is not None and not isinstance(column, Ragged):
             column = column.reshape(len(counts), length, *column.shape[1:])
@@ -183,7 +183,7 @@ def _wrap(column: FieldColumn, levels: list[tuple[int | None, list[int]]]) -> Fi
 
 
 def objects(values: Sequence[Any]) -> NDArray[Any]:
-    """Texts as an object array, (N,)."""
+    """Return texts as an object array, (N,)."""
     array = np.empty(len(values), object)
     array[:] = values
     return array

@@ -29,7 +29,7 @@ MAX_NAME, MAX_VALUE = 64, 256  # characters
 
 
 def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False) -> dict[str, str]:
-    """Tags of `KEY=VALUE` texts, as the command line has them.
+    """Parse tags from `KEY=VALUE` texts of the command line.
 
     Args:
         texts: such as `robot=amr-07`.
@@ -65,7 +65,7 @@ def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False
 
 
 def tag_problem(name: str, value: str) -> str | None:
-    """Why this cannot be a tag, or None."""
+    """Return why this cannot be a tag, or None."""
     if not 0 < len(name) <= MAX_NAME or "=" in name or not name.isprintable():
         return (
             f"{name[: MAX_NAME + 1]!r} is not a name of a tag: use 1 to {MAX_NAME} "
@@ -79,7 +79,7 @@ def tag_problem(name: str, value: str) -> str | None:
 
 
 def in_words(tags: Mapping[str, str]) -> str:
-    """Tags on one line, the named ones first."""
+    """Return tags on one line, the named ones first."""
     names = [*(name for name in NAMED if name in tags), *sorted(tags.keys() - set(NAMED))]
     return ", ".join(f"{name}={tags[name]}" for name in names)
 

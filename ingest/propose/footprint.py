@@ -465,7 +465,7 @@ class LidarPlace:
 
 
 def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPlace | None:
-    """LidarPose the lidar by the last of the recording's transforms.
+    """Place the lidar by the last of the recording's transforms.
 
     None if they do not, or not sanely.
     """

@@ -347,7 +347,7 @@ class KeptFrames:
 
     @classmethod
     def of(cls, name: str, frames: CameraFrames, ticks: Ints) -> KeptFrames:
-        """`ticks` are the steps that belong to an episode, in any order."""
+        """Choose frames for `ticks`, the steps that belong to an episode, in any order."""
         ticks = np.unique(ticks)
         return cls(name, frames, *frames.in_force(ticks), int((frames.at_tick[ticks] >= 0).sum()))
 

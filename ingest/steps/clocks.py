@@ -41,7 +41,7 @@ class TopicClock:
     zero_stamps: int | None = None
 
     def as_row(self) -> dict[str, str | int | bool | None]:
-        """Plain values, as `recordings.clocks` holds them (less what aligning found)."""
+        """Return plain values in the form of `recordings.clocks`, without aligning's findings."""
         return {**asdict(self), "stamped": self.offset_ns is not None}
 
 
@@ -151,21 +151,21 @@ class ClockMap:
 
     @classmethod
     def of_delays(cls, log_ns: Ints, delay_ns: Ints) -> ClockMap:
-        """Through messages (N >= 1,) of these delays (log time - stamp), less single bad stamps."""
+        """Fit the map through messages (N >= 1,) with these delays (log time - stamp)."""
         order = np.argsort(log_ns, kind="stable")
         log = log_ns[order]
         return cls.through(log, log - smoothed(delay_ns[order]))
 
     @classmethod
     def through(cls, log_ns: Ints, stamp_ns: Ints) -> ClockMap:
-        """Through messages (N >= 1,) that carry both times, in any order."""
+        """Fit the map through messages (N >= 1,) that carry both times, in any order."""
         order = np.argsort(log_ns, kind="stable")
         log, stamp = log_ns[order], np.maximum.accumulate(stamp_ns[order])
         last = np.append(np.diff(log) > 0, True)  # of messages received at once, the newest stamp
         return cls(log[last], stamp[last])
 
     def stamped(self, log_ns: Ints) -> Ints:
-        """Stamped times (N,) of log times (N,); beyond the knots at the map's mean pace."""
+        """Return stamped times (N,) of log times (N,); beyond the knots at the map's mean pace."""
         # Differences alone go through float64, which holds a time of day to 256 ns only.
         first, last = int(self.log_ns[0]), int(self.log_ns[-1])
         start = int(self.stamp_ns[0])
@@ -190,7 +190,7 @@ class ClockMap:
 
     @property
     def pace(self) -> float:
-        """Seconds of stamped time in one of log time, on average."""
+        """Return the seconds of stamped time per second of log time, on average."""
         log, stamp = (int(times[-1] - times[0]) for times in (self.log_ns, self.stamp_ns))
         return stamp / log if log else 1.0
 

@@ -39,14 +39,14 @@ class CustomColumn:
 
     @cached_property
     def samples(self) -> NDArray[np.bool_]:
-        """(N,) which messages say something: those without the one element meant do not."""
+        """Return which messages have the one element that is meant, (N,)."""
         if not self.signal.picks:
             return np.ones(len(self.values), np.bool_)
         return np.asarray(self.values.lengths > 0, np.bool_)
 
     @cached_property
     def whole(self) -> NDArray[np.bool_]:
-        """(N,) which messages of a list have one of the length that it must have."""
+        """Return which messages have a list of the required length, (N,)."""
         lengths, due = self.values.lengths, self.signal.length
         return np.asarray(lengths > 0 if due is None else lengths == due, np.bool_)
 

@@ -175,7 +175,7 @@ class Split:
 
     @property
     def ends(self) -> int:
-        """Ticks that only end an episode."""
+        """Return ticks that only end an episode."""
         return sum(not episode.shared for episode in self.episodes)
 
 
@@ -190,7 +190,7 @@ def split(task: Task, steps: Steps) -> Split:
 
 
 def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
-    """Why a recording gives no transition, and what to do about it where that is known."""
+    """Return why a recording gives no transition, and the remedy if it is known."""
     reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     why = [f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons]
     off = steps.clock.off_clock
@@ -209,7 +209,7 @@ def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
 
 
 def changed_route(steps: Steps) -> Ints:
-    """Ticks at which another goal is in force than at the tick before, or none."""
+    """Return ticks whose goal differs from that of the tick before, or is missing."""
     goal = steps.routing.goal
     changed = np.flatnonzero(steps.follows[1:] & (goal[1:] != goal[:-1])) + 1
     return changed[goal[changed - 1] >= 0]
@@ -222,7 +222,7 @@ def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) ->
 
 
 def protective_stop(task: Task, steps: Steps) -> Bools:
-    """Ticks (T,) less than RELEASE_S after the bumper was pressed, where a bump stops the robot."""
+    """Return ticks (T,) within RELEASE_S of a press of the bumper, if a bump stops the robot."""
     pressed = steps.signals["bumped"].astype(np.bool_) & task.bump_terminates
     latest = np.maximum.accumulate(np.where(pressed, np.arange(len(steps)), -1))
     stamp_ns = steps.signals["stamp_ns"]

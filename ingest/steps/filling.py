@@ -69,7 +69,7 @@ class Routing:
         return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
     def view(self, task: Task, plan: Ints, pose: Signals) -> RouteView:
-        """Along plan `plan[i]` from pose i to `plan_distances_m`, for N poses."""
+        """Follow plan `plan[i]` from pose i to `plan_distances_m`, for N poses."""
         count, at_m = len(plan), plan_distances_m(task)
         ahead = np.zeros((count, len(at_m), 2))
         ahead[:, :, 0] = at_m
@@ -121,7 +121,7 @@ class Routing:
 
 
 def same_goals(goals_m: F64, moved_m: float) -> Ints:
-    """Goals (G, 2) in the order they came -> for each the first of its run of equal goals (G,)."""
+    """Return for each goal (G, 2), in order, the first of its run of equal goals, (G,)."""
     first = np.arange(len(goals_m), dtype=np.int64)
     for index in range(1, len(goals_m)):
         if np.linalg.norm(goals_m[index] - goals_m[first[index - 1]]) <= moved_m:
@@ -235,7 +235,7 @@ class Filling:
 
     @property
     def follows(self) -> Bools:
-        """(T,) whether each tick comes directly after the one before, and both are usable."""
+        """Return whether each tick directly follows the one before and both are usable, (T,)."""
         return np.asarray(self.break_reason == "", np.bool_)
 
     def behaviour(self) -> list[tuple[str, str | None, float | None]]:
@@ -288,7 +288,7 @@ class Filling:
             reasons[1:][bad & (reasons[1:] == "")] = reason
 
     def _too_far(self, xy_m: F64) -> Bools:
-        """Between positions (N, 2), which of the steps (N - 1,) are too long to be driven."""
+        """Return which steps (N - 1,) between positions (N, 2) are too long to be driven."""
         moved_m = np.hypot(*np.diff(xy_m, axis=0).T)
         return np.asarray(moved_m > self.profile.episodes.max_pose_jump_m, np.bool_)
 
@@ -478,7 +478,7 @@ class Filling:
         self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
 
     def _hindsight(self) -> None:
-        """Goals and routes from where the robot went: they, and no other signal, see ahead."""
+        """Fill goals and routes from where the robot went; only these signals look ahead."""
         xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
         at = np.flatnonzero(self.located)
         carried = np.zeros(len(self.tick_ns), np.bool_)
@@ -501,7 +501,7 @@ def _chunks(steps: int) -> Iterator[Ints]:
 def _with_earlier(
     signals: Signals, rows: Ints, before: Ints, count: int
 ) -> tuple[Signals, list[Signals]]:
-    """Signals of these steps, and of the `count` steps before each, the last one first."""
+    """Return signals of these steps and of the `count` steps before each, the last one first."""
     at = [rows]
     for _ in range(count):
         at.append(before[at[-1]])
@@ -522,7 +522,7 @@ def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
 
 @lru_cache(maxsize=1024)
 def parse_policy(text: str) -> tuple[str, str | None, float | None]:
-    """`{"policy": …, "version": …, "probability": …}`, or a bare name, to the three.
+    """Parse `{"policy": …, "version": …, "probability": …}`, or a bare name, into the three.
 
     NaN is a probability that is none, as -3 is.
     """

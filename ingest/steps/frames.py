@@ -107,7 +107,7 @@ class Edges:
         return Edges(kept, self.static & kept.keys(), parents, self.parent_changes)
 
     def missing(self, base: str, fixed: str) -> str | None:
-        """Why no transform of the recording can lead from one frame to the other, or None."""
+        """Return why no transform of the recording leads from one frame to the other, or None."""
         ways = [upward(plain(frame), self.parents) for frame in (base, fixed)]
         if ways[0] & ways[1]:
             return None
@@ -252,7 +252,7 @@ class Tree:
         return out
 
     def times(self, frame: str) -> list[Ints]:
-        """When a moving transform between `frame` and the fixed one was given, by segment."""
+        """Return by segment when a moving transform between `frame` and the fixed one was given."""
         topics = self.edges.only({frame, self.frames.fixed}).topics
         moving = [name for name in topics if name.split(" ", 1)[0] == self.frames.topic]
         return [
@@ -385,7 +385,7 @@ class Tree:
 
 
 def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
-    """Quaternions (N,) to rotation matrices (N, 3, 3); NaN where a quaternion has no length."""
+    """Return rotation matrices (N, 3, 3) of quaternions (N,); NaN for one without length."""
     with np.errstate(all="ignore"):
         size = np.sqrt(x * x + y * y + z * z + w * w)
         x, y, z, w = (np.where(size > 1e-9, part / size, np.nan) for part in (x, y, z, w))
@@ -427,7 +427,7 @@ class PoseSeries:
 
     @classmethod
     def joined(cls, parts: Sequence[PoseSeries]) -> PoseSeries:
-        """Stretches that follow one another, as one."""
+        """Join consecutive stretches."""
         return cls.of(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS)
         )

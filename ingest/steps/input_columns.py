@@ -78,7 +78,7 @@ class Fixes:
         return std
 
     def problems(self, max_std_m: float) -> NDArray[Any]:
-        """Why each is of no use (N,), or ""."""
+        """Return why each fix is unusable, or "", (N,)."""
         problem = np.full(len(self.time_ns), "", object)
         problem[self.std_m() > max_std_m] = UNCERTAIN
         sane = (np.abs(self.latitude_deg) <= 90) & (np.abs(self.longitude_deg) <= 360)
@@ -89,7 +89,7 @@ class Fixes:
         return problem
 
     def origin_deg(self, max_std_m: float = MAX_STD_M) -> tuple[float, float] | None:
-        """Latitude and longitude of the first that is of use; None where none is."""
+        """Return latitude and longitude of the first usable fix; None if there is none."""
         good = np.flatnonzero(self.problems(max_std_m) == "")
         if not len(good):
             return None
@@ -149,7 +149,7 @@ class FixedPoses:
 
 
 def local_plane_m(latitude_deg: F64, longitude_deg: F64, origin_deg: tuple[float, float]) -> F64:
-    """Metres east and north (N, 2) of the origin, on the plane that touches WGS84 there."""
+    """Return metres east and north (N, 2) of the origin, on the plane that touches WGS84 there."""
     phi, lam = np.radians(origin_deg)
     away = _earth_centred_m(latitude_deg, longitude_deg) - _earth_centred_m(
         np.array([origin_deg[0]]), np.array([origin_deg[1]])
@@ -160,7 +160,7 @@ def local_plane_m(latitude_deg: F64, longitude_deg: F64, origin_deg: tuple[float
 
 
 def _earth_centred_m(latitude_deg: F64, longitude_deg: F64) -> F64:
-    """(N, 3) of points on the ellipsoid."""
+    """Return coordinates (N, 3) of points on the ellipsoid."""
     phi, lam = np.radians(latitude_deg), np.radians(longitude_deg)
     squared = FLATTENING * (2 - FLATTENING)  # of the eccentricity
     across = EQUATOR_M / np.sqrt(1 - squared * np.sin(phi) ** 2)
@@ -431,7 +431,7 @@ def _key(rule: Convention) -> str:
 
 
 def _flags(columns: TopicColumns, rule: Convention) -> Bools:
-    """(N,) which messages say so; none of them where they do not have the fields for it."""
+    """Return which messages say so, (N,); none if they lack the fields for it."""
     if _key(rule) in columns.fields:
         return np.asarray(columns.fields[_key(rule)], np.bool_)
     if set(rule.fields) <= columns.fields.keys():  # whole, as no recording's reader gives them

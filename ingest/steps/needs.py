@@ -95,7 +95,7 @@ def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
 def wanted_fields(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> dict[str, list[str]]:
-    """topic -> the field paths to keep for this profile, of the topics that are `available`.
+    """Return topic -> field paths to keep for this profile, of the `available` topics.
 
     `available` maps a topic to something with a `type`, an `expected` count and why it is `skipped`
     if it is, `leaves` to every field of its messages. What `reductions` reads is not in it, unless
@@ -173,7 +173,7 @@ def reductions(
 
 
 def _both(parts: Sequence[Reduction]) -> Reduction:
-    """Several reductions of one topic as one."""
+    """Combine several reductions of one topic."""
     if len(parts) == 1:
         return parts[0]
 
@@ -200,7 +200,7 @@ def input_problems(
     available: Mapping[str, Any],
     leaves: Mapping[str, Sequence[Leaf]] | None = None,
 ) -> list[str]:
-    """Why a recording with these topics (and fields) does not fit the profile, a line a topic."""
+    """Return why a recording with these topics (and fields) does not fit the profile, by topic."""
     needed: dict[str, list[str]] = {}
     types: dict[str, str] = {}  # of what is needed
     wrong: dict[str, list[str]] = {}

@@ -71,7 +71,7 @@ def add_action(file: AddedFile, now_ms: int) -> AddAction:
 
 
 def parquet_options(schema: pa.Schema) -> dict[str, Any]:
-    """How the tables' columns are encoded. Each page has a checksum: see `open_parquet`."""
+    """Return how the tables' columns are encoded. Each page has a checksum: see `open_parquet`."""
     return {
         "compression": "zstd",
         "write_page_checksum": True,
@@ -207,7 +207,7 @@ def _flush(writer: pq.ParquetWriter, waiting: list[pa.Table]) -> int:
 
 
 def _float_columns(schema: pa.Schema) -> list[str]:
-    """Parquet's paths of the float columns, those in lists of floats included."""
+    """Return Parquet's paths of the float columns, those in lists of floats included."""
     paths = []
     for field in schema:
         if pa.types.is_floating(field.type):
@@ -510,7 +510,7 @@ def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str
 
 
 def _turns(table: DeltaTable, recordings: Sequence[str]) -> list[Transaction]:
-    """Transaction ids that let one writer at a time change each of these recordings."""
+    """Return transaction ids that let one writer at a time change each of these recordings."""
     return [
         Transaction(app, (table.transaction_version(app) or 0) + 1)
         for app in (f"restock/{recording}" for recording in recordings)

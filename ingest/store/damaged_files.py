@@ -172,7 +172,7 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
 
 
 def unverified_files(place: Location, paths: Iterable[str]) -> int:
-    """How many of these files of a store `verify_files` would read."""
+    """Return how many of these files of a store `verify_files` would read."""
     known = _remembered(place, _stamps(place))
     return sum(path not in known for path in paths)
 
@@ -194,7 +194,7 @@ def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
 
 
 def _stamps(place: Location) -> dict[str, list[int]]:
-    """Size in bytes and time written in ns of each Parquet file of a store, by its path in it."""
+    """Return size (bytes) and write time (ns) of each Parquet file of a store, by its path."""
     with place.translate_errors():
         infos = place.files.get_file_info(pa.fs.FileSelector("", recursive=True))
     return {

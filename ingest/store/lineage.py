@@ -57,12 +57,12 @@ class StoredFile:
 
     @property
     def own(self) -> bool:
-        """Whether one ingest wrote it, and it is as it was written."""
+        """Return whether one ingest wrote it and it is unchanged."""
         return OWN_PATH.fullmatch(self.path) is not None
 
 
 def own_path(recording_id: str, ingest_id: str) -> str:
-    """Where an ingest writes."""
+    """Return the path that an ingest writes to."""
     return f"{recording_id}/{ingest_id}.parquet"
 
 
@@ -185,7 +185,7 @@ def packed_ingests(ingests: Sequence[Ingest]) -> bytes:
 
 
 def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
-    """One row an ingest: recording_id, ingest_id, rows, and the file that has them."""
+    """Return a row per ingest: recording_id, ingest_id, rows, and the file that has them."""
     every = [(*one, file.path) for file in files for one in file.ingests]
     names = ("recording_id", "ingest_id", "rows", "file")
     types = (pa.string(), pa.string(), pa.int64(), pa.string())
@@ -312,7 +312,7 @@ class StoreReader:
         return found.filter(pc.is_in(found["ingest_id"], wanted)).combine_chunks()
 
     def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
-        """One recording's transitions, as they were written.
+        """Return one recording's transitions as they were written.
 
         Raises:
             FileNotFoundError: there are none of this ingest.
@@ -385,7 +385,7 @@ class StoreReader:
         return list({one.ingest_id: one for one in held}.values())
 
     def sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
-        """Their sketches, each read once: many recordings would read all others' as many times."""
+        """Read their sketches, each once, however many recordings ask for them."""
         names = ("recording_id", "ingest_id", "sketch")
         schema = pa.schema([(name, pa.string()) for name in names])
         new = [one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES]

@@ -132,7 +132,7 @@ class Location:
 
     @property
     def options(self) -> dict[str, str] | None:
-        """Options for Delta's library, besides those of the environment."""
+        """Return options for Delta's library, besides those of the environment."""
         if self.folder is not None:
             return None
         return {
@@ -151,7 +151,7 @@ class Location:
         return str(self.folder / name) if self.folder is not None else f"{self.text}/{name}"
 
     def has_table(self, name: str) -> bool:
-        """Whether there is such a table. Raises StoreError where the place cannot be reached.
+        """Return whether there is such a table; raise StoreError if the place cannot be reached.
 
         A folder of a log is not yet one: another writer may be making its first version.
         """
@@ -211,7 +211,7 @@ class Location:
         return f"`restock ingest RECORDINGS --store {quoted(self.text)}` makes a store"
 
     def open_table(self, name: str, version: Version | None = None) -> DeltaTable:
-        """One of its tables, at a version (or the newest of a moment) or at its newest.
+        """Open one of its tables, at a version, at the newest of a moment, or at the newest.
 
         Raises:
             StoreError: no such table or version, one of another format or with a feature that
@@ -252,7 +252,7 @@ class Location:
 
     @cached_property
     def files(self) -> pa.fs.FileSystem:
-        """A file system whose root is the store."""
+        """Return a file system whose root is the store."""
         if self.folder is not None:
             return pa.fs.SubTreeFileSystem(str(self.folder.absolute()), pa.fs.LocalFileSystem())
         s3 = pa.fs.S3FileSystem(
@@ -417,7 +417,7 @@ def open_parquet(source: pa.NativeFile, **options: Any) -> pq.ParquetFile:
 
 
 def with_plain_text(rows: pa.Table) -> pa.Table:
-    """Rows with the columns of `plain_text`: Arrow cannot compare or look up text in views."""
+    """Cast the columns of `plain_text`: Arrow cannot compare or look up text in views."""
     schema = plain_text(rows.schema)
     return rows if schema == rows.schema else rows.cast(schema)
 

@@ -43,7 +43,7 @@ UNUSED = "not used by the profile"
 
 
 def software_version() -> str:
-    """Restock's version."""
+    """Return Restock's version."""
     try:
         return version("restock")
     except PackageNotFoundError:  # running from a source tree that was never installed
@@ -115,7 +115,7 @@ def uncertain_conditions(profile: Profile) -> list[str]:
 
 
 def driven_plan(rows: pa.Table) -> bool:
-    """Whether the plan of a recording's rows is the path that was driven: goals in hindsight."""
+    """Return whether a recording's rows have goals in hindsight, with the driven path as plan."""
     return (
         "goal_source" in rows.column_names
         and "hindsight" in rows["goal_source"].unique().to_pylist()
@@ -155,7 +155,7 @@ def recorded_facts(
 
 
 def topic_rows(recording: Recording) -> list[dict[str, Any]]:
-    """Every topic: the messages the container counts, those decoded, and why not the rest."""
+    """Return, per topic, the messages counted by the container, those decoded, and why not all."""
     rows = []
     for name, info in recording.topics.items():
         account = recording.accounts.get(name)
@@ -177,7 +177,7 @@ def topic_rows(recording: Recording) -> list[dict[str, Any]]:
 
 
 def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
-    """Every topic's clocks, and what aligning did about its messages."""
+    """Return every topic's clocks, and how aligning treated its messages."""
     report = steps.clock
     return [
         {
@@ -191,7 +191,7 @@ def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
 
 
 def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
-    """Precision and recall a step, as the manifest holds them."""
+    """Return precision and recall per step, in the manifest's form."""
     names = ("condition", "precision", "recall", "labelled", "support")
     return [{name: getattr(score, name) for name in names} for score in scores]
 
@@ -202,7 +202,7 @@ def count_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
 
 
 def conditions_json(conditions: Sequence[Condition]) -> str:
-    """Conditions of one kind as the manifest holds them: all but their kind and doc."""
+    """Return conditions of one kind in the manifest's form, without kind and doc."""
     names = ("name", "timing", "priority", "sql", "let", "probability", "uncertain", "constants")
     return msgspec.json.encode(
         [{name: getattr(condition, name) for name in names} for condition in conditions]
@@ -234,7 +234,7 @@ class Moments:
 
     @classmethod
     def of(cls, rows: pa.Table, clock_offset_ns: int | None) -> Moments:
-        """`clock_offset_ns` is the manifest's: log time less alignment clock."""
+        """Make it of rows; `clock_offset_ns` is the manifest's: log time less alignment clock."""
         logged = rows["stamp_ns"].to_numpy() + (clock_offset_ns or 0)
         if not rows["logged_ns"].null_count:
             logged = rows["logged_ns"].to_numpy()
@@ -247,7 +247,7 @@ class Moments:
         return np.asarray(same if same.any() else inside, np.bool_)
 
     def stretch(self, rows: Ints) -> tuple[int, int, int]:
-        """Episode, first and last log time of some rows of one episode."""
+        """Return episode, first and last log time of some rows of one episode."""
         first, last = int(rows[0]), int(rows[-1])
         stamps = self.logged_ns
         return int(self.episode_index[first]), int(stamps[first]), int(stamps[last])
@@ -259,7 +259,7 @@ def corrections_in(manifest: Mapping[str, Any]) -> list[Correction]:
 
 
 def correction_rows(corrections: Iterable[Correction]) -> list[dict[str, Any]]:
-    """Corrections as the manifest holds them."""
+    """Return corrections in the manifest's form."""
     return [asdict(correction) for correction in corrections]
 
 

@@ -214,7 +214,7 @@ def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
 
 @cache
 def _database() -> duckdb.DuckDBPyConnection:
-    """One for all recordings: opening it takes as long as a summary."""
+    """Return one connection for all recordings: opening it takes as long as a summary."""
     atexit.register(_database.cache_clear)  # nanobind complains of what outlives its module
     return duckdb.connect(config={"threads": 1})
 
@@ -245,7 +245,7 @@ def with_included(text: str, beside: Traversable | None = None) -> str:
 
 
 def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:
-    """All rows of a table as the one value of a list column."""
+    """Return all rows of a table as the one value of a list column."""
     fields = list(kind.value_type)
     columns = [rows[field.name].cast(field.type).combine_chunks() for field in fields]
     values = pa.StructArray.from_arrays(columns, fields=fields)
@@ -281,7 +281,7 @@ class RepeatedDrive:
 
     @property
     def the_less(self) -> bool:
-        """Whether it holds less of the drive than the new one: a part of it, or a cut of it."""
+        """Return whether it holds less of the drive than the new one: a part or a cut of it."""
         return self.share_of_other > self.share
 
     def __str__(self) -> str:
@@ -341,7 +341,7 @@ def _hashes(rows: pa.Table) -> Hashes:
 
 
 def looks_alike(mine: Hashes, other: Sketch) -> bool:
-    """Whether the rows (N,) and a sketch may be largely the same."""
+    """Return whether the rows (N,) and a sketch may be largely the same."""
     if not len(other.hashes):
         return False
     # Below its largest hash, a full sketch has all of its recording's.

@@ -54,7 +54,7 @@ class EpisodeRows:
 
     @property
     def starts(self) -> Ints:
-        """The rows that begin a transition, (N,); each one's successor is the row after it."""
+        """Return the rows that begin a transition, (N,); the row after each is its successor."""
         return np.flatnonzero(~self.is_end)
 
     def ends_table(self) -> pa.Table:
@@ -211,7 +211,7 @@ def recording_table(
     *,
     done: Callable[[int], None] = lambda ticks: None,
 ) -> tuple[pa.Table, EpisodeRows]:
-    """All transitions of a recording, and the steps they are made of (without their signals).
+    """Return all transitions of a recording, and their steps (without signals).
 
     Some whole episodes at a time, which changes no value: an episode's rows and labels depend on
     its own steps alone, and only those of one group are in memory in full. `done` is told how many
@@ -311,7 +311,7 @@ def transitions(
 def transition_table(
     profile: Profile, rows: EpisodeRows, values: TransitionValues, provenance: Provenance
 ) -> pa.Table:
-    """Rows of the store, by `restock.ingest.task.schema`: of a recording or of the twin.
+    """Build the store's rows of a recording or of the twin, by `restock.ingest.task.schema`.
 
     Raises:
         RecordingError: there are more steps than a transition id can number.
@@ -408,7 +408,7 @@ def _vectors(
 
 
 def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
-    """Values as a column of this type; a text stands in each of `count` rows."""
+    """Return values as a column of this type; a single text is repeated `count` times."""
     if isinstance(values, str):
         return pa.repeat(pa.scalar(values, kind), count)
     if isinstance(values, pa.Array | pa.ChunkedArray):

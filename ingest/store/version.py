@@ -38,7 +38,7 @@ _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
 
 def parse_version(text: str) -> Version:
-    """`12`, or an ISO 8601 time such as `2026-11-01T08:00Z`; UTC where it names no zone.
+    """Parse `12`, or an ISO 8601 time such as `2026-11-01T08:00Z`, in UTC if it names no zone.
 
     Raises:
         StoreError: it is neither.
@@ -303,7 +303,7 @@ def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None
 
 
 def _in_use(table: DeltaTable, feature: str) -> bool:
-    """Whether a feature that a table lists is in use; one that is not known is taken to be."""
+    """Return whether a feature that a table lists is in use; unknown features count as used."""
     if feature not in _PROPERTIES:
         return True
     columns = [field.metadata for field in table.schema().fields]

@@ -317,7 +317,7 @@ class StoreWriter(TableCommits):
         return {path for path, at_s in self.path.times(name).items() if at_s <= before_s}
 
     def _unnamed_frames(self, retention_hours: int) -> list[str]:
-        """Files of frames older than the window that no manifest names, removed ones included."""
+        """Return frame files older than the window that no manifest names, even a removed one."""
         found = self._written_before(FRAMES, retention_hours)
         if not found:
             return []
@@ -331,7 +331,7 @@ class StoreWriter(TableCommits):
         return [f"{FRAMES}/{path}" for path in sorted(found)]
 
     def _abandoned(self, retention_hours: int) -> list[str]:
-        """Manifests that join nothing, and are too old for a writer to be on its way to commit."""
+        """Return manifests that join nothing and are too old for a writer to be about to commit."""
         if not self.path.has_table(RECORDINGS) or not self.path.has_table(TRANSITIONS):
             return []
         manifests = self.path.open_table(RECORDINGS)  # before the transitions that may join them
@@ -447,7 +447,7 @@ def fold(store: StoreWriter, done: Compacted | None = None, changed: Collection[
 
 
 def fold_if_many(store: StoreWriter) -> None:
-    """Fold the manifests where so many files are read at every opening that it pays."""
+    """Fold the manifests if their number makes every opening slow."""
     if not store.path.has_table(TRANSITIONS):
         return
     if sum(file.own for file in store.files(RECORDINGS)) >= FOLD_FILES:
@@ -562,7 +562,7 @@ def _worth_it(group: Sequence[StoredFile]) -> bool:
 
 
 def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted) -> None:
-    """One file of these, in a commit of its own; none where one of them is gone by then."""
+    """Join these files in their own commit; do nothing if one is gone by then."""
     held: dict[str, Ingest] = {}  # another tool may have cut the rows of one into several files
     for one in (one for file in group for one in file.ingests):
         before = held.get(one.ingest_id)

@@ -81,7 +81,7 @@ def sandbox() -> duckdb.DuckDBPyConnection:
 
 @lru_cache(maxsize=1024)
 def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
-    """Why this SQL may not be a condition's, or None. Whether it binds is DuckDB's to say."""
+    """Return why this SQL may not be a condition's, or None; DuckDB finds unknown names."""
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
         # What closes our bracket and opens another fits into one kind of them only.
@@ -226,7 +226,7 @@ def _changing() -> frozenset[str]:
 
 @lru_cache(maxsize=1024)
 def not_an_expression(sql: str) -> str | None:
-    """Why this is no SQL that may stand between brackets of ours, or None."""
+    """Return why this SQL may not stand between brackets of ours, or None."""
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
         both = [f"SELECT ({sql}\n)", f"SELECT [{sql}\n]"]  # as in `refusal`

@@ -430,7 +430,7 @@ def _query(
     count: int,
     limit_s: float,
 ) -> Columns:
-    """Expressions of conditions that select from the same, one value for each of `count` steps.
+    """Evaluate conditions that select from the same tables, one value per step of `count`.
 
     Raises:
         duckdb.Error: they do not run, give another number of values, or take longer than they may.
@@ -451,7 +451,7 @@ def _query(
 
 @contextmanager
 def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) -> Iterator[None]:
-    """Interrupt what the connection does in the block once it takes longer."""
+    """Interrupt the connection if the block takes longer."""
     done = threading.Event()
 
     def interrupt() -> None:

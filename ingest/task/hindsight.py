@@ -65,7 +65,7 @@ class Missions:
 
     @property
     def problem(self) -> list[str]:
-        """(T,) why a tick has no goal, or ""."""
+        """Return why each tick has no goal, or "", (T,)."""
         without = np.where(self.mission < 0, NOWHERE, "")
         return [str(text) for text in np.where(self.standing, STANDING, without)]
 
@@ -142,7 +142,7 @@ class _Cutting:
         )
 
     def _cut_leg(self, first: int, last: int, end: str) -> None:
-        """Missions between the places where the robot stood still."""
+        """Find missions between the places where the robot stood still."""
         changes = np.flatnonzero(np.diff(self.standing[first : last + 1].astype(np.int8)))
         stood = first
         bounds = [first, *(changes + first + 1).tolist(), last + 1]
@@ -159,7 +159,7 @@ class _Cutting:
             self._cut_drive(start, stop if arrives else last, "stood still" if arrives else end)
 
     def _cut_drive(self, start: int, stop: int, end: str) -> None:
-        """Missions of a drive without a stop, from tick `start` to tick `stop`."""
+        """Find missions of a drive without a stop, from tick `start` to tick `stop`."""
         while start < stop:
             late = np.searchsorted(self.at_s, self.at_s[start] + self.longest_s, "right") - 1
             reach = min(stop, max(int(late), start + 1))
@@ -215,7 +215,7 @@ class _Cutting:
         return goal
 
     def _standing(self) -> Bools:
-        """Ticks (T,) of the stretches of `still_s` in which the robot keeps to its place.
+        """Return ticks (T,) of the stretches of `still_s` in which the robot stays in its place.
 
         By position, so that turning on the spot is standing too.
         """
@@ -257,7 +257,7 @@ def driven_m(xy_m: F64, leg: Ints, band_m: float) -> F64:
 
 
 def _weights(chosen: Bools, order: Ints) -> F64:
-    """`chosen` of the sorted rows, in the rows' own order."""
+    """Return `chosen` of the sorted rows in the rows' own order."""
     weights = np.zeros(len(order))
     weights[order] = chosen
     return weights

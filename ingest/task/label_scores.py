@@ -103,7 +103,7 @@ def score(
     step: Ints,
     period_s: float,
 ) -> list[LabelScore]:
-    """Labels (N,) by name against the true conditions of each transition (N).
+    """Score labels (N,) by name against the true conditions of each transition (N,).
 
     A text may name several conditions, separated by commas; None is unknown. Transitions are in
     order of their episode (N,) and step (N,), `period_s` apart. A label that no truth ever names

@@ -236,7 +236,7 @@ class Limits:
 
     @property
     def hash(self) -> str:
-        """Names them: 8 hex digits."""
+        """Return 8 hex digits that name the limits."""
         return hashlib.blake2b(msgspec.json.encode(self), digest_size=4).hexdigest()
 
     @property
@@ -262,7 +262,7 @@ class Limited:
 
     @property
     def intervened(self) -> Bools:
-        """(N,) where it is not what was proposed."""
+        """Return whether each command differs from the proposed one, (N,)."""
         return np.asarray(self.rule != NONE, np.bool_)
 
 
@@ -382,12 +382,12 @@ def _swept(limits: Limits, ahead: float, turn: float) -> F64:
 
 
 def _sinc(angle: F64) -> F64:
-    """sin(a) / a."""
+    """Return sin(a) / a."""
     return np.asarray(np.sinc(angle / np.pi), np.float64)
 
 
 def _cosc(angle: F64) -> F64:
-    """(1 - cos(a)) / a."""
+    """Return (1 - cos(a)) / a."""
     small = np.abs(angle) < 1e-6
     safe = np.where(small, 1.0, angle)
     return np.asarray(np.where(small, angle / 2, (1 - np.cos(safe)) / safe), np.float64)

@@ -42,7 +42,7 @@ class SectorMap:
 
     @classmethod
     def build(cls, bearings_rad: NDArray[Any], sectors: int, body: Body) -> SectorMap:
-        """Bearings (B,) of the beams in the lidar's own frame."""
+        """Return bearings (B,) of the beams in the lidar's own frame."""
         bearing = (np.asarray(bearings_rad, np.float64) + body.lidar_yaw_rad + np.pi) % (2 * np.pi)
         sector = np.minimum((bearing * (sectors / (2 * np.pi))).astype(np.intp), sectors - 1)
         order = np.argsort(sector, kind="stable")
@@ -53,7 +53,7 @@ class SectorMap:
     def clearance(
         self, ranges_m: NDArray[Any], range_min_m: float, range_max_m: float
     ) -> NDArray[np.float64]:
-        """Ranges (N, B) to clearance per sector (N, K), in [0, range_max_m].
+        """Reduce ranges (N, B) to clearance per sector (N, K), in [0, range_max_m].
 
         inf, NaN, and readings below `range_min_m` (the driver's "no valid return") or above
         `range_max_m` count as free up to `range_max_m`; so does a sector without beams. -inf is
@@ -89,7 +89,7 @@ class MovedMap:
     def build(
         cls, bearings_rad: NDArray[Any], sectors: int, body: Body, at_m: tuple[float, float]
     ) -> MovedMap:
-        """Bearings (B,) of the beams in the body's frame, from a place in it (ahead, left)."""
+        """Return bearings (B,) of the beams in the body's frame, from a place in it (x, y)."""
         ways = np.stack([np.cos(bearings_rad), np.sin(bearings_rad)])
         return cls(sectors, body, (at_m[0] - body.lidar_x_m, at_m[1]), ways)
 
@@ -127,7 +127,7 @@ def returned(ranges_m: F64, range_min_m: float, range_max_m: float) -> Bools:
 
 
 def with_unseen(clearance_m: NDArray[np.float64], range_max_m: float) -> NDArray[np.float64]:
-    """Clearance per sector (N, K) with what no beam ended in, NaN, filled.
+    """Fill sectors without a beam's end, NaN, in clearances (N, K).
 
     What lies behind a near thing, as a lidar beside the middle sees it, is as near as the nearer of
     the sectors on either side, over up to UNSEEN_SECTORS. More are beyond the lidars' view: free up

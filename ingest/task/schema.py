@@ -151,7 +151,7 @@ COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS 
 
 
 def signal_arrays(signals: Signals) -> dict[str, pa.Array]:
-    """Signals as SQL sees them: what is not known is null, where NaN would pass for a number."""
+    """Return signals for SQL: unknown values are null, since NaN would pass for a number."""
     return {
         name: pa.array(np.asarray(values), from_pandas=name in OPTIONAL_SIGNALS)
         for name, values in signals.items()
@@ -402,7 +402,7 @@ class Perturbed:
         return cls(sets, row, notes if unread else [])
 
     def columns(self, places: Ints) -> tuple[pa.Array, pa.Array]:
-        """`perturbation` and `perturbation_values` at some places (n,)."""
+        """Return `perturbation` and `perturbation_values` at some places (n,)."""
         named = [None if item is None else item[0] for item in self.sets]
         values = [None if item is None else list(item[1].items()) for item in self.sets]
         row = self.row[places]
@@ -414,7 +414,7 @@ class Perturbed:
 
 
 def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
-    """`{"name": …, "values": {field: number}}` to the two; None where it is something else."""
+    """Parse `{"name": …, "values": {field: number}}` into the two; None if it is something else."""
     try:
         message = json.loads(text)
         name, values = message["name"], message["values"]

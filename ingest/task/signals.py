@@ -99,7 +99,7 @@ LIDAR_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.lidar)
 def localised_velocity(
     now: Signals, before: Signals
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Forward and lateral speed (m/s) from two localised poses, in the body frame of `now`.
+    """Return forward and lateral speed (m/s) from two localised poses, in the body frame of `now`.
 
     Where no new pose has arrived since the step before there is no evidence of motion beyond
     the wheels', and the wheel speed is returned (so that it never looks like slip).
@@ -126,7 +126,7 @@ def wrap_angle(angle_rad: NDArray[Any]) -> NDArray[Any]:
 def yaw_of(
     x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], w: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise.
+    """Return the yaw of quaternions (N,) in (-pi, pi], REP 103: about z, counter-clockwise.
 
     NaN where one has no length: it was not filled in. Those of other lengths are normalised.
     """

@@ -39,7 +39,7 @@ class RouteView:
 
 
 def pad_plans(plans: Sequence[NDArray[Any]]) -> F64:
-    """Plans of (P_i, 2) points each to one array (N, max P, 2)."""
+    """Pad plans of (P_i, 2) points to one array (N, max P, 2)."""
     longest = max((len(plan) for plan in plans), default=1)
     padded = np.empty((len(plans), max(longest, 2), 2))
     for row, plan in zip(padded, plans, strict=True):
@@ -51,7 +51,7 @@ def pad_plans(plans: Sequence[NDArray[Any]]) -> F64:
 def view_route(
     plans_m: F64, pose_x_m: F64, pose_y_m: F64, pose_yaw_rad: F64, distances_m: Sequence[float]
 ) -> RouteView:
-    """Plans (N, P, 2) and poses (N,) to look-ahead points at `distances_m` along the plan.
+    """Return look-ahead points at `distances_m` along plans (N, P, 2), from poses (N,).
 
     A look-ahead point beyond the end of the plan is its end. Compiled code, where there is some
     (`restock.native`), does what NumPy does without it, to the last bit.
@@ -275,7 +275,7 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
 
 
 def sector_returns(task: Task, clearance_m: F64) -> tuple[F64, F64]:
-    """x and y (N, K) in the body frame of each sector's nearest return, of clearances (N, K)."""
+    """Return body-frame x and y (N, K) of each sector's nearest return, from clearances (N, K)."""
     sectors = _sectors(task.sectors, task.body)
     distance = clearance_m + sectors.reach_m
     return distance * sectors.cos + task.body.lidar_x_m, distance * sectors.sin

@@ -127,7 +127,7 @@ class Task(Checked, frozen=True):
 
     @property
     def hash(self) -> str:
-        """Names the definition, its parameters and the version of this code: 12 hex digits."""
+        """Return 12 hex digits of the definition, its parameters and the version of this code."""
         content = msgspec.json.encode([TASK_CODE_VERSION, self])
         return hashlib.blake2b(content, digest_size=6).hexdigest()
 
@@ -218,7 +218,7 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
 def nearest_action(
     task: Task, speed_mps: NDArray[Any], yaw_rate_radps: NDArray[Any]
 ) -> tuple[Ints, NDArray[np.float64]]:
-    """Commands (N,) to the nearest discrete action (N,), and how far from it they were (N,).
+    """Return the nearest discrete action (N,) of commands (N,), and their distance to it (N,).
 
     Distance is measured in units of the fastest action on each axis. Ties go to the first action.
     """
@@ -323,7 +323,7 @@ def _fastest(task: Task) -> NDArray[np.float64]:
 
 
 def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
-    """Clearance to [0, 1], with more resolution close by."""
+    """Scale clearance to [0, 1], with more resolution close by."""
     return np.sqrt(np.clip(clearance_m / range_max_m, 0.0, 1.0))
 
 
