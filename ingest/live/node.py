@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -182,7 +183,6 @@ def load_ros() -> Ros:
         "rclpy.executors": ("MultiThreadedExecutor",),
         "rclpy.clock": ("Clock", "ClockType"),
         "rclpy.signals": ("SignalHandlerOptions",),
-        "rosidl_runtime_py.utilities": ("get_message",),
     }
     try:
         found = {
@@ -190,7 +190,7 @@ def load_ros() -> Ros:
             for module, each in names.items()
             for name in each
         }
-        return Ros(rclpy=import_module("rclpy"), **found)
+        return Ros(rclpy=import_module("rclpy"), get_message=_message_class, **found)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
             f"needs ROS 2, whose rclpy cannot be imported: {error}",
@@ -200,7 +200,14 @@ def load_ros() -> Ros:
         ) from error
 
 
+def _message_class(kind: str) -> Any:
+    package, folder, name = kind.split("/")
+    return getattr(import_module(f"{package}.{folder}"), name)
+
+
 DIAGNOSTICS_S = 1.0
+DISCOVERY_S = 1.0
+WAKE_S = 0.2  # a signal is heard after at most this time
 NAME = "restock_policy"
 
 
@@ -212,12 +219,15 @@ class PolicyNode:
         self.pilot: Pilot | None = None
         self.active = False
         self._watch_group = ros.MutuallyExclusiveCallbackGroup()
+        self._commanding = threading.Lock()  # nothing is commanded after the last stop
         self._decided_s = math.inf  # by the steady clock
         self._said = ""  # who drives, as last published
         self._classes: dict[str, Any] = {}
         self._published: dict[str, Any] = {}
         self._reports: Any = None
-        self._subscriptions: list[Any] = []
+        self._subscriptions: dict[str, Any] = {}  # best effort, which any publisher matches
+        self._latched: dict[str, Any] = {}  # second ones, while a publisher latches
+        self._latching: dict[str, Any] = {}  # topics that a publisher may latch, with their classes
         self._timers: list[Any] = []
         self._defaults: dict[str, Any] = {}  # of the parameters that a policy's profile declared
         self._parameter("policy", str(policy))
@@ -274,11 +284,13 @@ class PolicyNode:
         }
         status = self._classes["diagnostics"] = self._class("diagnostic_msgs/msg/DiagnosticArray")
         self._reports = self.node.create_publisher(status, "/diagnostics", 10)
-        self._subscriptions = [
-            self.node.create_subscription(kind, topic, partial(self._receive, topic), qos)
+        self.pilot = pilot
+        self._subscriptions = {
+            topic: self._subscribe(topic, kind, self.ros.sensor_qos())
             for topic, kind in heard.items()
-            for qos in self._subscribed(topic, pilot)
-        ]
+        }
+        self._latching = {topic: heard[topic] for topic in sorted(pilot.latched)}
+        self._match_latched()
         # Control ticks by the node's clock, which use_sim_time sets; the rest by a steady one.
         steady = self.ros.Clock(clock_type=self.ros.ClockType.STEADY_TIME)
         self._timers = [
@@ -287,8 +299,8 @@ class PolicyNode:
                 self.watchdog_s / 2, self._watch, callback_group=self._watch_group, clock=steady
             ),
             self.node.create_timer(DIAGNOSTICS_S, self._report, clock=steady),
+            self.node.create_timer(DISCOVERY_S, self._match_latched, clock=steady),
         ]
-        self.pilot = pilot
         mode = "shadow: it sends no commands" if self.shadow else f"it drives {self.form.topic}"
         self._log(f"{policy.path}: profile {profile.name}, task {task.hash}, {mode}")
 
@@ -299,11 +311,12 @@ class PolicyNode:
 
     def deactivate(self) -> None:
         """Stop, and publish nothing from here on; the lifecycle publishers are still enabled."""
-        if self.active and self._drives():
-            self._command(0.0, 0.0)
-            assert self.pilot is not None
-            self._say(self.pilot.profile.behaviour_policy)
-        self.active = False
+        with self._commanding:
+            if self.active and self._drives():
+                self._command(0.0, 0.0)
+                assert self.pilot is not None
+                self._say(self.pilot.profile.behaviour_policy)
+            self.active = False
 
     def cleanup(self) -> None:
         """Take down what `configure` made."""
@@ -311,14 +324,14 @@ class PolicyNode:
         self.pilot = None
         for timer in self._timers:
             self.node.destroy_timer(timer)
-        for subscription in self._subscriptions:
+        for subscription in (*self._subscriptions.values(), *self._latched.values()):
             self.node.destroy_subscription(subscription)
         for publisher in self._published.values():
             self.node.destroy_lifecycle_publisher(publisher)
         if self._reports is not None:
             self.node.destroy_publisher(self._reports)
-        self._timers, self._subscriptions, self._published = [], [], {}
-        self._reports = None
+        self._timers, self._published, self._reports = [], {}, None
+        self._subscriptions, self._latched, self._latching = {}, {}, {}
         # The next policy has its own; what a person has set stays.
         for name, default in self._defaults.items():
             if self._value(name) == default:
@@ -327,10 +340,22 @@ class PolicyNode:
 
     # -- messages and ticks ---------------------------------------------------------------------
 
-    def _subscribed(self, topic: str, pilot: Pilot) -> list[Any]:
-        """Return the subscriptions' qualities: a latched one alone misses plain publishers."""
-        latched = [self.ros.latched_qos()] if topic in pilot.latched else []
-        return [self.ros.sensor_qos(), *latched]
+    def _subscribe(self, topic: str, kind: Any, qos: Any) -> Any:
+        return self.node.create_subscription(kind, topic, partial(self._receive, topic), qos)
+
+    def _match_latched(self) -> None:
+        """Ask for the last message of a topic while a publisher keeps it, whenever that starts.
+
+        Asked for it, a publisher that keeps none sends nothing, and both sides warn.
+        """
+        keeps = self.ros.DurabilityPolicy.TRANSIENT_LOCAL
+        for topic, kind in self._latching.items():
+            offers = self.node.get_publishers_info_by_topic(self.node.resolve_topic_name(topic))
+            offered = any(one.qos_profile.durability == keeps for one in offers)
+            if offered and topic not in self._latched:
+                self._latched[topic] = self._subscribe(topic, kind, self.ros.latched_qos())
+            elif not offered and topic in self._latched:
+                self.node.destroy_subscription(self._latched.pop(topic))
 
     def _receive(self, topic: str, message: Any) -> None:
         if self.pilot is not None:
@@ -343,16 +368,17 @@ class PolicyNode:
         decision = self.pilot.decide(self._now_ns())
         self._decided_s = time.monotonic()
         late = self._decided_s - began_s > self.watchdog_s  # the watchdog has stopped it meanwhile
-        if not self.active:
-            return
-        self._publish_shadow(decision)
-        if self.shadow:
-            return
-        if decision.taken_over:
-            self._say("operator")
-            return
-        self._say(self._own())
-        self._command(*((0.0, 0.0) if late else decision.command))
+        with self._commanding:
+            if not self.active:
+                return
+            self._publish_shadow(decision)
+            if self.shadow:
+                return
+            if decision.taken_over:
+                self._say("operator")
+                return
+            self._say(self._own())
+            self._command(*((0.0, 0.0) if late else decision.command))
 
     def _publish_shadow(self, decision: Decision) -> None:
         """Publish what it would do and why, for the log, whoever drives."""
@@ -368,12 +394,13 @@ class PolicyNode:
 
     def _watch(self) -> None:
         """Publish a stop if control ticks no longer come: a hanging decision or stopped clock."""
-        if not self.active or self.pilot is None:
-            return
-        if time.monotonic() - self._decided_s > self.watchdog_s:
-            self.pilot.counts["stop: watchdog"] += 1
-            if self._drives():
-                self._command(0.0, 0.0)
+        with self._commanding:
+            if not self.active or self.pilot is None:
+                return
+            if time.monotonic() - self._decided_s > self.watchdog_s:
+                self.pilot.counts["stop: watchdog"] += 1
+                if self._drives():
+                    self._command(0.0, 0.0)
 
     def _drives(self) -> bool:
         """Return whether its commands are the robot's."""
@@ -534,12 +561,15 @@ def lifecycle_node(ros: Ros, policy: Path, *, drive: bool = False) -> Any:
 
 
 def run_node(ros: Ros, policy: Path, *, drive: bool = False, activate: bool = False) -> int:
-    """Spin the node until it is interrupted; it stops the robot before it goes. Returns 0."""
+    """Spin the node until SIGINT or SIGTERM; it stops the robot before it goes. Returns 0."""
     import signal
 
-    # rclpy's own handlers would end the context before a last stop could be published.
+    # rclpy's own handlers would end the context before a last stop could be published. Waiting for
+    # messages holds Python's back, so the wait is short; a launch may send several.
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
     ros.rclpy.init(signal_handler_options=ros.SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     node = lifecycle_node(ros, policy, drive=drive)
     executor = ros.MultiThreadedExecutor(num_threads=2)  # the watchdog has its own
     executor.add_node(node)
@@ -549,11 +579,13 @@ def run_node(ros: Ros, policy: Path, *, drive: bool = False, activate: bool = Fa
             if done != ros.TransitionCallbackReturn.SUCCESS:
                 raise ConfigError("could not be configured: see the node's log", where=str(policy))
             node.trigger_activate()
-        executor.spin()
-    except KeyboardInterrupt:
+        else:
+            node.get_logger().info("unconfigured: waits for `configure`")
+        while not ended.is_set():
+            executor.spin_once(timeout_sec=WAKE_S)
         node.get_logger().info("interrupted: stopping")
     finally:
-        node.trigger_shutdown()
+        node.policy.deactivate()
         executor.shutdown()
         node.destroy_node()
         ros.rclpy.try_shutdown()

@@ -11,7 +11,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from support.ros_graph import Graph, Returned, message_class
+from support.ros_graph import (
+    VOLATILE,
+    Durability,
+    Graph,
+    QoS,
+    Returned,
+    message_class,
+)
 from support.twin_robot import TwinRobot, follower_onnx
 
 from restock.cli import main, run_node
@@ -119,12 +126,30 @@ def test_it_can_be_configured_again_after_a_cleanup(policy: Path) -> None:
     assert not graph.timers
     assert node.trigger_configure() is Returned.SUCCESS
     assert node.trigger_activate() is Returned.SUCCESS
-    assert len(graph.timers) == 3
+    assert len(graph.timers) == 4
 
 
-def test_configured_again_it_has_the_new_limits(
-    tmp_path: Path,
-) -> None:
+def test_a_kept_message_is_asked_for_while_a_publisher_keeps_it(policy: Path) -> None:
+    """The stub fails where a plain publisher is asked: there rclpy and the publisher warn."""
+    keeps, goal = QoS(1, durability=Durability.TRANSIENT_LOCAL), "geometry_msgs/msg/PoseStamped"
+    for earlier in (True, False):
+        graph = Graph()
+        graph.send("/goal_pose", message_class(goal)(), keeps if earlier else VOLATILE)
+        node = lifecycle_node(graph.ros(), policy)
+        assert node.trigger_configure() is Returned.SUCCESS, graph.logged
+        kept = node.policy.pilot.observer._buffers["/goal_pose"]
+        assert len(kept) == earlier
+        assert len(graph.heard["/goal_pose"]) == 1 + earlier
+        graph.offered["/goal_pose"] = VOLATILE if earlier else keeps
+        graph.fire(steady=True)
+        assert len(kept) == 1
+        assert len(graph.heard["/goal_pose"]) == 2 - earlier
+        assert len(graph.heard["/scan"]) == 1  # no other topic's last message counts
+    assert node.trigger_shutdown() is Returned.SUCCESS
+    assert not any(graph.heard.values())
+
+
+def test_configured_again_it_has_the_new_limits(tmp_path: Path) -> None:
     def limited(name: str, speed_mps: float) -> Path:
         limiter = Limiter(max_speed_mps=speed_mps, reaction_s=0.0)
         profile = msgspec.structs.replace(PROFILE, limiter=limiter)

@@ -2,8 +2,8 @@
 
 It has what `restock.ingest.live.node` imports and nothing else, written after rclpy's own source:
 the transitions and what their callbacks return, lifecycle publishers that are silent until they are
-enabled, which requests of QoS match which offers, timers by the node's clock or a steady one. It is
-no proof that rclpy does the same; no test here has rclpy.
+enabled, which requests of QoS match which offers, timers by the node's clock or a steady one.
+`test_ros.py` compares it with rclpy: the same commands for the same messages.
 """
 
 from __future__ import annotations
@@ -52,9 +52,11 @@ class Graph:
     parameters: dict[str, Any] = field(default_factory=dict)  # of the launch file
     logged: list[str] = field(default_factory=list)
     timers: list[SimpleNamespace] = field(default_factory=list)
+    offered: dict[str, QoS] = field(default_factory=dict)  # by the last publisher of a topic
 
     def send(self, topic: str, message: Any, offered: QoS = VOLATILE) -> None:
         self.sent.append((self.now_ns, topic, message))
+        self.offered[topic] = offered
         for requested, callback in list(self.heard.get(topic, ())):
             if offered.offers(requested):
                 callback(message)
@@ -169,7 +171,17 @@ class LifecycleNode:
         self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoS
     ) -> Any:
         self.graph.heard.setdefault(topic, []).append(entry := (qos, callback))
+        if qos.durability is Durability.TRANSIENT_LOCAL and (kept := self.graph.of(topic)):
+            assert self.graph.offered[topic].offers(qos), f"{topic}: incompatible QoS"
+            callback(kept[-1])
         return topic, entry
+
+    def resolve_topic_name(self, topic: str) -> str:
+        return topic
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
+        offered = self.graph.offered.get(topic)
+        return [] if offered is None else [SimpleNamespace(qos_profile=offered)]
 
     def create_timer(
         self, period_s: float, callback: Any, callback_group: Any = None, clock: Any = None
