@@ -205,12 +205,6 @@ def test_stamps_that_a_driver_left_at_zero_are_named(names, tmp_path, capsys):
     assert "200 of 200 messages of /imu were left out" in capsys.readouterr().err
 
 
-def test_topics_without_a_stamp_other_than_zero_are_no_clock():
-    topics = never_stamped(Drive(4.0), "/odom")
-    with pytest.raises(RecordingError, match=r"has a header stamp \(other than zero\)"):
-        align({"/odom": topics["/odom"][1]}, Clock())
-
-
 @pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
 def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path, capsys):
     topics = logged_at(Drive(20.0), lambda time, place: 0)

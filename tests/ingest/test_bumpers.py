@@ -14,7 +14,6 @@ from support.driven_robot import Drive, columns, ragged, typed_topics, write_top
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
-from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.live.observer import LiveObserver, _columns
 from restock.ingest.profile.profile import load_profile, parse_profile
@@ -105,16 +104,3 @@ def test_a_running_robot_reads_the_same(tmp_path: Path) -> None:
         observer.receive(topic, message, second * 10**9)
     kept = _columns(observer._buffers[topic])
     assert pressed_in(kept.fields, pressed, len(kept)).tolist() == [False, False, True]
-
-
-def test_a_bumper_by_hand_is_several_fields_or_one() -> None:
-    start = WAREHOUSE.index('pressed = "data"', WAREHOUSE.index("[inputs.bumper]"))
-
-    def with_pressed(path: str) -> str:
-        known = 'pressed = "data"'
-        return WAREHOUSE[:start] + f'pressed = "{path}"' + WAREHOUSE[start + len(known) :]
-
-    profile = parse_profile(with_pressed("front or sides[2] or rear.pressed"), where="p")
-    assert profile.inputs.bumper is not None
-    with pytest.raises(ConfigError, match=r"inputs\.bumper\.fields\.pressed"):
-        parse_profile(with_pressed("front or 3sides"), where="p")

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.profile_texts import WAREHOUSE
 
-from restock.errors import ConfigError, RecordingError
+from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
-from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps import clearance
 from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
@@ -82,16 +81,6 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(
         assert np.asarray(whole[UNAIMED])[row] == (beams > 0 and np.isnan(first))
 
 
-def test_ranges_of_a_fixed_size_are_no_different() -> None:
-    fields = scans([30, 30, 30], [-3.0, -3.0, 0.5], 4)
-    ranges = fields["ranges"]
-    assert isinstance(ranges, Ragged)
-    fixed = {**fields, "ranges": np.asarray(ranges.values).reshape(3, 30)}
-    for name in (SECTORS, BEAMS, BLIND):
-        one, other = REDUCE.apply(fields)[name], REDUCE.apply(fixed)[name]
-        assert np.array_equal(np.asarray(one), np.asarray(other))
-
-
 def test_an_angle_that_is_no_number_is_named() -> None:
     fields = scans([30], [-3.0], 4)
     with pytest.raises(RecordingError, match="'angle_min' of /scan is not one number per message"):
@@ -128,27 +117,3 @@ def test_a_lidar_upside_down_sees_at_negated_angles(last: str) -> None:
         assert np.array_equal(np.asarray(found[name]), np.asarray(expected[name])), name
     swapped = scan_reduction(TASK, upright).apply(fields | negated)
     assert not np.array_equal(np.asarray(swapped[SECTORS]), np.asarray(expected[SECTORS]))
-
-
-def test_only_a_scan_can_be_upside_down() -> None:
-    text = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
-    turned, known = (parse_profile(one, where="p") for one in (text, WAREHOUSE))
-    assert turned.hash != known.hash
-    same = parse_profile(text.replace("upside_down = true", "upside_down = false"), where="p")
-    assert same.hash == known.hash
-    odd = WAREHOUSE.replace("[inputs.imu]", "[inputs.imu]\nupside_down = true")
-    with pytest.raises(ConfigError, match=r"inputs\.imu\.upside_down` applies only to a scan"):
-        parse_profile(odd, where="p")
-
-
-@pytest.mark.parametrize(
-    ("last", "reported"),
-    [
-        ("", "missing 'angle_increment_rad'"),
-        (', angle_max_rad = "angle_max", angle_increment_rad = "b"', "angle_max_rad beside"),
-    ],
-)
-def test_a_scan_has_an_increment_or_a_last_angle(last: str, reported: str) -> None:
-    text = WAREHOUSE.replace(', angle_increment_rad = "angle_increment"', last)
-    with pytest.raises(ConfigError, match=reported):
-        parse_profile(text, where="p")

@@ -11,13 +11,12 @@ import pytest
 from support.driven_robot import BEAMS, Drive, columns, ragged, scans, typed_topics, write_topics
 from support.profile_texts import WAREHOUSE
 
-from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
-from restock.ingest.profile.signal_paths import CONVENTIONS, conventions_of
+from restock.ingest.profile.signal_paths import conventions_of
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
 
@@ -212,31 +211,3 @@ def test_a_robot_sees_what_its_recordings_say() -> None:
     kept = observer._buffers["/imu"][-1].fields
     (rule,) = conventions_of("sensor_msgs/msg/Imu", "angular_velocity.z")
     assert rule.flags(kept).tolist() == [True]
-
-
-def test_each_convention_names_fields_that_its_type_has() -> None:
-    from rosbags.typesys import Stores, get_typestore
-
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    full = {name.split("/")[-1]: name for name in types.fielddefs if name.split("/")[0] != "px4"}
-    for rule in CONVENTIONS:
-        for path in (*rule.values, *rule.fields):
-            kind = full[rule.type]
-            for part in path.split("."):
-                fields = dict(types.fielddefs[kind][1])
-                assert part in fields, (rule.type, path)
-                kind = fields[part][1] if isinstance(fields[part][1], str) else kind
-
-
-def test_a_proposal_takes_no_gyro_that_measures_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bag = write_topics(drive(angular_velocity=slice(None)), tmp_path / "bag", storage="mcap")
-    out = tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(out)]) == 0
-    said = capsys.readouterr().err
-    reported = "all 300 messages of /imu have no estimate of angular_velocity"
-    assert reported in said
-    text = out.read_text()
-    assert reported in text
-    assert parse_profile(text, where="p").inputs.imu is None

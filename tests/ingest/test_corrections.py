@@ -18,7 +18,6 @@ from support.profile_texts import WAREHOUSE
 from support.stores import one
 
 from restock.cli import main
-from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.relabel import (
     RecordingCorrections,
@@ -133,14 +132,6 @@ def test_taken_out_the_labels_of_the_rules_are_there_again(store: Path) -> None:
     assert "+" not in outcome.after
     assert labels(store, columns) == before
     assert remove_corrections(StoreWriter(store)) == ([], None)
-
-
-def test_a_reingested_recording_is_not_corrected(store: Path) -> None:
-    with Store(store) as opened:
-        recording = opened.sql("SELECT min(recording_id) FROM recordings").fetchall()[0][0]
-    given = {recording: RecordingCorrections("another", [])}
-    with pytest.raises(StoreError, match="ingested again or removed"):
-        correct_store(StoreWriter(store), given)
 
 
 def test_views_and_panels_show_corrections(store: Path, tmp_path: Path) -> None:

@@ -11,10 +11,8 @@ from support.driven_robot import Drive, write_bag
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
-from restock.errors import ConfigError
 from restock.ingest.profile.profile import (
     load_profile,
-    parse_profile,
     profile_toml,
     read_profile_toml,
 )
@@ -99,23 +97,6 @@ def test_an_exposure_takes_no_row_from_a_condition():
     assert named == primary({name: labels[name] for name in labels if name != "busy"}, SHIPPED)
     assert {"nominal", "near_collision"} <= set(named)
     assert labels_version(every) != labels_version(SHIPPED)
-
-
-@pytest.mark.parametrize("more", ['timing = "post"', 'timing = "pre"\nprobability = "0.5"'])
-def test_an_exposure_has_no_probability(more):
-    text = f'{TEXT}\n[[condition]]\nname = "x"\nkind = "exposure"\nsql = "true"\n{more}\n'
-    with pytest.raises(ConfigError, match="exposure is a situation known before acting"):
-        parse_profile(text, where="here")
-
-
-def test_a_name_that_is_none_is_refused_with_those_there_are():
-    with pytest.raises(ConfigError, match="no exposure named 'wheel_slip'") as caught:
-        parse_profile(TEXT.replace(LISTED, 'exposures = ["wheel_slip"]'), where="here")
-    assert "closing_traffic" in str(caught.value.remedy)
-    with pytest.raises(ConfigError, match="no condition named 'closing_traffic'"):
-        parse_profile(
-            TEXT.replace("conditions = [", 'conditions = ["closing_traffic", ', 1), where="here"
-        )
 
 
 @pytest.fixture

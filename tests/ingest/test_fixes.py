@@ -199,26 +199,6 @@ def test_the_track_equals_that_of_a_full_search(seed, scatter_m):
     np.testing.assert_array_equal(track_yaw(x, y, 1.0), plain_track_yaw(x, y, 1.0))
 
 
-@pytest.mark.parametrize("left_m", [0.0, 1.5], ids=["from the start", "after a drive"])
-def test_a_standing_robot_is_compared_with_few_positions(monkeypatch, left_m):
-    compared = 0
-    plain = np.hypot
-
-    def counted(*args):
-        nonlocal compared
-        compared += np.size(args[0])
-        return plain(*args)
-
-    monkeypatch.setattr(np, "hypot", counted)
-    count = 6_000
-    scatter = np.random.default_rng(0).normal(0, 0.03, (2, count))
-    x = np.concatenate([np.arange(0, left_m, 0.1), np.full(count, left_m)])
-    x[-count:] += scatter[0]
-    y = np.concatenate([np.zeros(len(x) - count), scatter[1]])
-    track_yaw(x, y, 1.0)
-    assert compared < 500 * count  # each with each is 3,000 times `count`
-
-
 def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, capsys):
     profile, store = tmp_path / "gps.toml", tmp_path / "store"
     assert main(["profile", "new", str(bag), "--out", str(profile)]) in (0, 3)

@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
-from restock.errors import ConfigError
-from restock.ingest.live.observer import LiveObserver
-from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.hindsight import GoalRules, missions, shortest_m
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
@@ -180,37 +178,6 @@ def test_a_robot_that_mostly_stood_has_goals_if_requested(tmp_path, capsys) -> N
         assert store.sql("SELECT DISTINCT goal_source FROM transitions").fetchall() == [
             ("hindsight",)
         ]
-
-
-def test_where_it_got_nowhere_no_goal_can_be_asked_for(tmp_path, capsys) -> None:
-    _, file, said = proposed(Turntable(20.0), tmp_path, capsys, "--hindsight-goals")
-    assert load_profile(file).task.goal == "none"
-    assert said["transitions"] > 90
-
-
-def test_the_goal_key_leaves_other_profiles_unchanged(tmp_path) -> None:
-    logged = load_profile("warehouse_amr")
-    text = profile_toml(logged)
-    assert parse_profile(text, where="text").hash == logged.hash
-    hindsight = text.replace('source = "logged"', 'source = "hindsight"')
-    with pytest.raises(ConfigError, match=r"inputs.goal.*would not be used"):
-        parse_profile(hindsight, where="text")
-    with pytest.raises(ConfigError, match=r"`task.goal` is 'none'"):
-        parse_profile(hindsight.replace('goal = "route"', 'goal = "none"'), where="text")
-
-
-def test_rules_of_hindsight_are_refused_where_goals_are_logged(tmp_path) -> None:
-    text = profile_toml(load_profile("warehouse_amr"))
-    unused = tmp_path / "unused.toml"
-    unused.write_text(text.replace("still_s = 3.0", "still_s = 5.0"))
-    with pytest.raises(ConfigError, match=r"`goal\.still_s` is given.*would not be used"):
-        load_profile(unused)
-
-
-def test_a_running_robot_has_no_hindsight(tmp_path, capsys) -> None:
-    _, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
-    with pytest.raises(ConfigError, match="in hindsight, which is not possible live"):
-        LiveObserver(load_profile(file))
 
 
 def found(xy: np.ndarray, leg: np.ndarray | None = None, located: np.ndarray | None = None):

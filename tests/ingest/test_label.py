@@ -15,7 +15,7 @@ from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import Condition, label, labels_version
+from restock.ingest.task.conditions import Condition, labels_version
 from restock.replay.store.store import Store
 
 # Looks ahead: at the last transition of an episode, at a step that is no row of the store.
@@ -98,15 +98,6 @@ def test_an_ingest_after_a_relabel_finds_it_unchanged(store, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["recordings"][0]["status"] == "unchanged"
 
 
-def test_a_dry_run_says_what_would_change_and_writes_nothing(store, tmp_path, capsys):
-    shipped = tmp_path / "shipped.toml"
-    shipped.write_text(TEXT)
-    before = sorted(store.rglob("*"))
-    assert main(["store", "label", str(store), "--profile", str(shipped), "--dry-run"]) == 0
-    assert "soon" in capsys.readouterr().out
-    assert sorted(store.rglob("*")) == before
-
-
 def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
     writer = StoreWriter(store)
 
@@ -126,36 +117,6 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
     with pytest.raises(StoreError, match="ingested again or removed in the meantime"):
         relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "primary_condition")} == {"nominal", "soon"}
-
-
-def test_rows_without_their_episodes_ends_are_refused(store):
-    writer = StoreWriter(store)
-    original = writer.rows
-    writer.rows = lambda *key: original(*key).replace_schema_metadata(None)  # type: ignore[method-assign]
-    with pytest.raises(StoreError, match="lack the ends of their episodes"):
-        relabel_store(writer, lambda name: [Condition("always", "pre", "true")])
-
-
-def test_wrong_usage(store, tmp_path, capsys):
-    assert main(["store", "label", str(tmp_path / "none")]) == 2
-    assert "there is no store, or it is empty" in capsys.readouterr().err
-    bad = tmp_path / "bad.toml"
-    bad.write_text(TEXT + SOON.format("lead(pose_x_mm) OVER episode > 2"))
-    assert main(["store", "label", str(store), "--profile", str(bad)]) == 2
-    assert "`condition[0].sql` ('soon'): its SQL fails" in capsys.readouterr().err
-
-
-def test_the_ends_are_kept_with_the_rows(store):
-    from restock.ingest.store.transitions import episode_ends
-
-    writer = StoreWriter(store)
-    for row in writer.live().to_pylist():
-        ends = episode_ends(writer.rows(row["recording_id"], row["ingest_id"]))
-        assert ends is not None
-        assert len(ends) == row["episodes"] == 1
-        last = ends["pose_x_m"][0].as_py()
-        assert last == pytest.approx(2.6 if row["transitions"] == 16 else 3.9, abs=0.01)
-        assert not label(ends, [Condition("x", "pre", "bumped")])["x"].any()
 
 
 def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:

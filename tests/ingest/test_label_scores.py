@@ -82,25 +82,6 @@ def test_scores_by_hand():
     assert score(never, ["nominal", "nominal"], *in_one_episode(2), 0.2) == []
 
 
-@pytest.mark.parametrize(("apart", "found"), [(1, 1), (2, 1), (3, 0)])
-def test_an_event_is_found_within_the_tolerance(apart, found):
-    holds = np.arange(12) == 6 + apart
-    truth = ["slip" if step == 6 else "nominal" for step in range(12)]
-    (one,) = score({"slip": holds}, truth, *in_one_episode(12), 0.2)
-    assert (one.event_found, one.event_right) == (found, found)
-    # Half the control period: the same time is twice the steps.
-    (one,) = score({"slip": holds}, truth, *in_one_episode(12), 0.1)
-    assert one.event_found == 1
-
-
-def test_no_event_reaches_into_another_episode_or_over_a_gap():
-    holds, truth = np.array([False, True, False, False]), ["nominal", "nominal", "slip", "slip"]
-    for episode, step in (([0, 0, 1, 1], [0, 1, 0, 1]), ([0, 0, 0, 0], [0, 1, 7, 8])):
-        (one,) = score({"slip": holds}, truth, np.array(episode), np.array(step), 0.2)
-        assert (one.event_labelled, one.event_right) == (1, 0)
-        assert (one.event_support, one.event_found) == (1, 0)
-
-
 @st.composite
 def episodes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Labels and truth (N,) with their episode and step."""

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -23,18 +22,13 @@ from support.bag_samples import compress_files
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 from support.long import one_in
-from support.stores import manifest
 
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import align
 from restock.ingest.steps.clocks import STAMP, topic_clock
-from restock.ingest.steps.episodes import Steps, split, steps_of
-from restock.ingest.store import summary
-from restock.ingest.store import transitions as transitions_module
-from restock.ingest.store.commits import plain_lists
-from restock.ingest.store.transitions import Provenance, recording_table
+from restock.ingest.steps.episodes import Steps, steps_of
 
 IMAGE_BYTES = 400_000
 FEW, MANY = 10, 250  # images
@@ -43,8 +37,6 @@ FEW, MANY = 10, 250  # images
 ALLOWED_MB = 48
 
 PROFILE = load_profile("warehouse_amr")
-PROVENANCE = Provenance("ab" * 8, "1", "drive.mcap", "1.0")
-
 # Ingests each recording in turn, and says the peak of this process' memory after each.
 MEASURE = """
 import json, re, sys
@@ -159,44 +151,3 @@ def steps() -> Steps:
     """Of a drive of many episodes of much the same length."""
     goals = [(float(t), 2.0 + t % 3, 1.0) for t in range(0, 40, 4)]
     return steps_of(PROFILE, Drive(duration_s=45.0, goals=goals).topics())
-
-
-def test_rows_lie_in_memory_once(steps: Steps, monkeypatch: pytest.MonkeyPatch) -> None:
-    episodes = split(PROFILE.task, steps)
-    assert len(episodes.episodes) > 5
-    monkeypatch.setattr(transitions_module, "GROUP_ROWS", 20)  # several groups
-    table, rows = recording_table(PROFILE, steps, episodes, PROVENANCE)
-    a_copy = 4 * PROFILE.task.observation_size * len(rows.tick)
-    wide = table.select(summary.WIDE)
-    assert wide.get_total_buffer_size() <= a_copy  # of both columns, ends of episodes included
-    # Parquet gets plain lists over the same memory, and their offsets.
-    offsets = 8 * (len(table) + len(rows.tick))
-    assert plain_lists(wide).get_total_buffer_size() <= a_copy + offsets
-    once = table.select(["recording_id"]).get_total_buffer_size()
-    assert once < len(table) * (4 + len(PROVENANCE.recording_id)) / 2
-    assert not steps.without_values().signals
-    assert len(steps.without_values()) == 0
-
-
-def test_a_summary_is_made_some_episodes_at_a_time(
-    steps: Steps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    table, _ = recording_table(PROFILE, steps, split(PROFILE.task, steps), PROVENANCE)
-    reported = manifest(table, task=PROFILE.task)
-    whole = summary.summarised(reported, table)
-    looked_at: list[int] = []
-
-    def seen(rows: pa.Table) -> pa.Table:
-        looked_at.append(len(rows))
-        return unchunked(rows)
-
-    unchunked = summary._unchunked
-    monkeypatch.setattr(summary, "_unchunked", seen)
-    monkeypatch.setattr(summary, "STRETCH_ROWS", 40)
-    assert summary.summarised(reported, table).equals(whole)
-    assert len(looked_at) > 2
-    assert sum(looked_at) == len(table)
-    looked_at.clear()
-    apart = table.take(np.argsort(table["step_index"].to_numpy(), kind="stable"))
-    summary.summarised(reported, apart)
-    assert looked_at == [len(table)]  # rows of an episode that do not lie together stay in one

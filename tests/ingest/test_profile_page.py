@@ -67,15 +67,3 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     main(["ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store", "--json"])
     recordings = json.loads(capsys.readouterr().out)["recordings"]
     assert {one["status"] for one in recordings} == {"unchanged"}
-
-
-def test_the_page_has_all_signal_keys_and_reductions():
-    from typing import get_args
-
-    from restock.ingest.profile.tables import CustomSignal, Frames, Reduce
-
-    for name in (*CustomSignal.__struct_fields__, *get_args(Reduce)):
-        assert f"`{name}`" in PAGE or f"`{name} = " in PAGE, name
-    for name in ("fixed", "base", "max_age_s"):
-        assert name in Frames.__struct_fields__
-        assert re.search(rf"^{name} = ", PAGE, re.M), name

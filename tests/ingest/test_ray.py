@@ -12,7 +12,6 @@ import pytest
 from support.driven_robot import write_bags
 from support.paths import ROOT
 
-from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.batch import IngestJob, ingest_all, prepare_on_ray
 from restock.ingest.profile.profile import load_profile
@@ -80,14 +79,6 @@ def test_a_task_that_dies_costs_its_recording_only(bags, tmp_path, cluster):
     results = dict(ingest_all([bags / f"drive{number}" for number in range(3)], job, engine="ray"))
     assert "the process that read it died" in str(results.pop(bags / "drive1"))
     assert {result.status for result in results.values()} == {"written"}
-
-
-def test_the_command(bags, tmp_path, cluster, capsys):
-    args = ["ingest", str(bags / "drive0"), "--store", str(tmp_path / "s"), "--engine", "ray"]
-    assert main(args) == 0
-    out, err = capsys.readouterr()
-    assert "written: " in out
-    assert "Traceback" not in err
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch):

@@ -105,22 +105,3 @@ def test_a_reader_that_stops_early_leaves_no_thread(recording: Path) -> None:
     batches.close()  # type: ignore[attr-defined]
     assert inflating() == []
     file.close()
-
-
-@pytest.mark.parametrize("what", ["one core", "few groups", "large chunks", "other workers"])
-def test_it_is_off_where_it_does_not_pay(
-    what: str, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if what == "one core":
-        monkeypatch.setattr(mcap_file, "cores", lambda: 1)
-    elif what == "few groups":
-        monkeypatch.setattr(mcap_file, "GROUP_BYTES", 1 << 20)
-    elif what == "large chunks":
-        monkeypatch.setattr(mcap_file, "GROUP_BYTES", CHUNK // 4)
-    else:
-        monkeypatch.setattr(ChunkReader, "ahead", False)
-    file = McapFile(recording)
-    batches = file.batches(file.channels)
-    next(batches)
-    assert inflating() == []
-    file.close()

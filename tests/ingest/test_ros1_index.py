@@ -11,7 +11,6 @@ from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from restock.errors import RecordingError
-from restock.ingest.containers import ros1_file
 from restock.ingest.containers.open_recording import open_recording
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -129,34 +128,6 @@ def test_every_cut_is_read_or_refused(bag: Path) -> None:
     assert before == 2 * ROWS
 
 
-def test_a_chunk_of_bz2_that_is_read_again_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "packed.bag"
-    writer = Writer(path)
-    writer.set_compression(writer.CompressionFormat.BZ2)
-    with writer:
-        flag = writer.add_connection("/flag", "std_msgs/msg/Bool", typestore=TYPES)
-        writer.write(flag, 1, b"\x01")
-    unpacked: list[int] = []
-    original = ros1_file.Bag._inflated
-
-    def inflated(self: ros1_file.Bag, position: int) -> bytes:
-        unpacked.append(position)
-        return original(self, position)
-
-    monkeypatch.setattr(ros1_file.Bag, "_inflated", inflated)
-    with open_recording(path) as recording:
-        for _ in range(5):
-            assert len(recording.read({"/flag": []})["/flag"]) == 1
-    assert len(unpacked) == 2
-    monkeypatch.setattr(ros1_file, "KEPT_BYTES", 0)
-    with open_recording(path) as recording:
-        for _ in range(5):
-            recording.read({"/flag": []})
-    assert len(unpacked) == 2 + 5
-
-
 def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     writer = Writer(path)
@@ -182,20 +153,3 @@ def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> 
         reasons = [account.reasons for account in recording.accounts.values()]
         assert [list(one) for one in reasons] == [[lost.reason]] * 2  # each topic's own share
         assert sum(one[lost.reason] for one in reasons) == lost.messages
-
-
-@pytest.mark.parametrize("most", [ros1_file.MAX_REMEMBERED, 150])
-def test_a_chunk_is_walked_once_while_there_is_room(bag, monkeypatch, most: int) -> None:
-    walked = []
-    real = ros1_file.walk
-    monkeypatch.setattr(ros1_file, "walk", lambda data: walked.append(data) or real(data))
-    monkeypatch.setattr(ros1_file, "MAX_REMEMBERED", most)
-    with Reader(bag) as reader:
-        chunks = len(reader.chunks)
-    with open_recording(bag) as recording:
-        for _ in range(3):
-            columns = recording.read({"/number": ["data"]})["/number"]
-            assert np.array_equal(columns.fields["data"], np.arange(ROWS))
-            assert len(recording.read({"/flag": []})["/flag"]) == ROWS
-    assert chunks > 3
-    assert len(walked) == chunks if most > 2 * ROWS else chunks < len(walked) < 6 * chunks

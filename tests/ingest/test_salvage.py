@@ -8,7 +8,6 @@ import pytest
 from mcap.writer import CompressionType
 from support.bag_samples import write_mcap
 
-from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.mcap_records import MAGIC, Op, walk
@@ -121,14 +120,3 @@ def test_a_chunk_that_only_looks_like_one(tmp_path: Path) -> None:
     decoded, reasons, _ = read(damaged(path, at, b"\x05" + HUGE + fake, drop_end=50))
     assert decoded == 70
     assert any("bytes from byte" in loss for loss in reasons)
-
-
-def test_info_shows_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_mcap(tmp_path / "run.mcap")
-    third = chunks_of(path)[2][0]
-    damaged(path, third + 1, HUGE)
-    assert main(["info", str(path)]) == 2
-    assert main(["info", str(path), "--salvage"]) == 3
-    printed = capsys.readouterr()
-    assert "140 messages" in printed.out
-    assert f"damaged at byte {third:,}" in printed.err

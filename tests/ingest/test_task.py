@@ -286,13 +286,6 @@ def test_the_hash_names_every_parameter():
     assert msgspec.structs.replace(TASK, rewards=harsher).hash != TASK.hash
 
 
-def test_actions_have_names_for_people():
-    assert TASK.action_names == ["stop", "drive 0.5", "drive 1", "turn left 1", "turn right 1"]
-    names = load_profile("warehouse_amr").task.action_names
-    assert len(set(names)) == len(names)
-    assert names[0] == "stop"
-
-
 def test_yaw_does_not_depend_on_a_quaternions_length():
     turn = np.array([0.1, -0.2, 0.5, 0.8])
     yaw = yaw_of(*(turn / np.linalg.norm(turn))[:, None])[0]

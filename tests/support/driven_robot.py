@@ -211,8 +211,9 @@ def write_topics(
             lines = []
             for topic, messages in part.items():
                 name = topics[topic][0]
+                message, varies = _blank(types, name), any("[]" in one for one in messages.fields)
                 for row in range(len(messages)):
-                    message = _blank(types, name)
+                    message = _blank(types, name) if varies else message
                     for path, column in messages.fields.items():
                         _set(types, message, path, column[row])
                     data = types.serialize_cdr(message, name)
