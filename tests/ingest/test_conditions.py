@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from importlib.resources import files
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -15,8 +10,7 @@ from hypothesis import strategies as st
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task import condition_sql, conditions
-from restock.ingest.task.condition_sql import refusal
+from restock.ingest.task import conditions
 from restock.ingest.task.conditions import (
     Condition,
     label,
@@ -267,24 +261,6 @@ def test_labels_are_in_the_order_of_the_rows():
     assert np.flatnonzero(found).tolist() == [1]
 
 
-def test_the_post_conditions_look_ahead_and_say_so():
-    assert {c.name: c.timing for c in SHIPPED} == {
-        "blocked_aisle": "pre",
-        "near_collision": "post",
-        "recovery": "pre",
-        "wheel_slip": "post",
-    }
-
-
-def test_every_shipped_condition_is_explained():
-    every = [*SHIPPED, *shipped(kind="exposure").values()]
-    for condition in every:
-        assert len(condition.doc) > 20, condition.name
-        assert "timing:" not in condition.sql
-    folder = files("restock.ingest.task") / "conditions"
-    assert sorted(c.name + ".sql" for c in every) == sorted(e.name for e in folder.iterdir())
-
-
 def test_the_lowest_priority_number_names_the_row():
     low, high = Condition("a", "pre", "true", priority=1), Condition("b", "pre", "true")
     labels = label(steps(2), [high, low])
@@ -297,25 +273,6 @@ def test_a_condition_that_does_not_run_is_named():
         label(steps(3), [good, bad])
     assert "condition 'bad'" in str(error.value)
     assert "clearance_m" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "sql",
-    ["unnest([true, false])", "unnest(if(step_index = 1, [true, false], if(bumped, [], [true])))"],
-)
-@pytest.mark.parametrize("let", [False, True])
-def test_a_condition_gives_one_value_a_step_in_their_order(monkeypatch, sql, let):
-    """Whatever functions DuckDB has that make several rows of one, or none."""
-    monkeypatch.setattr(condition_sql, "_MORE_ROWS", set())
-    refusal.cache_clear()
-    bumped = [False, False, True, False]  # so that the second one gives as many values as steps
-    good = Condition("good", "pre", "bumped")
-    bad = Condition("bad", "pre", "made" if let else sql, let={"made": sql} if let else {})
-    table = steps(4, bumped=np.array(bumped))
-    assert label(table, [good])["good"].tolist() == bumped
-    with pytest.raises(ConfigError, match=r"condition 'bad'.*gives .* for each of the 4 steps"):
-        label(table, [good, bad])
-    refusal.cache_clear()
 
 
 def doubled(times: int) -> dict[str, str]:
@@ -344,30 +301,17 @@ def test_a_condition_that_takes_too_much_memory_is_named():
 
 REFUSED = {
     "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it contains a query",
-    "EXISTS (FROM duckdb_settings())": "it contains a query",
-    "clearance_m > (SELECT avg(clearance_m) FROM steps)": "it contains a query",
     "read_text('/etc/passwd') IS NULL": "fails on the steps",
-    "getenv('HOME') = 'x'": "fails on the steps",
-    "current_setting('home_directory') = 'x'": "reads data other than the steps",
     "user = 'x'": "reads data other than the steps",
-    "current_date > '2026-01-01'": "reads data other than the steps",
     "random() < 0.5": "reads data other than the steps",
-    "age(TIMESTAMP '2026-01-01') > INTERVAL 1 DAY": "reads data other than the steps",
     "sleep_ms(100000) IS NULL": "reads data other than the steps",
     "length(repeat('x', 4000000000)) > 1": "can use unlimited memory",
-    "len(range(3000000000)) > 1": "can use unlimited memory",
-    "bit_count(bitstring('1', 2000000000)) > 1": "can use unlimited memory",
     "unnest([true, false, true])": "makes several rows of one",
-    "UNLIST([clearance_m > 1])": "makes several rows of one",
-    "pg_get_viewdef('x') = 'x'": "reads data other than the steps",
     "ATTACH 'x.db'": "fails on the steps",
     "COPY steps TO 'x.csv'": "syntax error",
     "true); ATTACH 'x.db'; SELECT (true": "SELECT",
-    "true; COPY steps TO 'x.csv'": "syntax error",
     "true) AS x, (SELECT 1": "more than one expression",
-    "true), (false": "more than one expression",
     "true) FROM steps WHERE (true": "syntax error",
-    "true) UNION ALL SELECT (true": "more than one expression",
     "false) OR (true": "its brackets do not match",
     "clearance_m > 1) -- (": "syntax error",
     "true /*": "comment",
@@ -377,7 +321,6 @@ REFUSED = {
     "lead(bumped) OVER episode": 'set timing = "post"',
     "max(bumped) OVER (episode ROWS BETWEEN 1 PRECEDING AND 1 FOLLOWING)": "at CURRENT ROW",
     "lag(bumped, -1) OVER episode": "give lag() a constant number",
-    "max(bumped) OVER (PARTITION BY episode_index)": "write OVER episode",
     "max(bumped) OVER (PARTITION BY episode_index ORDER BY step_index DESC)": "write OVER episode",
     "percent_rank() OVER episode > 0.5": 'set timing = "post"',
 }
@@ -408,34 +351,10 @@ def test_what_a_condition_may_say(sql):
     assert label(steps(3), [Condition("x", "pre", sql)])["x"].any()
 
 
-@pytest.mark.parametrize("machine", ["Pacific/Auckland", "America/Lima"])
-def test_times_with_a_zone_do_not_follow_the_machine(machine: str):
-    """DuckDB's own `+` has forms for such times, whose result depends on the zone that is set."""
-    sql = "hour(TIMESTAMPTZ '2026-01-01 12:00:00+00' + INTERVAL 1 HOUR) = 13 AND 1 + 1 = 2"
-    words = (
-        f"from restock.ingest.task.condition_sql import refusal, sandbox; sql = {sql!r};"
-        "assert refusal(sql, 'pre') is None;"
-        "assert sandbox().execute('SELECT ' + sql).fetchone() == (True,)"
-    )
-    subprocess.run([sys.executable, "-c", words], env={**os.environ, "TZ": machine}, check=True)
-
-
-def test_a_condition_sees_no_variable_of_the_program():
-    secret = pa.table({"z": [1]})
-    assert len(secret) == 1
-    with pytest.raises(ConfigError, match="it contains a query"):
-        label(steps(3), [Condition("x", "pre", "(SELECT z FROM secret) = 1")])
-
-
 @pytest.mark.parametrize("name", ['a" FROM steps; --', "nominal", "", "a b", "1a"])
 def test_a_condition_has_a_plain_name(name):
     with pytest.raises(ValueError, match="letters, digits and _"):
         Condition(name, "pre", "true")
-
-
-def test_a_condition_that_is_no_boolean_is_named():
-    with pytest.raises(ConfigError, match="not a boolean"):
-        label(steps(3), [Condition("number", "pre", "clearance_m")])
 
 
 def test_null_is_false():

@@ -31,8 +31,6 @@ from restock.ingest.propose.drives import robot_traits
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
 
-ENCODINGS = pytest.mark.parametrize("encoding", ["json", "protobuf"])
-
 
 def proposed(path: Path, capsys: Any, code: int = 0) -> tuple[str, list[str]]:
     """Return the proposal's TOML, and what it is told to lack."""
@@ -47,10 +45,8 @@ def read(path: Path, toml: str) -> tuple[Profile, Steps]:
         return profile, steps_of(profile, read_topics(recording, profile))
 
 
-@ENCODINGS
-def test_a_robots_scans_poses_odometry_and_commands_are_proposed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
-) -> None:
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, capsys, encoding):
     path = write_robot(tmp_path / "run.mcap", encoding, drive())
     toml, problems = proposed(path, capsys)
     assert problems == []
@@ -79,20 +75,12 @@ def test_a_robots_scans_poses_odometry_and_commands_are_proposed(
     assert str(traits.lidar) == f"lidar laser, {BEAMS} beams"
 
 
-@ENCODINGS
-def test_a_lidar_is_where_the_pose_in_its_scans_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
-) -> None:
-    messages = [
-        (
-            time_s,
-            topic,
-            kind,
-            {**values, "pose": pose(0.4, 0.0, np.pi)} if "scan" in topic else values,
-        )
-        for time_s, topic, kind, values in drive(8.0)
-    ]
-    toml, problems = proposed(write_robot(tmp_path / "run.mcap", encoding, messages), capsys)
+def test_a_lidar_is_where_the_pose_in_its_scans_says(tmp_path, capsys):
+    messages = drive(8.0)
+    for _, topic, _, values in messages:
+        if "scan" in topic:
+            values["pose"] = pose(0.4, 0.0, np.pi)
+    toml, problems = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
     assert problems == []
     body = parse_profile(toml, where="p").task.body
     assert body.lidar_x_m == pytest.approx(0.4)
@@ -101,14 +89,11 @@ def test_a_lidar_is_where_the_pose_in_its_scans_says(
     assert "by the pose in its scans" in toml
 
 
-@ENCODINGS
-def test_poses_are_by_satellite_fixes_where_nothing_else_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
-) -> None:
+def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, capsys):
     messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
     for time_s in np.arange(0, 20, 0.2).tolist():
         messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
-    path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
+    path = write_robot(tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda one: one[0]))
     toml, problems = proposed(path, capsys)
     assert problems == []
     assert "fixes of 0.02 m, mostly" in toml
@@ -122,10 +107,7 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(
     assert np.allclose(np.hypot(x, y - radius), radius, atol=0.02)
 
 
-@ENCODINGS
-def test_goals_and_plans_are_not_taken_for_poses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
-) -> None:
+def test_goals_and_plans_are_not_taken_for_poses(tmp_path, capsys):
     at = {"timestamp": 0.0, "frame_id": "map"}
     plan = {**at, "poses": [pose(), pose(2.0, 2.0)]}
     messages: list[Message] = [
@@ -133,19 +115,14 @@ def test_goals_and_plans_are_not_taken_for_poses(
         (0.0, "/plan", "foxglove.PosesInFrame", plan),
         *drive(),
     ]
-    toml, problems = proposed(write_robot(tmp_path / "run.mcap", encoding, messages), capsys)
+    toml, problems = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
     assert problems == []
     inputs = parse_profile(toml, where="p").inputs
-    assert inputs.goal is not None
-    assert inputs.plan is not None
-    assert inputs.pose is not None
     topics = inputs.goal.topic, inputs.plan.topic, inputs.pose.topic
     assert topics == ("/goal_pose", "/plan", "/pose")
 
 
-def test_a_ros_type_name_with_other_fields_is_not_taken(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ros_type_name_with_other_fields_is_not_taken(tmp_path, capsys):
     TYPES["geometry_msgs/msg/Twist"] = {"speed": "number", "turn": "number"}
     try:
         messages = [
@@ -163,11 +140,8 @@ def test_a_ros_type_name_with_other_fields_is_not_taken(
     assert "name it here" in toml
 
 
-@ENCODINGS
-@pytest.mark.parametrize("together", [True, False])
-def test_poses_and_the_lidars_place_are_by_transforms(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str, together: bool
-) -> None:
+@pytest.mark.parametrize(("encoding", "together"), [("json", True), ("protobuf", False)])
+def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, capsys, encoding, together):
     def between(time_s: float, parent: str, child: str, at: tuple[float, ...]) -> dict[str, Any]:
         where = pose(*at)
         return {

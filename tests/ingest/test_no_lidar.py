@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import Drive, columns, scans, typed_topics, write_bag, write_topics
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -22,7 +21,7 @@ from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import reported, shipped, unseen
+from restock.ingest.task.conditions import shipped
 from restock.ingest.task.robot import NONE, SPEED, Limits, limit
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
 from restock.replay.mixture.mixture import parse_mixture
@@ -125,7 +124,6 @@ def test_its_moments_are_viewed_without_what_a_lidar_sees(blind, tmp_path):
 
 def test_an_unseen_wall_beside_the_robot_costs_nothing(drives, tmp_path):
     """`tight` is 0 where clearance is unknown; with the lidar the same steps cost .05 each."""
-    from support.driven_robot import columns, scans
 
     class Tight(Drive):
         def topics(self) -> Mapping[str, TopicColumns]:
@@ -217,13 +215,6 @@ def test_labels_made_again_stay_unknown(drives, tmp_path):
         ]
 
 
-def test_all_conditions_with_lidar_signals_are_found():
-    every = [*shipped().values(), *shipped(kind="exposure").values()]
-    assert sorted(unseen(every)) == NEEDS_ONE
-    assert [one.name for one in reported(every, lidar=False)] == ["wheel_slip", "slippery_floor"]
-    assert reported(every, lidar=True) == every
-
-
 def test_the_limiter_without_a_lidar_limits_speed_alone():
     limits = Limits.of(BLIND.task)
     fast = np.array([[0.5, 0.0], [9.0, 0.0]])
@@ -235,36 +226,20 @@ def test_the_limiter_without_a_lidar_limits_speed_alone():
 def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path, capsys):
     profile, store = tmp_path / "mine.toml", tmp_path / "store"
     assert main(["profile", "new", str(drives / "blind"), "--out", str(profile)]) in (0, 3)
-    text = profile.read_text()
-    assert "sectors = 0  # no lidar" in text
-    assert "# No lidar: recovery, near_collision, blocked_aisle are unknown" in text
-    assert "lidar_x_m" not in text
-    capsys.readouterr()
+    assert "sectors = 0  # no lidar" in profile.read_text()
     command = ["ingest", str(drives / "blind"), "--profile", str(profile), "--store", str(store)]
     assert main(command) == 0
-    said = capsys.readouterr().out
-    assert "unknown (null, no lidar): recovery, near_collision, blocked_aisle" in said
-    assert main(["sql", str(store), "FROM coverage_by_condition", "--json"]) == 0
-    rows = {row["condition"]: row for row in json.loads(capsys.readouterr().out)}
-    assert rows["near_collision"]["rows_held"] is None
+    query = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
+    with Store(store) as opened:
+        assert opened.sql(query).fetchall() == [(None,)]
 
 
-def test_a_robot_with_a_point_cloud_alone_is_told_what_to_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from support.driven_robot import columns, typed_topics, write_topics
-
-    topics = typed_topics(Drive(6.0))
-    scan = topics.pop("/scan")
-    topics["/points"] = (
-        "sensor_msgs/msg/PointCloud2",
-        columns(np.arange(0, 6.0, 0.1), {"header.frame_id": np.full(60, "velodyne", object)}),
-    )
-    for name, more, hinted in (("cloud", {}, True), ("both", {"/scan": scan}, False)):
-        bag = write_topics(topics | more, tmp_path / name, storage="mcap")
-        assert main(["profile", "new", str(bag), "--out", str(tmp_path / f"{name}.toml")]) == 0
-        said = capsys.readouterr().err
-        text = " ".join((tmp_path / f"{name}.toml").read_text().replace("\n# ", " ").split())
-        for where in (said, text):
-            assert ("/points is a point cloud" in where) == hinted
-            assert ("pointcloud_to_laserscan (cloud_in:=/points" in where) == hinted
+@pytest.mark.parametrize("has_scan", [False, True])
+def test_a_point_cloud_alone_is_told_what_to_do(has_scan, tmp_path, capsys):
+    frames = {"header.frame_id": np.full(60, "velodyne", object)}
+    cloud = "sensor_msgs/msg/PointCloud2", columns(np.arange(0, 6.0, 0.1), frames)
+    topics = typed_topics(Drive() if has_scan else BlindDrive()) | {"/points": cloud}
+    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    assert main(["profile", "new", str(bag), "--out", str(tmp_path / "p.toml")]) == 0
+    hint = "pointcloud_to_laserscan (cloud_in:=/points"
+    assert (hint in capsys.readouterr().err) is not has_scan

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import pickle
 
-import numpy as np
 import pytest
-from support.driven_robot import Drive, typed_topics, write_topics
+from support.driven_robot import Drive, typed_topics, write_bag, write_topics
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
@@ -46,22 +45,12 @@ def test_the_hash_is_the_same_in_another_process():
     assert written.hash == profile.hash
 
 
-def test_zones_are_looked_up_in_order():
-    profile = load_profile("warehouse_amr")
-    first = profile.zones[0]
-    x = np.array([(first.box_m[0] + first.box_m[2]) / 2, -5.0])
-    y = np.array([(first.box_m[1] + first.box_m[3]) / 2, -5.0])
-    assert profile.zone_of(x, y) == [first.name, "elsewhere"]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ("sectors = 36", "sectrs = 36", "unknown key `task.sectrs`"),
-        ("length_m = 0.70", "length = 0.7", "unknown key `task.body.length`"),
         ("[clock]", "[klock]", "unknown key `klock`"),
         ('topic = "/scan"', "topic = 3", "`inputs.scan.topic`: Expected `str`, got `int`"),
-        ("sectors = 36", "sectors = 3", "task.sectors must be even and 4 or more, or 0, got 3"),
         ("sectors = 36", "sectors = 5", "task.sectors must be even and 4 or more, or 0, got 5"),
         ("sectors = 36", "sectors = 0", "`task.sectors` is 0 (a robot without a lidar)"),
         ("control_period_s = 0.2", "control_period_s = 0", "task.control_period_s must be above 0"),
@@ -70,25 +59,23 @@ def test_zones_are_looked_up_in_order():
         ("  [0.0, 0.0],", "  [0.1, 0.0],", "actions must start with the stop action [0, 0]"),
         ('"recovery"', '"recvery"', "no condition named 'recvery'"),
         ('"recovery"', '"recovery", "recovery"', "recovery is given twice"),
-        (
-            '{ x_m = "pose.pose',
-            '{ x = "pose.pose',
-            "`inputs.pose.fields`: unknown 'x', missing 'x_m'",
-        ),
-        ("[inputs.goal]", "[inputs.gaol]", "unknown key `inputs.gaol`"),
+        ("conditions = [", 'conditions = ["closing_traffic", ', "no condition named 'closing_t"),
+        ("{ x_m =", "{ x =", "`inputs.pose.fields`: unknown 'x', missing 'x_m'"),
         ('name = "warehouse_amr"', "", "missing key `name`"),
         ('goal = "route"', 'goal = "rout"', "`task.goal`: Invalid enum value 'rout'"),
         ("[task]", "[task", "is not TOML"),
         ("max_gap_s = 0.5", "max_gap_s = nan", "clock.max_gap_s must be above 0, got nan"),
-        ("max_gap_s = 0.5", "jump_s = 2.0", "unknown key `clock.jump_s`"),
         ("max_age_s = 0.5", "max_age_s = inf", "inputs.command.max_age_s must be finite, got inf"),
-        ("length_m = 0.70", "length_m = -0.7", "task.body.length_m must be above 0, got -0.7"),
-        ("max_pose_jump_m = 1.0", "max_pose_jump_m = nan", "must be above 0, got nan"),
-        (
-            "[task.rewards]",
-            "[task.rewards]\ngoal = nan",
-            "task.rewards.goal must be finite, got nan",
-        ),
+        # Keys that do not go together.
+        ("[inputs.wheels]", "[inputs.wheels]\noptional = true", "wheels has no fallback"),
+        ("[inputs.plan]", "[inputs.plon]", "unknown key `inputs.plon`"),
+        ('"/cmd_vel_nav"', '"/cmd_vel"', "`inputs.nav_command.topic` is the topic of the command"),
+        ("[inputs.imu]", "[inputs.imu]\nupside_down = true", "upside_down` applies only to a scan"),
+        (', angle_increment_rad = "angle_increment"', "", "missing 'angle_increment_rad'"),
+        ('"angle_increment"', '"a", angle_max_rad = "b"', "angle_max_rad beside"),
+        ('pressed = "data"', 'pressed = "front or 3sides"', "inputs.bumper.fields.pressed"),
+        ("[clock]", '[goal]\nsource = "hindsight"\n[clock]', "would not be used"),
+        ("[clock]", "[goal]\nstill_s = 5.0\n[clock]", "`goal.still_s` is given"),
     ],
 )
 def test_an_error_names_the_file_and_the_key(old, new, said):
@@ -97,12 +84,6 @@ def test_an_error_names_the_file_and_the_key(old, new, said):
         parse_profile(TEXT.replace(old, new, 1), where="mine.toml")
     assert said in str(error.value)
     assert str(error.value).startswith("mine.toml: ")
-
-
-def test_what_nothing_can_stand_in_for_is_not_optional():
-    text = TEXT.replace("[inputs.wheels]", "[inputs.wheels]\noptional = true")
-    with pytest.raises(ConfigError, match="wheels has no fallback, so it cannot be optional"):
-        parse_profile(text, where="mine.toml")
 
 
 def test_a_route_needs_a_goal_and_a_plan():
@@ -122,13 +103,6 @@ def test_without_a_goal_its_topics_are_not_needed(tmp_path):
         ingest(bag, parse_profile(TEXT, where="p"), store=None)
     aimless = parse_profile(TEXT.replace('goal = "route"', 'goal = "none"'), where="p")
     assert ingest(bag, aimless, store=None).manifest["transitions"] == 14
-
-
-def test_a_condition_of_ones_own():
-    own = '\n[[condition]]\nname = "dark"\ntiming = "pre"\nsql = "clearance_m < 1"\npriority = 5\n'
-    profile = parse_profile(TEXT + own, where="mine.toml")
-    assert profile.conditions[-1].name == "dark"
-    assert profile.labels_version != load_profile("warehouse_amr").labels_version
 
 
 def test_a_name_that_is_nearly_one(tmp_path):
@@ -153,19 +127,9 @@ def test_what_stands_in_is_said():
     }  # fmt: skip
 
 
-def test_a_proposal_is_not_read_from_the_command_itself():
-    text = TEXT.replace('"/cmd_vel_nav"', '"/cmd_vel"')
-    with pytest.raises(
-        ConfigError, match=r"`inputs.nav_command.topic` is the topic of the command"
-    ):
-        parse_profile(text, where="mine")
-
-
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory):
     """Return a bag of a robot with a navigation stack."""
-    from support.driven_robot import Drive, write_bag
-
     return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")
 
 
@@ -192,27 +156,20 @@ def test_a_proposed_profile_reads_its_recording(bag, tmp_path, capsys):
 
 
 def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
-    from support.driven_robot import Drive, write_bag
-
     class Blind(Drive):
         def topics(self):
-            topics = super().topics()
-            del topics["/odom"], topics["/plan"], topics["/imu"], topics["/amcl_pose"]
-            return topics
+            gone = ("/odom", "/plan", "/imu", "/amcl_pose")
+            return {name: one for name, one in super().topics().items() if name not in gone}
 
     bag = write_bag(Blind(), tmp_path / "bag")
-    assert main(["profile", "new", str(bag)]) == 3
-    out, err = capsys.readouterr()
-    assert "MISSING, and required" in out
+    assert main(["profile", "new", str(bag), "--json"]) == 3
+    said = json.loads(capsys.readouterr().out)
+    assert said["missing"] == ["pose"]
+    out = said["toml"]
     assert 'source = "hindsight"' in out
-    assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
-    assert "or transforms that join two frames" in out
-    assert "no topic for pose" in err
     lines = out[out.index("# [inputs.pose]") : out.index("# [inputs.imu]")].splitlines()
     named = "\n".join(line[2:] for line in lines if "[inputs.wheels]" not in line)
     assert parse_profile(out + named, where="p").inputs.pose.fields["yaw_rad"] == "FIELD"
-    assert main(["profile", "new", str(bag), "--json"]) == 3
-    assert json.loads(capsys.readouterr().out)["missing"] == ["pose"]
 
 
 def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):
@@ -223,20 +180,6 @@ def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):
     assert "no topic /front (scan)" in err
     assert "/imu holds sensor_msgs/msg/Imu, not nav_msgs/msg/Odometry (wheels)" in err
     assert "/amcl_pose" in out
-
-
-@pytest.mark.parametrize(
-    ("args", "said"),
-    [
-        (["new"], "takes at least 1 path, got 0"),
-        (["check", "warehouse_amr"], "takes 2 paths, got 1"),
-        (["new", "nowhere.mcap"], "nowhere.mcap"),
-        (["check", "warehouse", "nowhere.mcap"], "did you mean 'warehouse_amr'"),
-    ],
-)
-def test_wrong_usage_of_profile(args, said, capsys):
-    assert main(["profile", *args]) == 2
-    assert said in capsys.readouterr().err
 
 
 def test_a_profile_is_never_overwritten(bag, tmp_path, capsys):
@@ -270,7 +213,6 @@ def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
     ("entry", "said"),
     [
         ('file = "../tight.sql"', "`condition[0].file` is outside the profile's folder"),
-        ('file = "/etc/passwd.sql"', "`condition[0].file` is outside the profile's folder"),
         ('file = "link.sql"', "`condition[0].file` is outside the profile's folder"),
         ('file = "none.sql"', "`condition[0].file` cannot be read: none.sql"),
         ('file = "p.toml"', "`condition[0].file` must name a .sql file"),
@@ -299,10 +241,7 @@ def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
     [
         ("clearance_mm < 1", 'Referenced column "clearance_mm" not found'),
         ("clearance_m", "its SQL gives float, not a boolean"),
-        ("clearance_m <", "its SQL cannot be read: syntax error"),
         ("lead(bumped) OVER episode", 'timing is "pre", but lead() may look at later steps'),
-        ("(SELECT content FROM read_text('/etc/passwd')) = ''", "it contains a query"),
-        ("getenv('HOME') = ''", "does not exist"),
     ],
 )
 def test_a_condition_that_does_not_bind_is_refused_with_its_key(sql, said):

@@ -13,7 +13,6 @@ from support.driven_robot import (
     Drive,
     columns,
     typed_topics,
-    up_to_the_panel,
     write_topics,
 )
 
@@ -88,16 +87,6 @@ def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
     assert max(by_hand) < TAKEN_S[1] + 0.01
     assert {policy for _, policy in said} == {"operator", "unknown"}
     assert "[signals.restock_takeover]" not in file.read_text()
-
-
-@pytest.mark.long
-def test_start_names_the_operator_too(tmp_path, capsys):
-    bag = write_topics(taken_over(), tmp_path / "bag")
-    out = tmp_path / "out"
-    main(["start", str(bag), "--out", str(out), "--accept", "--json", *up_to_the_panel(tmp_path)])
-    with Store(out / "store") as store:
-        counted = store.sql("SELECT count(*) FROM transitions WHERE behaviour_policy = 'operator'")
-        assert counted.fetchall()[0][0] > 15
 
 
 def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):

@@ -64,11 +64,19 @@ def proposed(tmp_path: Any, capsys: Any, drive: Drive, **more: TopicColumns) -> 
     return parse_profile(text, where="p"), text
 
 
-def test_no_outline_reaches_to_what_the_lidar_saw(tmp_path, capsys):
-    profile, text = proposed(tmp_path, capsys, Turning(12.0))
-    body = profile.task.body
-    assert (body.length_m, body.width_m) == (pytest.approx(0.3125), pytest.approx(0.3125))
-    assert "from the lidar, which saw nothing nearer than 0.25 m: MEASURE IT" in text
+@pytest.mark.parametrize(
+    ("drive", "length_m", "said"),
+    [
+        (Turning(12.0), 0.3125, "which saw nothing nearer than 0.25 m: MEASURE IT"),
+        (Turning(12.0, nearest_m=0.9), 0.6, "A GUESS, as the recording does not contain it"),
+        (Turning(12.0, near_scans=1), 0.6, ""),  # one odd return makes no robot smaller
+        (Turning(12.0, nearest_m=0.06), 0.1, ""),  # than robots are
+    ],
+)
+def test_no_outline_reaches_to_what_the_lidar_saw(drive, length_m, said, tmp_path, capsys):
+    profile, text = proposed(tmp_path, capsys, drive)
+    assert profile.task.body.length_m == pytest.approx(length_m)
+    assert said in text
 
 
 @dataclass
@@ -113,22 +121,6 @@ def test_conditions_by_a_guessed_outline_are_uncertain(tmp_path, capsys):
     toml.unlink()
     assert main(["profile", "new", bag, "--out", str(toml), "--footprint", "0.33x0.33"]) in (0, 3)
     assert ingested() == []
-
-
-def test_a_robot_that_kept_away_is_as_large_as_guessed(tmp_path, capsys):
-    profile, text = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.9))
-    assert (profile.task.body.length_m, profile.task.body.width_m) == (0.6, 0.5)
-    assert "A GUESS, as the recording does not contain it" in text
-
-
-def test_one_odd_return_makes_no_robot_smaller(tmp_path, capsys):
-    profile, _ = proposed(tmp_path, capsys, Turning(12.0, near_scans=1))
-    assert profile.task.body.length_m == 0.6
-
-
-def test_nothing_makes_it_smaller_than_robots_are(tmp_path, capsys):
-    profile, _ = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.06))
-    assert profile.task.body.length_m == pytest.approx(0.1)
 
 
 def test_its_own_parts_are_its_body_and_no_obstacles(tmp_path, capsys):

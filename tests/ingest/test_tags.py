@@ -12,7 +12,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.profile.tag_rules import MAX_TAGS, parse_tags
+from restock.ingest.profile.tag_rules import parse_tags
 from restock.replay.store.store import Store
 
 
@@ -102,13 +102,10 @@ def test_relabelling_keeps_the_tags(bag, tmp_path):
     ("texts", "says"),
     [
         (["robot"], "'robot' is not KEY=VALUE"),
-        (["robot="], "'robot=' is not KEY=VALUE"),
         (["=amr"], "'' is not a name of a tag"),
-        ([f"{'r' * 65}=a"], "r' is not a name of a tag: use 1 to 64 characters"),
         (["robot=a", "robot=b"], "robot is given twice, as 'a' and as 'b'"),
         ([f"robot={'x' * 257}"], "the value of robot has 257 characters, more than 256"),
         (["robot=\x1b[2J"], "the value of robot has control characters"),
-        ([f"t{n}=x" for n in range(MAX_TAGS + 1)], "65 tags are too many: at most 64 are allowed"),
     ],
 )
 def test_tags_of_another_form_are_refused(texts, says):

@@ -1,0 +1,738 @@
+"""What `restock profile new` makes of a recording: a row of `ROBOTS` each, and what it rests on."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.bag_samples import write_bag as write_sample_bag
+from support.driven_robot import (
+    BEAMS,
+    SPEED_MPS,
+    START_NS,
+    Drive,
+    columns,
+    pose,
+    ragged,
+    scans,
+    typed_topics,
+    write_bag,
+    write_topics,
+)
+from support.paths import ROOT, SHARED, sample_transitions
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.propose.clock_choice import drivable
+from restock.ingest.propose.commands import (
+    CommandHold,
+    Commands,
+    command_hold,
+    limit_of,
+    settled_speeds,
+)
+from restock.ingest.propose.proposal_lines import actions_of
+from restock.ingest.propose.propose import propose_profile
+from restock.ingest.propose.robot_choice import RobotProposal
+from restock.ingest.steps.align import NS
+from restock.ingest.steps.frames import PoseSeries
+from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Task, nearest_action
+from restock.replay.store.store import Store
+from restock.train.twin.physics.simulation import blocks_of
+from restock.train.twin.survey.poses import candidate_poses
+
+SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
+ROWS = sample_transitions("amr_tuesday")
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+Topics = dict[str, tuple[str, TopicColumns]]
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+
+
+def asked(*arguments: object) -> tuple[int, Any]:
+    """Return the exit code and the JSON of `restock profile …`."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        code = main(["profile", *map(str, arguments), "--json"])
+    return code, json.loads(out.getvalue())
+
+
+def proposed(recording: Path, *options: str, code: int = 0) -> tuple[Any, Profile, Path]:
+    """Return what a proposal says, the profile, and its file beside the recording."""
+    found, said = asked("new", recording, *options)
+    assert found == code, said
+    file = recording.parent / f"{recording.name}.toml"
+    file.write_text(said["toml"])
+    return said, load_profile(file), file
+
+
+def checked(profile: Path, recording: Path) -> Any:
+    code, said = asked("check", profile, recording)
+    assert (code, said["problems"]) == (0, [])
+    return said["outcome"]
+
+
+# -- robots ----------------------------------------------------------------------------------
+
+
+def usual(seconds: float = 6.0, **changes: Any) -> Topics:
+    """Return the topics of a plain drive; `drop`: without these; `add`: and these."""
+    drop, add = changes.pop("drop", ()), changes.pop("add", {})
+    topics = typed_topics(Drive(seconds, **changes))
+    return {name: one for name, one in topics.items() if name not in drop} | add
+
+
+@dataclass
+class Commanded(Drive):
+    """Commands at these times (s), received while the robot's clock ran at `pace` of log time.
+
+    Its poses lie up to `off_m` ahead of where it is, or behind it, by turns.
+    """
+
+    times_s: Any = ()
+    pace: float = 1.0
+    nearest_m: float = 3.0
+    off_m: float = 0.0
+    odometry_alone: bool = False
+
+    def topics(self) -> dict[str, TopicColumns]:
+        topics = super().topics()
+        del topics["/plan"], topics["/goal_pose"], topics["/behaviour_policy"]
+        scan, poses = topics["/scan"], topics["/amcl_pose"].fields
+        scan.fields.update(scans(np.full((len(scan), BEAMS), self.nearest_m)))
+        x = np.asarray(poses["pose.pose.position.x"])
+        off = self.off_m * np.random.default_rng(0).uniform(-1, 1, len(x))
+        poses["pose.pose.position.x"] = x + off
+        if self.odometry_alone:
+            del topics["/imu"], topics["/amcl_pose"]
+            at = np.arange(0, self.duration_s, 0.02)
+            topics["/odom"].fields.update(pose("pose.pose", self.x_at(at), 1.0))
+        if len(self.times_s):
+            fields = {"linear.x": np.full(len(self.times_s), 0.4)}
+            fields["angular.z"] = 0 * fields["linear.x"]
+            topics["/cmd_vel"] = columns(np.array(self.times_s), fields, stamped=False)
+        return {name: self.received(one) for name, one in topics.items()}
+
+    def received(self, one: TopicColumns) -> TopicColumns:
+        log = START_NS + np.rint((one.log_time_ns - START_NS) / self.pace).astype(np.int64)
+        return TopicColumns(log, log, one.fields)
+
+
+class Erratic(Commanded):
+    """Its clock follows log time in no way: it stands still now and then."""
+
+    def received(self, one: TopicColumns) -> TopicColumns:
+        since = (one.log_time_ns - START_NS) / NS
+        log = START_NS + np.rint((since * 1.5 + 0.35 * np.floor(since / 0.7)) * NS).astype(np.int64)
+        return TopicColumns(log, log, one.fields)
+
+    def topics(self) -> dict[str, TopicColumns]:
+        topics = super().topics()
+        odom, slow = topics["/odom"], np.arange(0, len(topics["/odom"]), 30)
+        fields = {path: np.asarray(column)[slow] for path, column in odom.fields.items()}
+        fields |= pose("pose.pose", 0.4 * np.arange(len(slow)), 0.0)
+        odom = TopicColumns(odom.log_time_ns[slow], odom.log_time_ns[slow], fields)
+        return {"/cmd_vel": topics["/cmd_vel"], "/odom": odom, "/bumper": topics["/bumper"]}
+
+
+@dataclass
+class Shuttle(Drive):
+    """It drives ahead and back, in turns of 2 s, without goals."""
+
+    duration_s: float = 24.0
+    ahead_mps: float = 0.5
+    back_mps: float = 0.5
+
+    def topics(self) -> dict[str, Any]:
+        def speed_at(at_s: Any) -> Any:
+            return np.where(at_s % 4 < 2, self.ahead_mps, -self.back_mps)
+
+        ticks, fast = np.arange(0, self.duration_s, 0.2), np.arange(0, self.duration_s, 0.02)
+        found = super().topics()
+        del found["/goal_pose"], found["/plan"]
+        told = {"linear.x": speed_at(ticks), "angular.z": 0 * ticks}
+        found["/cmd_vel"] = columns(ticks + 0.005, told, stamped=False)
+        moved = {"twist.twist.linear.x": speed_at(fast - 0.005), "twist.twist.angular.z": 0 * fast}
+        found["/odom"] = columns(fast, moved)
+        x_m = 1.0 + np.cumsum(speed_at(fast)) * 0.02
+        at_s = np.arange(0, self.duration_s, 0.1)
+        found["/amcl_pose"].fields["pose.pose.position.x"] = np.interp(at_s, fast, x_m)
+        return found
+
+
+class Utm(Drive):
+    """Its poses are UTM coordinates; it has neither goal nor plan."""
+
+    def topics(self):
+        topics = super().topics()
+        del topics["/goal_pose"], topics["/plan"]
+        for axis, far_m in (("x", 4.5e5), ("y", 5.2e6)):
+            topics["/amcl_pose"].fields[f"pose.pose.position.{axis}"] += far_m
+        return topics
+
+
+def told(ahead_mps: float, aside_mps: float = 0.0, seconds: float = 3.0) -> Topics:
+    """Return the plain drive with commands of these speeds, whatever it does."""
+    count = len(ticks := np.arange(0, seconds, 0.2))
+    speeds = {"linear.x": ahead_mps, "linear.y": aside_mps, "angular.z": 0.0}
+    fields = {path: np.full(count, speed) for path, speed in speeds.items()}
+    return usual(seconds, add={"/cmd_vel": (TWIST, columns(ticks + 0.005, fields, stamped=False))})
+
+
+def local_plan(topic: str, **changes: Any) -> Topics:
+    """Return a drive with what a controller looks at, more often than the plan is made."""
+    path = {f"poses[].pose.position.{axis}": ragged([np.full(60, 1.0)] * 2) for axis in "xy"}
+    near = columns(np.arange(0.0, 6.0, 0.1), path)
+    return usual(**changes, add={topic: ("nav_msgs/msg/Path", near)})
+
+
+def sent_to_move_base() -> Topics:
+    """Return goals in the frame of the pose in them: the action's own header has none."""
+    topics = usual()
+    _, sent = topics.pop("/goal_pose")
+    there = "goal.target_pose.pose.position"
+    fields = {path.replace("pose.position", there): c for path, c in sent.fields.items()}
+    fields["goal.target_pose.header.frame_id"] = np.full(len(sent), "odom", object)
+    goals = "move_base_msgs/msg/MoveBaseActionGoal", replace(sent, fields=fields)
+    return topics | {"/move_base/goal": goals}
+
+
+def two_lidars() -> Topics:
+    topics = usual()
+    topics["/scan_front"] = topics["/scan_back"] = topics.pop("/scan")
+    return topics
+
+
+def transforms(*edges: tuple[str, str, float], count: int = 1) -> tuple[str, TopicColumns]:
+    """Parent, child and angle of each edge, in every one of so many messages."""
+    parents, children, yaw = zip(*edges, strict=True)
+    values: dict[str, Any] = {
+        "header.frame_id": list(parents),
+        "child_frame_id": list(children),
+        "transform.rotation.z": np.sin(np.array(yaw) / 2),
+        "transform.rotation.w": np.cos(np.array(yaw) / 2),
+    }
+    fields = {
+        f"transforms[].{path}": ragged(
+            [np.array([one] * count, object if path.endswith("_id") else None) for one in column]
+        )
+        for path, column in values.items()
+    }
+    return "tf2_msgs/msg/TFMessage", columns(np.arange(count) * 0.1, fields, stamped=False)
+
+
+def with_laser(frame: str = "laser", **tf: tuple[str, TopicColumns]) -> Topics:
+    topics = usual()
+    scan = topics["/scan"][1]
+    scan.fields["header.frame_id"] = np.full(len(scan), frame, object)
+    for limit, value in (("range_min", 0.05), ("range_max", 8.0)):
+        scan.fields[limit] = np.full(len(scan), value)
+    return topics | {f"/{name}": one for name, one in tf.items()}
+
+
+MOVING = transforms(("odom", "base_link", 0.0), count=60)
+STATIC = transforms(("base_link", "mast", 0.0), ("mast", "laser", np.pi / 2))
+SECONDS = np.arange(0, 8, 0.1)
+RISING = np.clip(SECONDS, 0, 6)
+EMPTY = columns(SECONDS, {})
+
+
+def flight(command: str = "/mavros/setpoint_velocity/cmd_vel", climbs: bool = True) -> Topics:
+    """As mavros publishes it: local pose and velocity set points."""
+    at = pose("pose", SECONDS * 0.3, 1.0) | {"pose.position.z": RISING}
+    speeds = {"twist.linear.x": np.full(len(SECONDS), 0.3)}
+    speeds["twist.linear.z"] = climbs * np.gradient(RISING, SECONDS)
+    place = "geometry_msgs/msg/PoseStamped", columns(SECONDS, at)
+    return {
+        "/mavros/local_position/pose": place,
+        command: (STAMPED, columns(SECONDS, speeds)),
+    }
+
+
+def servoed(**speeds: object) -> Topics:
+    """As MoveIt Servo drives an arm: twists of its tool, which is located in the base's frame."""
+    at = pose("pose", 0.4 + 0.1 * np.sin(SECONDS), 0.1) | {"pose.position.z": 0.5 + 0 * SECONDS}
+    reported = {"twist.linear.x": 0.1 * np.sin(SECONDS)}
+    reported |= {f"twist.{path}": value + 0 * SECONDS for path, value in speeds.items()}
+    return {
+        "/joint_states": ("sensor_msgs/msg/JointState", EMPTY),
+        "/servo/twists": (STAMPED, columns(SECONDS, reported)),
+        "/tool_pose": ("geometry_msgs/msg/PoseStamped", columns(SECONDS, at)),
+    }
+
+
+def with_a_base() -> Topics:
+    """Return an arm on a base, whose commands are far fewer and of a name that tells nothing."""
+    seldom = SECONDS[::4]
+    reported = {"twist.linear.x": 0.1 * np.sin(seldom), "twist.angular.z": 0.2 * np.cos(seldom)}
+    base = {"/wheels/speeds": (STAMPED, columns(seldom, reported))}
+    return servoed(**{"linear.z": 0.05, "angular.y": 0.1}) | base
+
+
+def swaying() -> Topics:
+    """Odometry in three dimensions, in place of commands: rough floor pitches and rolls it."""
+    sways = 0.2 * np.sin(9 * SECONDS)
+    motion = {"twist.twist.linear.x": 0.1 + 0 * SECONDS, "twist.twist.linear.z": sways}
+    motion |= {"twist.twist.angular.x": sways, "twist.twist.angular.y": sways}
+    at = pose("pose.pose", 0.1 * SECONDS, 1.0)
+    return {"/odom": ("nav_msgs/msg/Odometry", columns(SECONDS, motion | at))}
+
+
+ODOMETRY = ("--odometry-as-command",)
+HURRIED = told(3 * SPEED_MPS, seconds=12.0)
+UNEVEN = np.cumsum(np.random.default_rng(0).choice([0.06, 0.1, 0.1, 0.1, 0.17], 200))
+HALF_SECONDS = 0.5 * np.arange(56) + np.random.default_rng(0).uniform(0, 0.04, 56)
+
+
+def reverse(actions: Any) -> list[tuple[float, float]]:
+    return [(speed, turn) for speed, turn in actions if speed < 0]
+
+
+def topics_of(*names: str) -> Callable[[Profile], Any]:
+    return lambda p: tuple(getattr(getattr(p.inputs, name), "topic", None) for name in names)
+
+
+# name: (topics, options, what is asked of the profile, what it is, what the text has, or lacks: -)
+ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], Any, list[str]]] = {
+    # Which topic is what.
+    "navigation": (
+        usual(proposals="/mux/input/navi"), (), topics_of("command", "nav_command"),
+        ("/cmd_vel", "/mux/input/navi"), ["beside the command that is driven (/cmd_vel)"],
+    ),
+    "a joystick": (
+        usual(proposals="/joy/cmd_vel"), (), topics_of("command", "nav_command"),
+        ("/cmd_vel", None), [],
+    ),
+    "what a controller looks at": (
+        local_plan("/local_plan"), (), topics_of("plan"), ("/plan",), [],
+    ),
+    "and no plan": (
+        local_plan("/move_base/DWAPlannerROS/local_plan", drop=("/plan",)), (),
+        lambda p: p.goal.source, "hindsight", [],
+    ),
+    "goals sent to move_base": (
+        sent_to_move_base(), (), topics_of("goal"), ("/move_base/goal",), [],
+    ),
+    "two lidars": (two_lidars(), (), topics_of("scan"), ("/scan_front",), ["or /scan_back?"]),
+    "a bumper": (
+        usual(), (), lambda p: p.task.bump_terminates, True, ["- no bumper seen"],
+    ),
+    "no bumper": (
+        usual(drop=("/bumper",)), (), lambda p: p.task.bump_terminates, True,
+        ["no bumper seen"],
+    ),
+    "no commands": (
+        usual(drop=("/cmd_vel", "/scan")), ODOMETRY, topics_of("command"), ("/odom",),
+        ["No command was recorded: the measured motion is used"],
+    ),
+    "poses in UTM": (
+        Utm(3.0), (), lambda p: p.origin_m,
+        pytest.approx((4.5e5 + 1 + 0.5 * 1.5, 5.2e6 + 1), abs=1), [],
+    ),
+    # Commands: their speeds, how long each holds, and the clock.
+    "back as fast as ahead": (
+        Shuttle(8.0), (), lambda p: reverse(p.task.actions), [(-0.5, 0.0)], [],
+    ),
+    "back slowly": (
+        Shuttle(8.0, back_mps=0.1), (), lambda p: reverse(p.task.actions), [(-0.1, 0.0)], [],
+    ),
+    "sideways": (told(0.4, 0.3), (), topics_of("command"), ("/cmd_vel",), []),
+    "three times its speed": (
+        HURRIED, (),
+        lambda p: (p.robot.max_speed_mps, p.robot.origin_of("max_speed_mps"),
+                   max(speed for speed, _ in p.task.actions)),
+        (SPEED_MPS, "logs", SPEED_MPS), ["beyond 0.5 m/s were commanded"],
+    ),
+    "twice a second": (
+        Commanded(30.0, times_s=HALF_SECONDS), (),
+        lambda p: (p.task.control_period_s, p.clock.max_gap_s > 1.0),
+        (pytest.approx(0.5), True), ["- time_limit_steps"],
+    ),
+    "uneven": (
+        Commanded(float(UNEVEN[-1]), times_s=UNEVEN), (), lambda p: p.clock.steps, "rate", [],
+    ),
+    "even and slow": (
+        Commanded(30.0, times_s=0.2 * np.arange(150)), (),
+        lambda p: (p.clock.steps, p.task.time_limit_steps), ("command", 250),
+        ["time_limit_steps = 250  # 20 m at 0.4 m/s"],
+    ),
+    **{
+        f"at {pace} of real time": (
+            Commanded(15.0, pace=pace), (),
+            lambda p: (p.clock.alignment, p.task.control_period_s),
+            ("header.stamp", pytest.approx(0.2)),
+            ["Header stamps run at" if pace != 1.0 else "- Header stamps run at"],
+        )
+        for pace in (0.5, 0.97, 1.0)
+    },
+    "a clock that cannot be followed": (
+        Erratic(40.0), (), lambda p: p.clock.alignment, "log_time",
+        ["[inputs.pose]", "Log time, as header stamps do not work: "],
+    ),
+    # How near is near, and by how much poses and wheels differ.
+    **{
+        f"{width_m} m wide": (
+            Commanded(4.0), ("--footprint", f"0.3x{width_m}"),
+            lambda p: p.task.rewards.tight_clearance_m, near_m,
+            ["tight_clearance_m" if near_m < 0.15 else "- tight_clearance_m"],
+        )
+        for width_m, near_m in ((0.1, 0.05), (0.3, 0.09), (0.7, 0.15))
+    },
+    **{
+        f"poses off by {off_m} m": (
+            Commanded(20.0, off_m=off_m), (), lambda p: p.noise.localiser_m,
+            pytest.approx(max(off_m / 2, 0.01), rel=0.3),
+            ["[noise]" if off_m > 0.02 else "- [noise]"],
+        )
+        for off_m in (0.0, 0.03, 0.1)
+    },
+    "odometry alone": (
+        Commanded(10.0, odometry_alone=True), (),
+        lambda p: {"wheel_slip", "slippery_floor"} & {one.name for one in p.definitions},
+        set(), ["wheel_slip"],  # why it is not there
+    ),
+    # Which way a lidar points is a guess if no transform says it.
+    "a lidar that no transform places": (
+        with_laser(tf=MOVING), (), lambda p: p.task.body.lidar_yaw_rad, 0.0,
+        ["zero points straight ahead, as no transform places its frame, laser"],
+    ),
+    "a lidar that transforms turn": (
+        with_laser(tf=MOVING, tf_static=STATIC), (), lambda p: p.task.body.lidar_yaw_rad,
+        pytest.approx(np.pi / 2, abs=1e-3), ["- no transform places"],
+    ),
+    # Robots on wheels, though something of them moves off the floor.
+    "on a ramp": (flight("/cmd_vel", False), (), topics_of("command"), ("/cmd_vel",), []),
+    "mostly on the floor": (
+        servoed(**{"linear.z": np.where(SECONDS < 3, 0.1, 0.0)}), (), topics_of("command"),
+        ("/servo/twists",), [],
+    ),
+    "noise off the floor": (
+        servoed(**{"angular.y": np.random.default_rng(0).normal(0, 1e-3, len(SECONDS))}), (),
+        topics_of("command"), ("/servo/twists",), [],
+    ),
+    "a base below an arm": (with_a_base(), (), topics_of("command"), ("/wheels/speeds",), []),
+    "rough floor": (swaying(), ODOMETRY, topics_of("command"), ("/odom",), []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_proposal_is_of_its_robot(name, tmp_path):
+    robot, options, ask, answer, lines = ROBOTS[name]
+    topics = typed_topics(robot) if isinstance(robot, Drive) else robot
+    said, profile, file = proposed(write_topics(topics, tmp_path / "bag"), *options)
+    assert said["problems"] == []
+    assert ask(profile) == answer
+    text = " ".join(file.read_text().replace("\n# ", " ").split(" "))
+    for line in lines:
+        assert (line.removeprefix("- ") in text) is not line.startswith("- "), line
+    assert said["transitions"] > 5
+
+
+@pytest.mark.parametrize(
+    ("topics", "said"),
+    [
+        (flight(), "a robot arm's or a drone's recording ("),
+        (
+            {"/command/trajectory": ("trajectory_msgs/msg/MultiDOFJointTrajectory", EMPTY)},
+            "a drone's recording (it has trajectory_msgs/msg/MultiDOF",
+        ),
+        (
+            {"/arm_controller/joint": ("trajectory_msgs/msg/JointTrajectory", EMPTY)},
+            "a robot arm's recording (it has trajectory_msgs/msg/JointTrajectory",
+        ),
+        (
+            servoed(**{"linear.y": 0.1, "linear.z": 0.05, "angular.y": 0.1}),
+            "a robot arm's or a drone's recording (80 of the 80 commands to move of /servo/twists"
+            " have linear.z, angular.x or angular.y)",
+        ),
+        (
+            servoed(**{"linear.z": np.where(SECONDS < 4.2, 0.1, 0.0)}),
+            "a robot arm's or a drone's recording (42 of",
+        ),
+        ({"/camera/color": ("sensor_msgs/msg/Image", EMPTY)}, "a recording of sensors alone"),
+    ],
+)
+def test_a_recording_of_no_wheels_is_named_once(topics, said, tmp_path, capsys):
+    bag = write_topics(topics, tmp_path / "bag")
+    code, document = asked("new", bag)
+    (problem,) = document["problems"]
+    assert code == 3
+    assert f"this looks like {said}" in problem
+    assert main(["start", str(bag), "--out", str(tmp_path / "out"), "--json"]) == 3
+    stopped = json.loads(capsys.readouterr().out)["stopped"]
+    assert stopped["remedies"] == ["give recordings of a robot on wheels"]
+    assert not (tmp_path / "out" / "profile.toml").exists()
+
+
+# -- advice, and what a profile then gives -----------------------------------------------------
+
+
+def test_commands_that_actions_lack_are_advised(tmp_path):
+    """Sideways ones, and ones that never move: `start` shows what a proposal advises."""
+    advice = {}
+    for name, topics in (("aside", told(0.4, 0.3)), ("never", told(0.0))):
+        said, _, _ = proposed(write_topics(topics, tmp_path / name))
+        advice[name] = {one["key"]: one["text"] for one in said["advice"]}
+    assert "contain a sideways speed, up to 0.3 m/s" in advice["aside"]["inputs.command"]
+    assert "the actions are a guess" in advice["never"]["task.actions"]
+    assert not {"task.actions", "inputs.command"} <= advice["aside"].keys()
+
+
+def test_without_commands_or_odometry_as_one_it_is_not_usable(tmp_path):
+    bag = write_topics(usual(drop=("/cmd_vel", "/scan")), tmp_path / "bag")
+    code, said = asked("new", bag)
+    assert (code, said["missing"]) == (3, ["command"])
+    (tmp_path / "p.toml").write_text(said["toml"])
+    assert main(["profile", "check", str(tmp_path / "p.toml"), str(bag)]) == 2
+
+
+def test_a_hold_is_read_from_how_long_the_robot_drives_on(tmp_path):
+    times = (*np.arange(0, 1, 0.1), 6.0, 17.0)
+    bag = write_bag(Commanded(20.0, times_s=times), tmp_path / "bag")
+    said, profile, file = proposed(bag)
+    assert (profile.clock.steps, profile.inputs.command.max_age_s) == ("rate", pytest.approx(11))
+    assert said["transitions"] > 90  # 20 s, five a second
+    strict = file.read_text().replace("max_age_s = 11", "max_age_s = 1", 1)
+    file.write_text(strict)
+    _, said = asked("check", file, bag)
+    (line,) = [line for line in said["advice"] if "inputs.command.max_age_s" in line]
+    promised = int(line.split("without it (latched) ")[1].split()[0])
+    before, after = strict.split("[inputs.command]")
+    file.write_text(f"{before}[inputs.command]{after.replace('max_age_s', '# max_age_s', 1)}")
+    assert checked(file, bag)["transitions"] == promised > 3 * said["outcome"]["transitions"]
+
+
+def test_an_outline_that_the_lidar_contradicts_is_advised(tmp_path):
+    bag = write_bag(Commanded(10.0, nearest_m=0.28), tmp_path / "bag")
+    said, _, file = proposed(bag)
+    texts = [each["text"] for each in said["advice"] if each["key"] == "task.body"]
+    assert "inside the robot at 50" in texts[0]
+    assert any(
+        "`task.body`: with an outline of 0.6" in one
+        for one in asked("check", file, bag)[1]["advice"]
+    )
+    assert proposed(bag, "--footprint", "0.1x0.1")[0]["advice"] == []
+
+
+def test_ingest_names_a_lidar_that_nothing_places(tmp_path):
+    from restock.ingest.pipeline import ingest
+
+    ahead = "[inputs.scan]\nlidar_at_m = [0.0, 0.0]\nlidar_yaw_rad = 0.0"
+    shipped = load_profile("warehouse_amr")
+    text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
+    points_ahead = parse_profile(text.replace("[inputs.scan]", ahead), where="p")
+    leading = transforms(("odom", "base_link", 0.0), ("base_link", "/laser", 0.0), count=60)
+    for number, (topics, profile, named) in enumerate(
+        [
+            (with_laser(tf=MOVING), shipped, True),
+            (with_laser(), shipped, True),
+            (with_laser(tf=MOVING, tf_static=STATIC), shipped, False),
+            (with_laser("base_link", tf=MOVING), shipped, False),
+            (with_laser(tf=leading), shipped, False),
+            (with_laser(tf=MOVING), points_ahead, False),
+        ]
+    ):
+        bag = write_topics(topics, tmp_path / str(number), storage="mcap")
+        notes = ingest(bag, profile, store=None).notes
+        assert any("no transform places laser" in note for note in notes) is named, number
+
+
+def test_poses_in_utm_coordinates_are_stored_to_the_millimetre(tmp_path):
+    recording, store = write_bag(Utm(8.0), tmp_path / "bag"), tmp_path / "store"
+    _, profile, file = proposed(recording)
+    assert main(["ingest", str(recording), "--profile", str(file), "--store", str(store)]) == 0
+    query = "SELECT pose_x_m, pose_y_m FROM transitions ORDER BY stamp_ns"
+    with Store(store) as rows:
+        found = rows.sql(query).fetchnumpy()
+    x, y = found["pose_x_m"].astype(float), found["pose_y_m"].astype(float)
+    driven = 1 + 0.5 * np.arange(len(x)) * 0.2
+    assert x + profile.origin_m[0] == pytest.approx(4.5e5 + driven, abs=1e-3)
+    assert y + profile.origin_m[1] == pytest.approx(5.2e6 + 1, abs=1e-3)
+    with open_recording(recording) as opened:
+        (surveyed,) = candidate_poses(opened, profile)  # of a floor: from the same origin
+    assert surveyed.places_m[0] == pytest.approx([x[0], y[0]], abs=1e-3)
+
+
+# -- what the choices rest on ------------------------------------------------------------------
+
+
+def reported(speeds: Any, turns: Any = 0.0) -> Commands:
+    speeds = np.asarray(speeds, np.float64)
+    return Commands().fastest(speeds, np.broadcast_to(turns, speeds.shape))
+
+
+@pytest.mark.parametrize(
+    ("commands", "speeds"),
+    [
+        (reported([0.0, 0.2, 0.5]), []),
+        (reported([*[0.5] * 400, *[-0.2] * 200, -0.5]), [-0.2]),  # an outlier is no speed
+        (reported([*[0.5] * 400, -3.0]), [-0.5]),
+        (reported([*[0.5] * 9, *[-0.5] * 9]).limited(0.3, None), [-0.3]),  # what it reached
+    ],
+)
+def test_a_robot_backs_up_as_fast_as_usual(commands, speeds):
+    assert reverse(actions_of(commands, RobotProposal())) == [(speed, 0.0) for speed in speeds]
+
+
+@pytest.mark.parametrize("slowest", [0.0, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("fastest", [0.3, 0.7, 1.0])
+def test_reverse_at_many_speeds_is_near_an_action(slowest, fastest):
+    back = np.linspace(min(slowest, fastest), fastest, 200)
+    speeds = np.concatenate([np.ones(300), -back])
+    actions = actions_of(reported(speeds), RobotProposal())
+    task = Task(body=Body(0.6, 0.5), actions=tuple(actions))
+    assert nearest_action(task, speeds, 0 * speeds)[1].max() <= 0.25
+
+
+def test_a_car_backs_up_and_turns_as_fast_as_its_logs():
+    car = RobotProposal(values={"drive": "ackermann", "wheelbase_m": 0.4, "max_steering_rad": 0.5})
+    backs = reverse(actions_of(reported([*[1.0] * 50, *[-0.8] * 50], 0.5), car))
+    assert {speed for speed, _ in backs} == {-0.8}
+    assert sorted(np.sign(turn) for _, turn in backs) == [-1, 0, 1]
+    assert reverse(actions_of(reported([1.0, 0.5], 0.5), car)) == []
+
+
+def held(until_s: float, commands: list[tuple[float, float]]) -> CommandHold:
+    """Return what is read of commands (time, speed) to a robot that goes .5 m/s, then stands."""
+    at = np.arange(0, 30, 0.05)
+    still = np.zeros(len(at))
+    poses = PoseSeries((at * NS).astype(np.int64), 0.5 * np.minimum(at, until_s), still, still)
+    times, speeds = (np.array(column) for column in zip(*commands, strict=True))
+    return command_hold(times, speeds, np.zeros(len(times)), poses)
+
+
+def test_a_driver_that_times_out_is_seen():
+    moving = [(0.1 * i, 0.5) for i in range(101)]
+    assert held(10.6, moving).age_s == pytest.approx(0.6, abs=0.5)
+    stopped = [*moving, (10.1, 0.0)]
+    assert held(10.2, stopped).stops_hold
+    assert not held(25.0, stopped).stops_hold  # somebody else drives it
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize(("most", "limit"), [(0.3, 0.3), (0.2, 0.2), (0.45, None), (1.0, None)])
+def test_a_base_that_cuts_off_shows_its_limit(way, most, limit):
+    """It follows after .3 s, as fast as it can: 3 s fast, 2 s slowly."""
+    at_s, ticks_s = np.arange(0, 20, 0.05), np.arange(0, 20, 0.1)
+    followed = np.maximum(np.searchsorted(ticks_s, at_s - 0.3, "right") - 1, 0)
+
+    def limit_seen(told: Any) -> float | None:
+        driven = np.clip(told[followed], -most, most)
+        return limit_of(settled_speeds(ticks_s, told, at_s, driven, 0.5), 0.5)
+
+    assert limit_seen(way * np.where(ticks_s % 5 < 3, 0.5, 0.1)) == limit
+    assert limit_seen(np.where(ticks_s % 1.6 < 0.8, 0.5, -0.5)) is None  # before it could follow
+
+
+def test_every_proposed_period_is_one_that_the_twin_can_drive() -> None:
+    """Of 145 s of a fra2mo, .13 s were proposed, and then no twin could be built."""
+    for period_s in np.arange(0.08, 0.5001, 0.001):
+        found = drivable(float(period_s))
+        assert found == pytest.approx(period_s, abs=0.025)
+        actions = ((0.0, 0.0), (0.4, 0.0))
+        task = Task(body=Body(0.6, 0.5), actions=actions, control_period_s=found)
+        assert np.prod(blocks_of(task, 0.01)) == pytest.approx(found)
+    for kept in (0.08, 0.1, 0.12, 0.2, 0.3, 0.5):
+        assert drivable(kept) == kept
+    # Of commands a fifth of a second apart .21 s were proposed, which no log of theirs can follow.
+    assert [drivable(near) for near in (0.1015, 0.2003, 0.3012)] == [0.1, 0.2, 0.3]
+
+
+# -- the sample, and recordings of others, with all their signals ------------------------------
+
+
+def with_all_signals(toml: str) -> str:
+    """Return the proposal with every commented-out custom signal taken in."""
+    lines, inside = [], False
+    for line in toml.splitlines():
+        inside = line.startswith("# [signals.") or (inside and line.startswith("# "))
+        lines.append(line.removeprefix("# ") if inside else line)
+    return "\n".join(lines)
+
+
+def test_of_the_sample_bag_and_with_all_its_signals(tmp_path):
+    _, said = asked("new", SAMPLE)
+    text, file = said["toml"], tmp_path / "p.toml"
+    count = len(re.findall(r"^# \[signals\.", text, re.M))
+    assert count >= 8
+    assert said["transitions"] == ROWS
+    assert 'alignment = "header.stamp"' in text
+    assert parse_profile(text, where="p").frames is None
+    taken = re.sub(r"^# (\[frames\]|fixed|base|max_age_s = 0.5)", r"\1", text, flags=re.M)
+    assert parse_profile(taken, where="p").frames is not None
+    file.write_text(with_all_signals(text))
+    outcome = checked(file, SAMPLE)
+    assert outcome["transitions"] == ROWS
+    assert len(outcome["signals"]) == count
+    assert all(one["steps"] > 0 and one["unread"] == 0 for one in outcome["signals"])
+    names = {signal["name"]: signal["unit"] for signal in outcome["signals"]}
+    assert names["diagnostics_battery_voltage_v"] == "V"
+    assert names["joint_states_velocity_left_wheel_joint_radps"] == "rad/s"
+    assert not any("ground_truth" in name for name in names)  # no robot knows it
+
+
+def test_without_a_pose_topic_the_pose_is_from_transforms(tmp_path):
+    """A recording of the sample's topics but for /amcl_pose."""
+    with open_recording(SAMPLE) as recording:
+        del recording.topics["/amcl_pose"]
+        text = propose_profile(recording, "amr").toml
+    profile = parse_profile(text, where="p")
+    assert profile.inputs.pose is None
+    assert (profile.frames.fixed, profile.frames.base) == ("map", "base_link")
+    (tmp_path / "p.toml").write_text(text)
+    assert checked(tmp_path / "p.toml", SAMPLE)["transitions"] > 600
+
+
+def test_every_type_of_a_bag_without_a_robot_is_gone_through(tmp_path):
+    said, _, _ = proposed(write_sample_bag(tmp_path / "bag"), *ODOMETRY)
+    assert said["missing"] == said["problems"] == []
+    assert said["signals"] == len(re.findall(r"^# \[signals\.", said["toml"], re.M)) > 4
+    parse_profile(with_all_signals(said["toml"]), where="p")
+
+
+OTHERS = {  # recordings of others -> transitions of the proposal, and the fastest in reverse
+    "turtlebot3-sim-humble": (133, None),
+    "turtlebot3-sim-sparse-cmd": (208, None),
+    "ros1/husky_robot_localization.bag": (3903, None),
+    "sim-time-husky": (77, None),
+    "sim-time-mobrob": (41, None),
+    "sim-time-robot-kf": (520, None),
+    "robots/turtlebot3-sim/rosbag_test": (113, None),
+    "robots/turtlebot3-sim-clock/ros2bag": (17, None),
+    "robots/neato-map-ros1/ac109_3_demo.bag": (None, -0.0927),
+    "jetacker": (None, -1.0),
+}
+MEASURED = ("ros1/husky_robot_localization.bag", "sim-time-mobrob", "sim-time-robot-kf")
+
+
+@pytest.mark.long
+@needs_shared
+@pytest.mark.parametrize("name", OTHERS)
+def test_of_others_robots_and_with_all_its_signals(name, tmp_path):
+    recording, (transitions, back_mps) = SHARED / name, OTHERS[name]
+    code, said = asked("new", recording, *(ODOMETRY if name in MEASURED else ()))
+    assert code == (3 if said["losses"] else 0)  # of one a file is missing
+    profile = parse_profile(said["toml"], where="p")
+    if back_mps is not None:
+        slowest = min(speed for speed, _ in reverse(profile.task.actions))
+        assert slowest == pytest.approx(back_mps, rel=0.01)
+        return
+    assert said["transitions"] == transitions
+    if name.startswith(("turtlebot3", "ros1")):
+        file = tmp_path / "p.toml"
+        file.write_text(with_all_signals(said["toml"]))
+        outcome = checked(file, recording)
+        assert outcome["transitions"] == transitions
+        assert len(outcome["signals"]) > 4
+        assert all(signal["found"] for signal in outcome["signals"])
+        if name == "turtlebot3-sim-humble":  # a small robot: its rows were nearly all recovery
+            assert outcome["conditions"]["recovery"] <= 1
