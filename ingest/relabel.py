@@ -39,7 +39,6 @@ from restock.ingest.store.manifest import (
     uncertain_conditions,
 )
 from restock.ingest.store.transitions import by_name, episode_ends, names_of, replaced
-from restock.ingest.store.version import Version
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
     NOMINAL,
@@ -82,11 +81,8 @@ def relabel_store(
     conditions_of: Callable[[str], Sequence[Condition]],
     *,
     dry_run: bool = False,
-    version: Version | None = None,
 ) -> tuple[list[Relabelled], int | None]:
     """Label every recording again whose conditions have changed.
-
-    A `version` of the store is labelled in a dry run alone: what was is not written over.
 
     `conditions_of` gives the definitions, of both kinds, for the profile (by name) that read a
     recording. Returns what became of each, and the version of `transitions` (None where nothing
@@ -97,15 +93,9 @@ def relabel_store(
         ConfigError: a condition's SQL does not run over the signals that are stored.
     """
     expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
-    if version is not None and not dry_run:
-        raise StoreError(
-            "an earlier version cannot be labelled",
-            where=str(store.path),
-            remedy="give --dry-run to see what would change, or leave out --version",
-        )
     outcomes: list[Relabelled] = []
     stale: list[dict[str, Any]] = []
-    for row in store.live(version=version).to_pylist():
+    for row in store.live().to_pylist():
         rules = labels_version(conditions_of(row["profile"]))
         if rules_of(row["labels_version"]) == rules:
             same = (row["labels_version"], row["labels_version"])

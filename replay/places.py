@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
-from restock.ingest.store.version import Version
 from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import REMAKE, read_parquet
 from restock.replay.store.store import Store, is_store
@@ -31,7 +30,6 @@ def open_place(
     beside: Mapping[str, str | Path] | None = None,
     memory_limit: str | None = None,
     only_store: bool = False,
-    version: Version | None = None,
     opened: Callable[[Store], None] = lambda store: None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Yield a connection with the views of a store, a run or a panel.
@@ -39,12 +37,11 @@ def open_place(
     Query it with `query` or `install_named`, which make the store's views that a text names.
 
     Args:
-        path: the place: a folder, or `s3://bucket/prefix` for a store.
+        path: the place: a folder, or `s3://bucket/prefix` for a store; `store@12` for a version.
         beside: a run and a panel, each under a schema of its own: `{"run": "runs/a"}` gives
             `run.audit`, `{"panel": "panel"}` gives `panel.rows`.
         memory_limit: of DuckDB, for a store.
         only_store: take nothing but a store.
-        version: of a store; the newest.
         opened: called with the store before it is queried: `Store.verify` verifies its files.
 
     Raises:
@@ -54,7 +51,7 @@ def open_place(
     """
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
-        with Store(place, version=version, memory_limit=memory_limit) as store:
+        with Store(place, memory_limit=memory_limit) as store:
             opened(store)
             add_computed_tables(store)
             _add_all(store.bare, beside)
@@ -66,8 +63,8 @@ def open_place(
     path = place.folder
     if not path.exists():
         raise StoreError("it does not exist", where=str(path), remedy=place.remedy_if_absent())
-    if version is not None:
-        raise StoreError("only a store has versions", where=str(path), remedy="leave --version out")
+    if place.version is not None:
+        raise StoreError("only a store has versions", where=str(path), remedy="leave out the @")
     with duckdb.connect() as connection:
         if _add(connection, path, "main") is None:
             raise StoreError(

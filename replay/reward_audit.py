@@ -18,7 +18,6 @@ import duckdb
 from restock.errors import ConfigError, RunError, quoted
 from restock.files import read_json
 from restock.ingest.store.location import Location
-from restock.ingest.store.version import Version
 from restock.process import interrupts_raised
 from restock.replay.places import RUN_CONFIG, open_place
 from restock.replay.store.audit import Audit, Finding, Thresholds, check_thresholds, run_audits
@@ -49,7 +48,6 @@ def audit_reward(
     thresholds: Thresholds,
     *,
     discount: float | None = None,
-    version: Version | None = None,
     memory_limit: str | None = None,
 ) -> RewardAudit:
     """Return whether more success earns more, in a store's logs or a run's evaluations.
@@ -58,7 +56,6 @@ def audit_reward(
         place: a store, or a run.
         audits, thresholds: all that are known; those of the reward are run.
         discount: of one step; for a run its own, for a store DISCOUNT.
-        version: of the store; the newest.
         memory_limit: of DuckDB, for a store.
 
     Raises:
@@ -83,7 +80,6 @@ def audit_reward(
         beside=beside,
         memory_limit=memory_limit,
         only_store=not of_run,
-        version=version,
         opened=Store.verify,
     ) as connection:
         if of_run:

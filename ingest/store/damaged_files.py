@@ -134,6 +134,7 @@ def verify_store(path: str | Path | Location) -> Verified:
             reason than damage.
     """
     store = StoreReader(path)
+    store.path.expect_newest()
     store.path.expect_both_tables()
     paths = [
         f"{name}/{file}"

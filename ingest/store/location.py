@@ -79,14 +79,15 @@ _MEANINGS = (
 
 @dataclass(frozen=True)
 class Location:
-    """A store's place. `str()` gives it as a user writes it."""
+    """A store's place. `str()` gives it as a user writes it, without a version."""
 
     text: str
     folder: Path | None  # None on S3
+    version: Version | None = None  # after an @; None: the newest
 
     @classmethod
     def of(cls, place: str | Path | Location) -> Location:
-        """Return the place that a path or an address names.
+        """Return the place that a path or an address names, with the version after its `@`.
 
         Raises:
             StoreError: an address of another kind or with a secret in it, or a path where Delta
@@ -95,7 +96,7 @@ class Location:
         if isinstance(place, Location):
             return place
         expect("a store's place", place, (str, Path), "give a folder, or s3://bucket/prefix")
-        text = str(place)
+        text, version = split_version(str(place))
         if not text.strip():
             raise StoreError(
                 "the name of the store is empty",
@@ -124,8 +125,8 @@ class Location:
             )
         if on_s3:
             prefix = on_s3["prefix"].strip("/")
-            return cls(f"s3://{on_s3['bucket']}" + (f"/{prefix}" if prefix else ""), None)
-        return cls(text, Path(text))
+            return cls(f"s3://{on_s3['bucket']}" + (f"/{prefix}" if prefix else ""), None, version)
+        return cls(text, Path(text), version)
 
     def __str__(self) -> str:
         return self.text
@@ -149,6 +150,15 @@ class Location:
     def table(self, name: str) -> str:
         """Return the address of one of its tables."""
         return str(self.folder / name) if self.folder is not None else f"{self.text}/{name}"
+
+    def expect_newest(self) -> None:
+        """Raise StoreError if a version is named where only the newest can be meant."""
+        if self.version is not None:
+            raise StoreError(
+                "only the newest version can be changed or verified",
+                where=f"{self.text}@{self.version}",
+                remedy=f"give {self.text}",
+            )
 
     def has_table(self, name: str) -> bool:
         """Return whether there is such a table; raise StoreError if the place cannot be reached.
@@ -201,13 +211,7 @@ class Location:
         return StoreError(what, where=self.text, remedy=remedy)
 
     def remedy_if_absent(self) -> str:
-        """Return what to do if there is nothing. Raises StoreError as `has_table` does."""
-        path, version = split_version(self.text)
-        if version is not None and Location.of(path).has_table(TRANSITIONS):
-            return (
-                f"`{path}` is a store: name its version with --version"
-                f" {self.text.removeprefix(f'{path}@')}, where the command has that option"
-            )
+        """Return what to do if there is nothing."""
         return f"`restock ingest RECORDINGS --store {quoted(self.text)}` makes a store"
 
     def open_table(self, name: str, version: Version | None = None) -> DeltaTable:

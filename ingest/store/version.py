@@ -50,15 +50,9 @@ def parse_version(text: str) -> Version:
     except ValueError:
         raise StoreError(
             f"{text!r} is neither the number of a version nor a time",
-            where="--version",
             remedy="give a number such as 12, or a time such as 2026-11-01T08:00Z",
         ) from None
     return moment
-
-
-def given_version(text: str | None) -> Version | None:
-    """Parse what `--version` was given. Raises StoreError as `parse_version` does."""
-    return None if text is None else parse_version(text)
 
 
 def split_version(place: str) -> tuple[str, Version | None]:
@@ -224,7 +218,7 @@ _REMOVE = (
     " CONSTRAINT or UNSET TBLPROPERTIES)"
 )
 _AGAIN = "ingest the recordings into a new store"
-_EARLIER = f"name a version from before with --version, or {_AGAIN}"
+_EARLIER = f"name a version from before, as in STORE@12, or {_AGAIN}"
 _UNSUPPORTED = re.compile(r"Feature '([^']+)' is not supported")  # Delta's library
 
 

@@ -81,6 +81,7 @@ class StoreWriter(TableCommits):
 
     def __init__(self, path: str | Path | Location) -> None:
         super().__init__(path)
+        self.path.expect_newest()
         self._fitting: list[pa.Schema] = []  # columns that its tables are known to have
         self._reached = False
 

@@ -20,7 +20,6 @@ from typing import Any
 
 from restock.errors import StoreError
 from restock.files import building, expect_place
-from restock.ingest.store.version import Version
 from restock.process import install_command, installed, interrupts_raised
 from restock.replay.export import FORMATS
 from restock.replay.export.selection import Selection, open_selection
@@ -149,7 +148,6 @@ def export_dataset(
     *,
     query: str | None = None,
     panel: str | Path | None = None,
-    version: Version | None = None,
     continuous: bool = False,
     license: str | None = None,
     cameras: Sequence[str] | None = None,
@@ -161,7 +159,7 @@ def export_dataset(
         source: a store or a panel.
         to: one of FORMATS.
         out: a file or directory that must not exist yet.
-        query, panel, version, continuous: see `open_selection`.
+        query, panel, continuous: see `open_selection`.
         license: its identifier (`cc-by-4.0`), for the card of a data set that is a directory.
         cameras: whose frames go with the steps, of a store to lerobot; None: all that it has.
         advance: called with the number of steps written, as it goes on.
@@ -209,7 +207,6 @@ def export_dataset(
         source,
         query=query,
         panel=panel,
-        version=version,
         continuous=continuous,
         cameras=cameras,
     ) as selection:

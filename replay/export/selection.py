@@ -16,7 +16,6 @@ import pyarrow as pa
 
 from restock import __version__
 from restock.errors import PanelError, QueryError, StoreError
-from restock.ingest.store.version import Version
 from restock.ingest.task.task import Task
 from restock.replay.export.images import chosen_cameras
 from restock.replay.export.trajectory import (
@@ -66,17 +65,15 @@ def open_selection(
     *,
     query: str | None = None,
     panel: str | Path | None = None,
-    version: Version | None = None,
     continuous: bool = False,
     cameras: Sequence[str] | None = (),
 ) -> Iterator[Selection]:
     """Yield the rows of a panel, or of a query to a store.
 
     Args:
-        path: a store or a panel.
+        path: a store, at a version if it is `store@12`, or a panel.
         query: SQL over the store's views that gives whole transitions; default all of them.
         panel: whose tables the query may use: `panel.rows`, `panel.strata`.
-        version: of a store, its number or a moment; the newest.
         continuous: the action is the command that was logged, not the index of the nearest.
         cameras: of a store: rows without a frame of each are left out; None: every camera.
 
@@ -86,8 +83,6 @@ def open_selection(
     """
     path = Path(path)
     if (path / HEADER).is_file():
-        if version is not None:
-            raise StoreError("only a store has versions", where=str(path))
         if query is not None or panel is not None:
             raise QueryError("a panel is exported as it is, without a query", where=str(path),
                              remedy="query its store, with --panel beside it")  # fmt: skip
@@ -100,8 +95,8 @@ def open_selection(
     text = (query or EVERYTHING).strip().rstrip(";")
     beside: Mapping[str, str | Path] = {"panel": panel} if panel is not None else {}
     with (
-        Store(path, version=version) as store,
-        open_place(path, beside=beside, only_store=True, version=version) as connection,
+        Store(path) as store,
+        open_place(path, beside=beside, only_store=True) as connection,
     ):
         store.verify()
         chosen = chosen_cameras(store, cameras)

@@ -67,9 +67,10 @@ class Store:
     """A store at one version. Close it, or use it as a context manager.
 
     Args:
-        path: the store's directory, or `s3://bucket/prefix`.
-        version: of its transitions table, a number or the moment whose newest it was; default the
-            newest.
+        path: the store's directory, or `s3://bucket/prefix`; `store@12` and `store@2026-11-01` are
+            a version of it.
+        version: of its transitions table, a number or the moment whose newest it was; default that
+            of the path, or the newest.
         memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
 
     `version` is of the transitions table, `files` the Parquet files of each table, `bare` the
@@ -90,6 +91,7 @@ class Store:
         memory_limit: str | None = None,
     ) -> None:
         self.path = Location.of(path)
+        version = self.path.version if version is None else version
         if version is not None:
             expect("version", version, (int, datetime), "give a number, or a moment")
         _expect(self.path)

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from restock.errors import PanelError, RunError, StoreError, quoted
 from restock.files import read_json, read_table
-from restock.ingest.store.version import Version
+from restock.ingest.store.location import Location
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
 from restock.replay.store.parquet_views import passed_in
@@ -44,7 +44,6 @@ class TracePlaces:
     panel: Path | str | None = None
     recording: Path | str | None = None
     profile: str | None = None
-    version: Version | None = None  # of the store that a trace begins at
 
 
 def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = None) -> Trace:
@@ -52,7 +51,7 @@ def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = Non
 
     Args:
         place: a run (`row` is STEP/ROW: gradient step and row of the batch), a panel (`row` is a
-            row number) or a store (`row` is a transition id).
+            row number) or a store, or `store@12` (`row` is a transition id).
         row: which row.
         where: places that were moved, and the recording whose messages to read.
 
@@ -63,24 +62,17 @@ def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = Non
     """
     path, row, where = Path(place), str(row), where or TracePlaces()
     trace = Trace()
-    if where.version is not None and not is_store(str(place)):
-        raise StoreError(
-            "only a store has versions: rows of runs and panels come from the version that was "
-            "mixed",
-            where=str(place),
-            remedy="leave --version out",
-        )
     if (path / RUN_CONFIG).is_file():
         _of_run(trace, path, row, where)
     elif (path / HEADER).is_file():
         _of_panel(trace, Panel.open(path), _number(row, path, "row number of the panel"), where)
-    elif is_store(str(place)):
+    elif is_store(location := Location.of(place)):
         number = _number(row, path, "transition id")
         version = None
-        if where.version is not None:
-            with Store(place, version=where.version) as store:
+        if location.version is not None:
+            with Store(location) as store:
                 version = store.version
-        trace.origin = _origin([StoreVersion(str(place), version)], number, where)
+        trace.origin = _origin([StoreVersion(str(location), version)], number, where)
     else:
         raise StoreError(
             "it is not a run, a panel or a store" if path.exists() else "it does not exist",

@@ -46,13 +46,13 @@ when_imported("gymnasium", _register)
 def open(store: str, *, version: int | str | None = None) -> Store:
     """Open a store of transitions for reading: `restock.open("store").sql("FROM coverage")`.
 
-    `version` opens it as it was: a version's number, or an ISO 8601 time.
+    `version` opens it as it was: a version's number, or an ISO 8601 time. So does `"store@12"`.
     """
-    from restock.ingest.store.version import given_version
+    from restock.ingest.store.version import parse_version
     from restock.replay.places import add_computed_tables
     from restock.replay.store.store import Store
 
-    moment = given_version(version) if isinstance(version, str) else version
+    moment = parse_version(version) if isinstance(version, str) else version
     opened = Store(store, version=moment)
     add_computed_tables(opened)
     return opened

@@ -102,3 +102,7 @@ VERBS = {  # what to type instead
     "schema": "it is `restock profile schema` now",
     "completion": "it is `restock --tyro-write-completion SHELL FILE` now",
 }
+
+OPTIONS = {  # of one command, or of all; what to type instead
+    "--version": "write the version after the store: STORE@12 or STORE@2026-11-01T08:00Z",
+}

@@ -14,6 +14,7 @@ from support.paths import ROOT
 from restock import cli, native
 from restock.cli.output import print_table
 from restock.errors import ExitCode, RecordingError
+from restock.renamed import OPTIONS
 from restock.renamed import VERBS as RENAMED
 
 COMMANDS = [*cli.VERBS, *(f"{verb} {job}" for verb in cli.JOBS for job in cli.JOBS[verb])]
@@ -54,6 +55,15 @@ def test_an_old_verb_is_answered_with_the_new_one(
     assert RENAMED[verb] in said
     named = re.findall(r"`restock (\w+)(?: (\w+))?", said)
     assert all(new in cli.VERBS and verb != new for new, _ in named)
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_removed_option_is_answered_with_the_new_way(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = option.rpartition(" ")[0] or "sql"
+    assert cli.main([*command.split(), "place", f"--{option.partition('--')[2]}=1"]) == 2
+    assert OPTIONS[option] in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["store"], ["store", "none"], ["twin", "none"]], ids=" ".join)

@@ -244,9 +244,9 @@ def test_the_command_says_what_was_removed_and_how_to_get_it_back(tmp_path, caps
     assert "removed 2 recordings" in said
     assert f"restock ingest logs/2.mcap logs/3.mcap --store {place}" in said
     version = StoreWriter(place).path.open_table(TRANSITIONS).version() - 1
-    assert f"--version {version}" in said
+    assert f"{place}@{version}" in said
     assert shown(place) == expected((1, "a"))
-    assert main(["sql", place, "--version", str(version), "FROM recordings", "--json"]) == 0
+    assert main(["sql", f"{place}@{version}", "FROM recordings", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == 3
     assert main(["store", "remove", place, name_of(1), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

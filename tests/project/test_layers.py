@@ -43,9 +43,7 @@ MAY_IMPORT = {
         "replay panel store ingest/containers ingest/decoding ingest/profile ingest/steps"
         " ingest/store ingest/task"
     ),
-    "replay/export": (
-        "replay panel plan store ingest/steps ingest/store ingest/profile ingest/task"
-    ),
+    "replay/export": ("replay panel plan store ingest/steps ingest/profile ingest/task"),
     "train": (
         "dqn evaluation feed run twin/missions twin/env twin/floors twin/physics"
         " replay/mixture replay/panel replay/store ingest/profile ingest/task"
@@ -123,7 +121,7 @@ MAY_IMPORT = {
     ),
     "cli/twin": (
         "cli report report/run ingest/profile ingest/propose"
-        " ingest/store ingest/task replay/fleet replay/store train/evaluation"
+        " ingest/task replay/fleet replay/store train/evaluation"
         " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
         " train/twin/physics train/twin/recording train/twin/survey"
     ),

@@ -103,7 +103,7 @@ def test_the_verb_answers_of_a_version_and_joins(
     newest = json.loads(capsys.readouterr().out)
     assert newest
     assert all(row["rows"] == row["packed"] for row in newest)
-    assert cli.main(["sql", store, query, "--json", "--version", "0"]) == 0
+    assert cli.main(["sql", f"{store}@0", query, "--json"]) == 0
     older = json.loads(capsys.readouterr().out)
     assert sum(row["rows"] for row in older) < sum(row["rows"] for row in newest)
 

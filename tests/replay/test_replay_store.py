@@ -426,7 +426,7 @@ def test_what_is_no_store_is_said_to_be_none(tmp_path: Path) -> None:
         (tmp_path / name).unlink()
     write_store(tmp_path / "s", [recording_transitions(1)])
     assert is_store(tmp_path / "s")
-    with pytest.raises(StoreError, match="--version 3"):
+    with pytest.raises(StoreError, match="has no version 3"):
         Store(f"{tmp_path / 's'}@3")
 
 

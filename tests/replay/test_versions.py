@@ -18,9 +18,6 @@ from restock.replay.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("summaries_once")
 
-VERBS = ("sql", "audit", "mix", "export", "trace")
-JOBS = ("coverage gaps", "coverage drift", "store label")
-
 
 @pytest.fixture(scope="module")
 def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
@@ -32,21 +29,15 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     return path, first
 
 
-@pytest.mark.parametrize("verb", [*VERBS, *JOBS, "twin fit", "twin gap"])
-def test_the_flag_is_the_same_everywhere(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*verb.split(), "--help"]) == 0
-    assert "--version N|TIME" in capsys.readouterr().out
-
-
 def test_each_reads_what_was(
     versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, first = versions
-    store, then = str(path), str(first)
+    store = f"{path}@{first}"
     rows = one(1)[1]
 
     def requested(*args: str) -> object:
-        assert main([*args, "--version", then, "--json"]) in (0, 1)
+        assert main([*args, "--json"]) in (0, 1)
         return json.loads(capsys.readouterr().out)
 
     assert requested("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": len(rows)}]
@@ -63,12 +54,14 @@ def test_each_reads_what_was(
     found = requested("trace", store, str(identity))
     assert isinstance(found, dict)
     assert found["store"]["version"] == first
-    labelled = requested("store", "label", store, "--dry-run")
-    assert isinstance(labelled, dict)
-    assert len(labelled["recordings"]) == 1
-    with restock.open(store, version=first) as opened:
+    shelves = requested("coverage", store)
+    assert isinstance(shelves, list)
+    assert requested("audit", store)
+    with restock.open(store) as opened:
         assert opened.version == first
-    with restock.open(store, version="2999-01-01T00:00Z") as opened:
+    with restock.open(str(path), version=first) as opened:
+        assert opened.version == first
+    with restock.open(str(path), version="2999-01-01T00:00Z") as opened:
         assert opened.version == first + 1
 
 
@@ -76,31 +69,22 @@ def test_what_has_no_versions_says_so(
     versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, first = versions
-    assert main(["store", "label", str(path), "--version", str(first)]) == 2
-    assert "--dry-run" in capsys.readouterr().err
     assert main(["mix", str(path), "--out", str(tmp_path / "panel")]) == 0
-    for args in (
-        ["sql", str(tmp_path / "panel"), "FROM rows"],
-        ["trace", str(tmp_path / "panel"), "3"],
-        ["export", str(tmp_path / "panel"), "--to", "npz", "--out", str(tmp_path / "x.npz")],
+    panel, out = f"{tmp_path / 'panel'}@1", str(tmp_path / "x.npz")
+    for args, said in (
+        (["sql", panel, "FROM rows"], "only a store has versions"),
+        (["export", panel, "--to", "npz", "--out", out], "is a panel, not a store"),
+        (["store", "label", f"{path}@{first}"], "only the newest version can be changed"),
+        (["store", "compact", f"{path}@{first}"], "only the newest version can be changed"),
+        (["store", "verify", f"{path}@{first}"], "only the newest version can be changed"),
+        (["sql", f"{path}@{first + 9}", "FROM recordings"], f"has no version {first + 9}"),
+        (["sql", f"{path}@2026-13-01", "FROM recordings"], "neither the number of a version"),
+        (["sql", f"{path}x@{first}", "FROM recordings"], "restock ingest"),
     ):
-        assert main([*args, "--version", "1"]) == 2
-        assert "only a store has versions" in capsys.readouterr().err
+        assert main(args) == 2
+        assert said in capsys.readouterr().err
     with pytest.raises(StoreError, match="neither the number"):
         restock.open(str(path), version="yesterday")
-
-
-@pytest.mark.parametrize("verb", ["sql", "audit", "coverage", "store compact", *JOBS])
-def test_a_version_after_an_at_is_said_to_be_an_option(
-    verb: str, versions: tuple[Path, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, first = versions
-    assert main([*verb.split(), f"{path}@{first}"]) == 2
-    said = capsys.readouterr().err
-    assert f"`{path}` is a store: name its version with --version {first}" in said
-    assert "restock ingest" not in said
-    assert main([*verb.split(), f"{path}x@{first}"]) == 2  # and that is no store
-    assert "restock ingest" in capsys.readouterr().err
 
 
 def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path: Path) -> None:

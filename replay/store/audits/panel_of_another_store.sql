@@ -1,6 +1,6 @@
 -- severity: error
 -- needs: panel
--- advice: Audit the panel with the store, or the version of it, that it was made from (`--version`; a panel's `panel.json` names both), or mix it again from this one.
+-- advice: Audit the panel with the store, or the version of it, that it was made from (`STORE@VERSION`; a panel's `panel.json` names both), or mix it again from this one.
 -- doc: Recordings of the panel of which rows are not in this store: it was made from another store, or from a version that held more. Rows of a mixture's other stores do not count.
 WITH drawn AS (
     SELECT recording_id, transition_id

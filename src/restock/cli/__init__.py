@@ -214,6 +214,7 @@ def _say_jobs(verb: str, rest: list[str]) -> int:
 
 def _run(name: str, prog: str, rest: list[str]) -> int:
     """Parse the arguments of a command, and run it."""
+    _refuse_removed_options(name, prog, rest)
     when_imported("pyarrow", _settle_pandas)
     if FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
         _start_no_blas_threads()
@@ -241,6 +242,17 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
     with work_goes_on() if name in PRINTS_ON_THE_WAY else nullcontext():
         code: int | None = parsed.run()
     return int(code or ExitCode.OK)
+
+
+def _refuse_removed_options(name: str, prog: str, rest: list[str]) -> None:
+    options = [word.partition("=")[0] for word in rest if word.startswith("--")]
+    if not options:
+        return
+    from restock.renamed import OPTIONS
+
+    for option in options:
+        if instead := OPTIONS.get(f"{name} {option}") or OPTIONS.get(option):
+            raise RestockError(f"there is no option {option} any more", where=prog, remedy=instead)
 
 
 def command_of(name: str) -> type[Any]:

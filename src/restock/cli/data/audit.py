@@ -70,9 +70,6 @@ class AuditCommand:
     its evaluations is used."""
     strict: bool = False
     """Warnings fail, too."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """Audit an earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default:
-    the newest."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
     """Memory limit of DuckDB, e.g. 4GB; beyond it, DuckDB spills to a temporary folder."""
     json: bool = False
@@ -85,7 +82,6 @@ class AuditCommand:
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
-        from restock.ingest.store.version import given_version
         from restock.replay.reward_audit import audit_reward
         from restock.replay.store.audit import load_audits, load_thresholds
 
@@ -103,7 +99,6 @@ class AuditCommand:
                 audits,
                 thresholds,
                 discount=self.discount,
-                version=given_version(self.version),
                 memory_limit=self.memory_limit,
             )
             parts = [Part("audit", reward.findings)]
@@ -164,7 +159,6 @@ class AuditCommand:
 
     def _run_audits(self, audits: Sequence[Audit], thresholds: Mapping[str, Any]) -> list[Finding]:
         from restock.cli import output
-        from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
         from restock.replay.store.audit import run_audits
         from restock.replay.store.store import Store
@@ -176,7 +170,6 @@ class AuditCommand:
             beside=given,
             memory_limit=self.memory_limit,
             only_store=True,
-            version=given_version(self.version),
             opened=Store.verify,
         )
         with place as connection, output.progress("audits", len(audits)) as advance:
@@ -201,16 +194,11 @@ class AuditCommand:
         return parts
 
     def _difference(self, old: str) -> list[Finding]:
-        from restock.ingest.store.version import given_version, split_version
         from restock.replay.fleet.store_difference import diff_stores
         from restock.replay.store.store import Store
 
-        path, version = split_version(old)
         try:
-            with (
-                Store(path, version=version) as first,
-                Store(self.store, version=given_version(self.version)) as second,
-            ):
+            with Store(old) as first, Store(self.store) as second:
                 first.verify()
                 return of_difference(diff_stores(first, second).document(), old=old)
         except RestockError as error:
@@ -231,14 +219,10 @@ class AuditCommand:
 
     def _capacity(self) -> int:
         from restock.cli import output
-        from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
         from restock.replay.store.audit import recommend_capacity
 
-        version = given_version(self.version)
-        with open_place(
-            self.store, memory_limit=self.memory_limit, only_store=True, version=version
-        ) as connection:
+        with open_place(self.store, memory_limit=self.memory_limit, only_store=True) as connection:
             capacity = recommend_capacity(connection)
         if self.json:
             output.print_json({"store": str(self.store), "capacity": asdict(capacity)})

@@ -35,9 +35,6 @@ class ExportCommand:
     transitions."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables the query may use, as panel.rows and panel.strata."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
     license: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
@@ -52,7 +49,6 @@ class ExportCommand:
         """Write the data set and say what is in it."""
         from restock.cli import output
         from restock.cli.command_line import refuse
-        from restock.ingest.store.version import given_version
 
         if self.to == "onnx":
             of_rows = ("query", "panel", "version", "action", "license", "cameras")
@@ -84,7 +80,6 @@ class ExportCommand:
                 self.out,
                 query=self.query,
                 panel=self.panel,
-                version=given_version(self.version),
                 continuous=self.action == "continuous",
                 license=self.license,
                 cameras=self._cameras(),

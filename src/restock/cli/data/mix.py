@@ -48,9 +48,6 @@ class MixCommand:
     """Only show the plan; write nothing."""
     force: bool = False
     """Replace an existing panel."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
     """Memory limit of DuckDB, e.g. 1GB. Packing needs little more, whatever the panel's size."""
     verify: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
@@ -62,7 +59,6 @@ class MixCommand:
         """Plan, and unless it is a dry run, pack."""
         from restock.cli import output
         from restock.cli.command_line import refuse
-        from restock.ingest.store.version import given_version
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import check_free, open_source, write_panel
         from restock.replay.plan.plan import plan_panel
@@ -87,9 +83,7 @@ class MixCommand:
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
         with (
-            Store(
-                self.store, version=given_version(self.version), memory_limit=self.memory_limit
-            ) as store,
+            Store(self.store, memory_limit=self.memory_limit) as store,
             open_source(store, mixture, folder=folder) as source,
         ):
             with output.progress("planning", None):

@@ -43,9 +43,6 @@ class SqlCommand:
     """A run whose tables the query can also use, as run.audit, run.strata, …"""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables the query can also use, as panel.rows, panel.strata."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """Query an earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default:
-    the newest."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
@@ -58,7 +55,6 @@ class SqlCommand:
     def run(self) -> None:
         """Run the query and print its rows."""
         from restock.cli import output
-        from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
 
         if self.json and self.csv:
@@ -76,7 +72,6 @@ class SqlCommand:
             self.path,
             beside=given,
             memory_limit=self.memory_limit,
-            version=given_version(self.version),
             opened=output.say_unverified,
         ) as connection:
             if self.query is None and sys.stdin.isatty():
@@ -151,12 +146,11 @@ class SqlCommand:
     def _export(self, out: Path) -> None:
         from restock.cli import output
         from restock.files import expect_file_place
-        from restock.ingest.store.version import given_version
         from restock.replay.store.export_views import export_views
         from restock.replay.store.store import Store
 
         expect_file_place(out, "--export")
-        with Store(self.path, version=given_version(self.version)) as store:
+        with Store(self.path) as store:
             export_views(store, out)
             output.say(f"views of {self.path}, version {store.version} -> {out}")
 

@@ -43,9 +43,6 @@ class CoverageCommand:
     docs/mixture.md."""
     every: str = "week"
     """The length of a period for drift: day, week, month, year or decade."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     json: bool = False
     """Print the table as JSON, one object per condition."""
 
@@ -55,7 +52,6 @@ class CoverageCommand:
         from restock.cli.command_line import refuse
         from restock.errors import by_priority, uncertain_labels
         from restock.files import expect_file_place
-        from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
 
         if self.out is None:
@@ -64,7 +60,7 @@ class CoverageCommand:
         expect_file_place(self.out, "--out")
         if self.figures is not None:
             expect_file_place(self.figures / "figure.svg", "--figures")
-        with Store(self.store, version=given_version(self.version)) as store:
+        with Store(self.store) as store:
             output.say_unverified(store)
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             order = store.priority()
@@ -175,9 +171,6 @@ class GapsCommand:
     unit: Literal["missions", "hours"] | None = None
     """Count in missions or in hours of driving. Default: missions if a simulator made the
     recordings, hours if robots did."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     missions_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write the plan as a missions file, which must not exist yet."""
     json: bool = False
@@ -189,7 +182,6 @@ class GapsCommand:
         from restock.cli.command_line import refuse
         from restock.errors import ConfigError
         from restock.files import expect_file_place
-        from restock.ingest.store.version import given_version
         from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
         from restock.replay.fleet.shopping_list import document, shopping_list
@@ -207,7 +199,7 @@ class GapsCommand:
         if self.missions_out is not None:
             refuse_existing(self.missions_out)
         expect_file_place(self.missions_out, "--missions-out")
-        with Store(self.store, version=given_version(self.version)) as store:
+        with Store(self.store) as store:
             yields, gaps = find_gaps(
                 store,
                 mixture,
@@ -363,9 +355,6 @@ class DriftCommand:
     """The store."""
     every: str = "week"
     """The length of a period: day, week, month, year or decade."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write an HTML page that opens without a network. Replaces an existing file."""
     exit_code: bool = False
@@ -378,12 +367,11 @@ class DriftCommand:
         """Measure, print, and write the page."""
         from restock.cli import output
         from restock.files import expect_file_place
-        from restock.ingest.store.version import given_version
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.store.store import Store
 
         expect_file_place(self.out, "--out")
-        with Store(self.store, version=given_version(self.version)) as store:
+        with Store(self.store) as store:
             output.say_unverified(store)
             drift = measure_drift(store, every=self.every)
         if self.out is not None:

@@ -5,14 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from restock.errors import ExitCode, RestockError
-
-if TYPE_CHECKING:
-    from restock.replay.store.store import Store
 
 
 @dataclass
@@ -72,8 +69,9 @@ def _difference(first: str, second: str) -> dict[str, Any]:
         return diff_runs(Path(first), Path(second))
     from restock.cli import output
     from restock.replay.fleet.store_difference import diff_stores
+    from restock.replay.store.store import Store
 
-    with _open(first) as one, _open(second) as other:
+    with Store(first) as one, Store(second) as other:
         output.say_unverified(one)
         output.say_unverified(other)
         return diff_stores(one, other).document()
@@ -89,14 +87,6 @@ def _kind_of(place: str) -> str:
     if (Path(place) / HEADER).is_file():
         return "panel"
     return "run" if (Path(place) / RUN_CONFIG).is_file() else "store"
-
-
-def _open(place: str) -> Store:
-    from restock.ingest.store.version import split_version
-    from restock.replay.store.store import Store
-
-    path, version = split_version(place)
-    return Store(path, version=version)
 
 
 SHOWN = 12  # rows of a table on a terminal; --json has all

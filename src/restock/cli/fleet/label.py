@@ -56,9 +56,6 @@ class LabelCommand:
     corrections: Annotated[str | None, tyro.conf.arg(metavar="FILE|none")] = None
     """Write the verdicts of a CSV file (see docs/ingest.md) to the store; `none` removes all
     corrections."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """With --dry-run: an earlier version of the store, its number or a time. Default: the
-    newest."""
     dry_run: bool = False
     """Do everything except writing, and print what would change."""
     json: bool = False
@@ -68,7 +65,6 @@ class LabelCommand:
         """Label, and say what changed."""
         from restock.cli import output
         from restock.ingest.relabel import open_for_relabel, relabel_store
-        from restock.ingest.store.version import given_version
 
         self._check_options()
         if self.score:
@@ -84,7 +80,6 @@ class LabelCommand:
             store,
             self._conditions_of(store),
             dry_run=self.dry_run,
-            version=given_version(self.version),
         )
         rows = [as_json(outcome) for outcome in outcomes]
         if self.json:
@@ -123,7 +118,6 @@ class LabelCommand:
         of_rules = {
             "--profile": self.profile is not None,
             "--all": self.all,
-            "--version": self.version is not None,
         }
         for verb, given, others in (
             ("--score", self.score, {"--review": self.review is not None}),
@@ -143,9 +137,8 @@ class LabelCommand:
 
     def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
         from restock.ingest.profile.profile import load_profile, read_profile_toml
-        from restock.ingest.store.version import given_version
 
-        live = store.live(version=given_version(self.version))
+        live = store.live()
         carried = {row["profile"]: row["profile_toml"] for row in live.to_pylist()}
         given = load_profile(self.profile) if self.profile is not None else None
 

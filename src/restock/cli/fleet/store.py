@@ -126,7 +126,7 @@ class RemoveCommand:
     commit, or none: a name that fits no recording, or several, is refused.
 
     This does not ask first, as it can be undone: ingest the recording again, or read the version
-    before (`--version N`), which stays readable for 7 days. The recording's files are deleted after
+    before (`STORE@N`), which stays readable for 7 days. The recording's files are deleted after
     that by `restock ingest`. The corrections of its labels and its tags from `--tag` are removed
     with it. Panels and runs made from the store do not change.
 
@@ -202,7 +202,7 @@ class RemoveCommand:
         lines.append(f"give the options from before again, such as --profile or --tag{had}")
         lines.append(
             f"version {done.version_before} still has {it}, for {RETENTION_HOURS // 24} days:"
-            f' restock sql {store} --version {done.version_before} "FROM recordings"'
+            f' restock sql {quoted(f"{self.store}@{done.version_before}")} "FROM recordings"'
         )
         return lines
 

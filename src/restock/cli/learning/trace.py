@@ -48,9 +48,6 @@ class TraceCommand:
     """The profile with which the recording was ingested, if it is not a shipped one."""
     store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
     """The new path of the store, if it was moved."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the STORE: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """The new path of the panel, if it was moved."""
     view: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -68,7 +65,6 @@ class TraceCommand:
     def run(self) -> None:
         """Trace, and print what was found."""
         from restock.cli import output
-        from restock.ingest.store.version import given_version
         from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
         self._check_view()
@@ -89,8 +85,7 @@ class TraceCommand:
                     f"`restock trace {quoted(self.place)} {listed[0]['row']}` traces one of them"
                 )
             return
-        version = given_version(self.version)
-        where = TracePlaces(self.store, self.panel, self.recording, self.profile, version)
+        where = TracePlaces(self.store, self.panel, self.recording, self.profile)
         trace = trace_row(self.place, self.row, where)
         written = self._write_view(trace)
         if self.json:

@@ -46,9 +46,6 @@ class FitCommand:
     """Length in seconds of the segments that are driven again."""
     segments: int = 200
     """The largest number of segments."""
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     task: str | None = None
     """Hash of the task whose rows are used, if the store has several tasks."""
     profile: str | None = None
@@ -61,7 +58,6 @@ class FitCommand:
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
         from restock.files import expect_file_place
-        from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
         from restock.train.twin.calibration.fitted_twin import write_fit
         from restock.train.twin.calibration.logged_steps import recordings_of
@@ -75,7 +71,7 @@ class FitCommand:
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         expect_file_place(self.out, "--out")
-        with Store(self.store, version=given_version(self.version)) as store:
+        with Store(self.store) as store:
             groups: list[tuple[str, ...]] = [self.recording]
             if self.per_recording:
                 groups = [(name,) for name in recordings_of(store, self.recording, self.task)]

@@ -50,9 +50,6 @@ class GapCommand:
     """The largest number of segments per condition and horizon, spread evenly; for single steps,
     five times as many.
     """
-    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
-    newest."""
     task: str | None = None
     """Hash of the task whose rows are used, if the store has several tasks."""
     profile: str | None = None
@@ -68,7 +65,6 @@ class GapCommand:
         from restock.cli import output
         from restock.cli.twin.fit import robot_given
         from restock.errors import ConfigError, ExitCode
-        from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
         from restock.report import write_gap_page
         from restock.train.twin.calibration.gap import measure_gap
@@ -97,7 +93,7 @@ class GapCommand:
         )
         if self.out is not None:
             check_place(self.out)
-        with Store(self.store, version=given_version(self.version)) as store:
+        with Store(self.store) as store:
             notes: tuple[str, ...] = ()
             if self.fit:
                 from restock.train.twin.calibration.fit import FitConfig, fit
