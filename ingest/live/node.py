@@ -27,7 +27,8 @@ from typing import Any
 import msgspec
 
 from restock.errors import ConfigError
-from restock.ingest.live.pilot import Decision, Pilot, PolicyFile
+from restock.ingest.live.pilot import Decision, Pilot
+from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import CustomSignal, Input, is_motion
 from restock.ingest.task.conditions import Condition

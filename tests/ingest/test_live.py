@@ -18,7 +18,8 @@ from support.paths import ROOT
 from restock.cli import run_node
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.live.observer import LiveObserver
-from restock.ingest.live.pilot import Pilot, PolicyFile, play
+from restock.ingest.live.pilot import Pilot, play
+from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Frames

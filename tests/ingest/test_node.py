@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from support.policy_files import changed_policy
 from support.ros_graph import (
     VOLATILE,
     Durability,
@@ -216,15 +217,15 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
     assert all(np.isfinite(pair).all() for pair in speeds(graph))
 
 
-def test_a_policy_with_nan_weights_is_a_stop(policy: Path, tmp_path: Path) -> None:
+def test_values_that_overflow_are_a_stop(policy: Path, tmp_path: Path) -> None:
     import onnx
 
-    model = onnx.load(policy)
-    (weight,) = [each for each in model.graph.initializer if each.name == "weight"]
-    damaged = np.full(tuple(weight.dims), np.nan, np.float32)
-    weight.CopyFrom(onnx.numpy_helper.from_array(damaged, "weight"))
-    onnx.save(model, tmp_path / "damaged.onnx")
-    graph, node = started(tmp_path / "damaged.onnx")
+    def enlarge(model: Any) -> None:
+        (weight,) = [each for each in model.graph.initializer if each.name == "weight"]
+        large = np.full(tuple(weight.dims), 3e38, np.float32)
+        weight.CopyFrom(onnx.numpy_helper.from_array(large, "weight"))
+
+    graph, node = started(changed_policy(policy, tmp_path / "large.onnx", enlarge))
     node.trigger_activate()
     driven(TwinRobot(graph, SPEC), steps=8)
     assert node.policy.pilot.reason == "policy: the value of its action is not a finite number"

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from restock.ingest.live.pilot import FORMAT
+from restock.ingest.live.policy_file import FORMAT, with_digest
 from restock.ingest.profile.profile import Profile, profile_toml
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -119,11 +119,12 @@ def follower_onnx(path: Path, profile: Profile) -> Path:
             ],
         ),
         opset_imports=[helper.make_opsetid("", 18)],
-        ir_version=10,
+        ir_version=8,
     )
     metadata = {
         "format": FORMAT,
         "task_hash": task.hash,
+        "observation": msgspec.json.encode(task.observation_names).decode(),
         "actions": msgspec.json.encode(task.actions).decode(),
         "profile": profile.name,
         "profile_toml": profile_toml(profile),
@@ -131,5 +132,5 @@ def follower_onnx(path: Path, profile: Profile) -> Path:
         "version": "1",
     }
     helper.set_model_props(model, metadata)
-    path.write_bytes(model.SerializeToString())
+    path.write_bytes(with_digest(model.SerializeToString()))
     return path

@@ -20,7 +20,7 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
-from restock.ingest.live.pilot import FORMAT, open_session
+from restock.ingest.live.policy_file import FORMAT, OnnxFile, with_digest
 from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
 from restock.process import import_extra
@@ -67,7 +67,11 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     }
     onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
-    write_bytes(out, model.SerializeToString())
+    try:
+        content = with_digest(model.SerializeToString())
+    except ValueError as error:
+        raise RunError(f"its policy {error}", where=str(run.path)) from error
+    write_bytes(out, content)
     return {"path": str(out), "bytes": out.stat().st_size, **metadata}
 
 
@@ -159,45 +163,21 @@ class _Graph:
 
 
 class OnnxPolicy:
-    """Acts by an ONNX file: greedily, by its output `action`.
+    """Acts by an ONNX file, greedily.
 
     Raises:
         ConfigError: no such file, not a policy of this task, or the extra `onnx` is missing.
     """
 
     def __init__(self, path: Path, task: Task) -> None:
-        self._session = open_session(path)
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        if metadata.get("format") == FORMAT and metadata.get("task_hash") != task.hash:
-            raise ConfigError(
-                f"was made for task {metadata.get('task_hash')}, this is {task.hash}",
-                where=str(path),
-                remedy="export it again from a run of this task",
-            )
-        (taken,) = self._session.get_inputs()[:1]
-        if len(self._session.get_inputs()) != 1 or taken.shape[-1] != task.observation_size:
-            raise ConfigError(
-                f"takes {[i.shape for i in self._session.get_inputs()]}, the task's observation"
-                f" is (N, {task.observation_size})",
-                where=str(path),
-            )
-        self._input, self._actions = taken.name, len(task.actions)
-        names = [output.name for output in self._session.get_outputs()]
-        # A model of another make: its first output is taken for action values.
-        self._output = "action" if "action" in names else names[0]
-        self._path = path
-        self.name, self.version = f"onnx:{path}", metadata.get("version", "")
+        self._file = OnnxFile(path)
+        self._file.expect(task, "this task")
+        self.name, self.version = f"onnx:{path}", self._file.metadata.get("version", "")
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
         """Return the best action (N,) of each observation (N, D), and 1 for its probability."""
-        (output,) = self._session.run([self._output], {self._input: observation})
-        action = output if output.ndim == 1 else output.argmax(axis=1)
-        if action.shape != (len(observation),) or not np.isin(action, range(self._actions)).all():
-            raise ConfigError(
-                f"its output {self._output} {output.shape} holds no action of the {self._actions}",
-                where=str(self._path),
-            )
-        return action.astype(np.int64), np.ones(len(action), np.float32)
+        action = self._file.values(observation).argmax(axis=1)
+        return action, np.ones(len(action), np.float32)
 
 
 def _array(tensor: torch.Tensor) -> F32:

@@ -43,7 +43,7 @@ class NodeCommand:
 
     def run(self) -> int:
         from restock.errors import ConfigError
-        from restock.ingest.live.pilot import PolicyFile
+        from restock.ingest.live.policy_file import PolicyFile
 
         if self.on is not None:
             return self._play(self.on)
@@ -63,7 +63,8 @@ class NodeCommand:
 
     def _play(self, recording: Path) -> int:
         from restock.cli.output import print_json
-        from restock.ingest.live.pilot import Pilot, PolicyFile, play, summary
+        from restock.ingest.live.pilot import Pilot, play, summary
+        from restock.ingest.live.policy_file import PolicyFile
         from restock.ingest.task.robot import Limits
 
         policy = PolicyFile(self.policy, self.profile)
