@@ -19,10 +19,11 @@ import torch
 
 from restock.arrays import F32, Bools
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.manifest import LabelScore, events, touched, widened
 from restock.ingest.store.transitions import episode_ends
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import Condition
-from restock.ingest.task.label_scores import LabelScore, events, touched, true_names, widened
+from restock.ingest.task.schema import true_names
 from restock.train.twin.calibration.logged_steps import sector_clearance
 
 Log = dict[str, Any]  # every step's signals by name (N,), ends of episodes included

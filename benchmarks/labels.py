@@ -28,8 +28,8 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from restock.arrays import F64
+from restock.ingest.store.manifest import LabelScore
 from restock.ingest.task.conditions import let_values, shipped
-from restock.ingest.task.label_scores import LabelScore
 from restock.ingest.task.schema import signal_columns
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.replay.review import LabelQuality, label_quality, reliability

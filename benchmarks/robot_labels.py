@@ -23,7 +23,7 @@ from harness import finish, markdown, option_parser
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.store.transitions import label_table
 from restock.ingest.task.conditions import label, shipped
-from restock.ingest.task.label_scores import true_names
+from restock.ingest.task.schema import true_names
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

@@ -25,16 +25,17 @@ from restock.ingest.decoding.columns import Ragged
 from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
+from restock.ingest.profile.signal_paths import FIELDS, frame_id_path, plain, transform_fields
 from restock.ingest.profile.tag_rules import RecordingTags, resolve_tags
-from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows, kept_frames
+from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
 from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
-from restock.ingest.steps.frames import FIELDS, frame_id_path, plain, transform_fields
 from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
 from restock.ingest.store.lineage import own_path
 from restock.ingest.store.manifest import (
     correction_rows,
     corrections_in,
     definitions,
+    label_scores,
     lay_over,
     manifest_row,
     recorded_facts,
@@ -45,7 +46,6 @@ from restock.ingest.store.manifest import (
 from restock.ingest.store.transitions import Provenance, recording_table, replaced
 from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
-from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
 from restock.process import interrupts_raised
 
@@ -249,7 +249,7 @@ class _Ingest:
             "corrections": correction_rows(self.corrections),
         }
         steps = steps.without_values()
-        kept = kept_frames(steps.cameras, rows.tick)
+        kept = [KeptFrames.of(name, one, rows.tick) for name, one in steps.cameras.items()]
         path = own_path(provenance.recording_id, self.ingest_id)
         file = path if sum(len(one.row) for one in kept) else ""
         facts["cameras"] = [one.manifest_row(self.recording, file) for one in kept]

@@ -22,9 +22,9 @@ from typing import Any, Literal
 from restock.errors import RecordingError, RestockError, StoreError, counted, expect, quoted
 from restock.ingest.profile.tag_rules import in_words
 from restock.ingest.store.lineage import Ingest
+from restock.ingest.store.manifest import LabelScore
 from restock.ingest.store.summary import RepeatedDrive
 from restock.ingest.store.writer import Staged, StoreWriter
-from restock.ingest.task.label_scores import LabelScore
 
 GROUP_S = 5.0
 MAX_WAITING = 64

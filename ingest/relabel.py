@@ -26,12 +26,14 @@ from restock.ingest.profile.profile import profile_toml, read_profile_toml, with
 from restock.ingest.store.manifest import (
     COLUMN,
     Correction,
+    LabelScore,
     Moments,
     conditions_json,
     correction_rows,
     corrections_in,
     count_rows,
     driven_plan,
+    label_scores,
     lay_over,
     merged,
     rules_of,
@@ -55,7 +57,6 @@ from restock.ingest.task.conditions import (
     too_near_to_call,
     unknown_rows,
 )
-from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 from restock.ingest.task.task import Task
 

@@ -26,8 +26,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.errors import LabelError, QueryError, StoreError
 from restock.files import first_line
 from restock.ingest.relabel import RecordingCorrections
-from restock.ingest.store.manifest import Correction
-from restock.ingest.task.label_scores import LabelScore, label_scores, pooled
+from restock.ingest.store.manifest import Correction, LabelScore, label_scores, pooled
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval, cluster_counts, percentiles, wilson

@@ -21,24 +21,22 @@ from numpy.typing import NDArray
 from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.storage import (
+    Account,
     Damage,
     Extra,
+    Fields,
     Integrity,
+    LostMessages,
     Metadata,
     Packed,
-    Storage,
-    Watch,
-    decompressed,
-    unwatched,
-)
-from restock.ingest.containers.topic_reading import (
-    Account,
-    Fields,
-    LostMessages,
     Reduction,
+    Storage,
     TopicInfo,
     TopicReading,
+    Watch,
+    decompressed,
     together,
+    unwatched,
 )
 from restock.ingest.decoding.columns import (
     CannotDecode,

@@ -219,18 +219,14 @@ REFUSED = (
 REMEDY = "docs/robot.md says what the model must contain, and has an example"
 
 
-def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """Replace the name in `[robot] mjcf = "my_robot.xml"` of a profile's TOML by the file's text.
+def mjcf_text(given: str, folder: Path | None, where: str) -> str:
+    """Return the text of the file that `[robot] mjcf = "my_robot.xml"` of a profile's TOML names.
 
     The name must stay in the profile's folder: profiles are passed between strangers.
 
     Raises:
         ConfigError: no such file, one that lies elsewhere, or one that `mjcf_problem` refuses.
     """
-    robot = document.get("robot")
-    given = robot.get("mjcf") if isinstance(robot, dict) else None
-    if not isinstance(given, str) or not isinstance(robot, dict):
-        return document
 
     def refused(what: str, remedy: str | None = None) -> ConfigError:
         return ConfigError(f"`robot.mjcf` {what}", where=where, remedy=remedy)
@@ -238,7 +234,7 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
     if _is_text(given):
         if problem := mjcf_problem(given):
             raise refused(problem, REMEDY)
-        return document
+        return given
     if folder is None:
         raise refused(
             "gives a file name, which needs a profile that is a file: the name is "
@@ -260,7 +256,7 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
         raise refused(f"cannot be read: {given}: {first_line(error)}", "check its path") from error
     if problem := mjcf_problem(text):
         raise refused(f"{given}: {problem}", REMEDY)
-    return document | {"robot": robot | {"mjcf": text}}
+    return text
 
 
 def mjcf_problem(text: str) -> str | None:

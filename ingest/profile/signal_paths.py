@@ -14,13 +14,14 @@ element is not there, none.
 `CONVENTIONS` is the one place that knows what messages say in place of a value that was not
 measured: a driver that measures no yaw rate still publishes one, and says in a field beside it that
 it means nothing. Inputs, custom signals and proposed profiles ask it. A value that a message gives
-up is NaN, which rows have as null.
+up is NaN, which rows have as null. The fields that name frames, and those of transforms, are here
+too.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, take
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf
+    from restock.ingest.profile.tables import Input
 
 
 Rows = NDArray[np.intp]
@@ -443,3 +445,46 @@ def said_in(columns: Mapping[str, FieldColumn], path: str) -> F64:
 def last_part(kind: str) -> str:
     """Return a message type without package and namespace: "Twist" of `ros.geometry_msgs.Twist`."""
     return re.split(r"[/.:]", kind)[-1]
+
+
+AXES = ("translation.x", "translation.y", "translation.z")
+TURN = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
+FIELDS = (
+    "transforms[].header.stamp",
+    "transforms[].header.frame_id",
+    "transforms[].child_frame_id",
+    *(f"transforms[].transform.{part}" for part in (*AXES, *TURN)),
+)
+_FOXGLOVES = ("timestamp", "parent_frame_id", "child_frame_id", *AXES, *TURN)
+_LAYOUTS = (  # the same fields in as many types: ROS's, foxglove.FrameTransforms, FrameTransform
+    FIELDS,
+    tuple(f"transforms[].{path}" for path in _FOXGLOVES),
+    _FOXGLOVES,
+)
+FRAME_ID = "header.frame_id"
+FRAME_IDS = (FRAME_ID, "frame_id")  # of ROS's messages, and of Foxglove's
+
+
+def frame_path(source: Input, fields: Container[str]) -> str | None:
+    """Return the field with the frame of an input's point: its innermost header's."""
+    around = source.fields["x_m"].split(".")[:-1] if "x_m" in source.fields else []
+    for count in range(len(around), -1, -1):
+        path = ".".join([*around[:count], FRAME_ID])
+        if path in fields and "[" not in path:
+            return path
+    return frame_id_path(fields)
+
+
+def frame_id_path(fields: Container[str]) -> str | None:
+    """Return the field that says in which frame a message is."""
+    return next((path for path in FRAME_IDS if path in fields), None)
+
+
+def transform_fields(fields: Collection[str]) -> tuple[str, ...] | None:
+    """Return the fields of transforms in the order of `FIELDS`; None if there are none."""
+    return next((layout for layout in _LAYOUTS if set(layout) <= set(fields)), None)
+
+
+def plain(frame: str) -> str:
+    """Return a frame's name as ROS 2 writes it, without the leading slash of ROS 1."""
+    return frame.strip("/")

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.tables import CustomSignal, name_problem
 from restock.ingest.steps.cameras import TYPES, ImageProblem, image_bytes, image_fields, layouts

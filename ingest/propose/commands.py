@@ -23,7 +23,7 @@ import numpy as np
 
 from restock.arrays import F64, Ints
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import Gaps

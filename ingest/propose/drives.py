@@ -25,9 +25,10 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.description import read_description
+from restock.ingest.profile.signal_paths import FRAME_IDS, frame_id_path, plain
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.commands import (
@@ -51,7 +52,6 @@ from restock.ingest.propose.robot_choice import DriveEvidence
 from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.propose.trial import Advice, Trial
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.frames import FRAME_IDS, frame_id_path, plain
 
 MAX_DRIVES = 12  # of one kind, that a proposal reads
 MAX_NAMED = 5  # of those that it does not read, in a profile's first lines

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
+from restock.ingest.containers.storage import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.description import (
     BASE_FRAMES,
@@ -34,12 +34,13 @@ from restock.ingest.profile.description import (
     extent,
     read_description,
 )
+from restock.ingest.profile.signal_paths import frame_id_path, plain
 from restock.ingest.profile.tables import Clock, Frames, Input
 from restock.ingest.propose.pose_choice import named_frames, transform_topics
 from restock.ingest.propose.roles import Kind, shared, sort_own_first
 from restock.ingest.steps.align import align
-from restock.ingest.steps.clearance import BEAMS, angle_keys, beam_angles
-from restock.ingest.steps.frames import Edges, PoseSeries, Tree, frame_id_path, plain, upward
+from restock.ingest.steps.frames import Edges, PoseSeries, Tree, upward
+from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
 from restock.ingest.task.signals import yaw_of
 
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms

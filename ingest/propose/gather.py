@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.description import BASE_FRAMES
-from restock.ingest.profile.signal_paths import conventions_of
+from restock.ingest.profile.signal_paths import conventions_of, plain
 from restock.ingest.profile.tables import HINDSIGHT, Input, is_motion
 from restock.ingest.propose.candidates import (
     CameraTopic,
@@ -75,7 +75,7 @@ from restock.ingest.propose.roles import (
     usable_topics,
 )
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.frames import PoseSeries, plain
+from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 

@@ -17,17 +17,11 @@ import numpy as np
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.description import BASE_FRAMES
+from restock.ingest.profile.signal_paths import transform_fields
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.roles import Roles, robots_in
 from restock.ingest.steps.align import align
-from restock.ingest.steps.frames import (
-    Edges,
-    PoseSeries,
-    Tree,
-    poses_along,
-    transform_fields,
-    upward,
-)
+from restock.ingest.steps.frames import Edges, PoseSeries, Tree, poses_along, upward
 from restock.ingest.steps.input_columns import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.task.signals import wrap_angle, yaw_of
 

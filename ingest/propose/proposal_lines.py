@@ -12,7 +12,7 @@ import numpy as np
 
 from restock.errors import ConfigError, visible
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import with_node_topics
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.signal_paths import pressed_in

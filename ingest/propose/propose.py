@@ -15,7 +15,7 @@ from pathlib import Path
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.propose.clock_choice import by_log_time

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
 from restock.ingest.profile.signal_paths import (
     last_part,

@@ -15,6 +15,7 @@ from restock.arrays import Bools, Ints
 from restock.errors import RecordingError, counted
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.signal_paths import plain
 from restock.ingest.profile.tables import (
     COMMAND_SOURCES,
     COMMAND_THROUGH,
@@ -33,7 +34,7 @@ from restock.ingest.steps.align import (
     ticks_of,
 )
 from restock.ingest.steps.cameras import CameraFrames, usable_frames
-from restock.ingest.steps.frames import Edges, Placement, PoseSeries, Tree, plain, poses_along
+from restock.ingest.steps.frames import Edges, Placement, PoseSeries, Tree, poses_along
 from restock.ingest.steps.input_columns import InputColumns
 
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used

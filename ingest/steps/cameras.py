@@ -12,7 +12,7 @@ import hashlib
 import io
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import DTYPES, FieldColumn, Leaf, Ragged, TopicColumns
 from restock.ingest.profile.tables import Camera
 from restock.ingest.task.schema import frame_schema, transition_ids
@@ -364,11 +364,6 @@ class KeptFrames:
             "size_bytes": int(sizes[self.row].sum()),
             "file": file,
         }
-
-
-def kept_frames(cameras: Mapping[str, CameraFrames], ticks: Ints) -> list[KeptFrames]:
-    """Return the frames of each camera that steps in episodes use."""
-    return [KeptFrames.of(name, frames, ticks) for name, frames in cameras.items()]
 
 
 def frame_rows(recording: Recording, kept: KeptFrames) -> Iterator[pa.RecordBatch]:

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
-from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.signal_paths import (
     Convention,

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.ingest.containers.topic_reading import Fields
+from restock.ingest.containers.storage import Fields
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.steps.clearance import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.steps.frames import motion_at
+from restock.ingest.steps.needs import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.hindsight import missions
 from restock.ingest.task.scan import with_unseen
 from restock.ingest.task.schema import Perturbed

@@ -17,7 +17,7 @@ cannot have driven so far, so the localiser found it elsewhere.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,48 +26,13 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.decoding.columns import Ragged, TopicColumns
-from restock.ingest.profile.tables import Frames, Input
+from restock.ingest.profile.signal_paths import AXES, TURN, plain, transform_fields
+from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.align import ClockSegment, LatestMessages
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.task.signals import wrap_angle
 
-AXES = ("translation.x", "translation.y", "translation.z")
-TURN = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
-FIELDS = (
-    "transforms[].header.stamp",
-    "transforms[].header.frame_id",
-    "transforms[].child_frame_id",
-    *(f"transforms[].transform.{part}" for part in (*AXES, *TURN)),
-)
-_FOXGLOVES = ("timestamp", "parent_frame_id", "child_frame_id", *AXES, *TURN)
-_LAYOUTS = (  # the same fields in as many types: ROS's, foxglove.FrameTransforms, FrameTransform
-    FIELDS,
-    tuple(f"transforms[].{path}" for path in _FOXGLOVES),
-    _FOXGLOVES,
-)
 PARENT = "parent"
-FRAME_ID = "header.frame_id"
-FRAME_IDS = (FRAME_ID, "frame_id")  # of ROS's messages, and of Foxglove's
-
-
-def frame_path(source: Input, fields: Container[str]) -> str | None:
-    """Return the field with the frame of an input's point: its innermost header's."""
-    around = source.fields["x_m"].split(".")[:-1] if "x_m" in source.fields else []
-    for count in range(len(around), -1, -1):
-        path = ".".join([*around[:count], FRAME_ID])
-        if path in fields and "[" not in path:
-            return path
-    return frame_id_path(fields)
-
-
-def frame_id_path(fields: Container[str]) -> str | None:
-    """Return the field that says in which frame a message is."""
-    return next((path for path in FRAME_IDS if path in fields), None)
-
-
-def transform_fields(fields: Collection[str]) -> tuple[str, ...] | None:
-    """Return the fields of transforms in the order of `FIELDS`; None if there are none."""
-    return next((layout for layout in _LAYOUTS if set(layout) <= set(fields)), None)
 
 
 @dataclass(frozen=True)
@@ -119,11 +84,6 @@ class Edges:
             f"no transform joins {', '.join(tops[0])} (above {plain(base)}) to"
             f" {', '.join(tops[1])}; there are {have or 'none'}"
         )
-
-
-def plain(frame: str) -> str:
-    """Return a frame's name as ROS 2 writes it, without the leading slash of ROS 1."""
-    return frame.strip("/")
 
 
 def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:

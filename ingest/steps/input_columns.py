@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import (
@@ -35,12 +35,14 @@ from restock.ingest.profile.signal_paths import (
     PathProblem,
     conventions_of,
     element_of,
+    frame_path,
+    plain,
     pressed_in,
     said_in,
 )
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS
-from restock.ingest.steps.frames import Placement, frame_path, plain
+from restock.ingest.steps.frames import Placement
 from restock.ingest.task.signals import yaw_of
 
 EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS84

@@ -31,8 +31,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.arrays import Bools, Ints, splitmix64
+from restock.arrays import Bools, Ints
 from restock.errors import StoreError
+from restock.ingest.task.schema import splitmix64
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
 # Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.

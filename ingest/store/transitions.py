@@ -24,13 +24,14 @@ from restock.ingest.task.conditions import (
     reported,
     too_near_to_call,
 )
-from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import (
     PROVENANCE,
     STEP_BITS,
     signal_columns,
     transition_ids,
     transition_schema,
+    true_names,
+    truth_text,
 )
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import observe, reward

@@ -61,9 +61,8 @@ _BACKWARD = {
 }
 
 
-def select_of(columns: str, source: str = "steps") -> str:
-    """Build the query that computes columns over the table `steps`, or over what is made of it."""
-    return f"SELECT {columns} FROM {source} {WINDOW} ORDER BY row_"
+# Computes columns over the table `steps`, or over what is made of it.
+SELECT = "SELECT {columns} FROM {source} " + WINDOW + " ORDER BY row_"
 
 
 @cache
@@ -85,7 +84,7 @@ def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
         # What closes our bracket and opens another fits into one kind of them only.
-        both = [select_of(f"({sql}\n)"), select_of(f"[{sql}\n]")]
+        both = [SELECT.format(columns=f"{a}{sql}\n{b}", source="steps") for a, b in ("()", "[]")]
         ((text, other),) = connection.execute(query, both).fetchall()
     try:
         return _read(json.loads(text), timing) or (

@@ -45,7 +45,7 @@ are not.
 The difference of timings matters to replay: boosting a `post` stratum resamples the outcome of an
 action and biases what the critic learns, unless it is corrected for. What else a condition may not
 say is in `restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored
-against it: `restock.ingest.task.label_scores`.
+against it.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ import pyarrow as pa
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.files import first_line
-from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, sandbox, select_of
+from restock.ingest.task.condition_sql import SANDBOX, SELECT, WINDOW, refusal, sandbox
 from restock.ingest.task.signals import LIDAR_SIGNALS, PLAN_SIGNALS, Noise
 from restock.ingest.task.task import STAND_IN_LIMITS
 from restock.toml import Checked
@@ -105,17 +105,15 @@ class Condition(Checked, frozen=True):
         Where they are a robot's, times such as `{1.6 s}`, and ways such as `{0.2 m}` at its highest
         speed, become numbers of steps.
         """
-        made = self
-        if "control_period_s" in constants:
-            made = msgspec.structs.replace(
-                self,
-                sql=in_steps(self.sql, constants),
-                probability=in_steps(self.probability, constants),
-                let={name: in_steps(sql, constants) for name, sql in self.let.items()},
-            )
-        words = made.words
+        words, made = self.words, dict[str, Any]()
         used = {name: value for name, value in constants.items() if name in words}
-        return msgspec.structs.replace(made, constants=used | self.constants)
+        if "control_period_s" in constants:
+            made = {
+                "sql": in_steps(self.sql, constants),
+                "probability": in_steps(self.probability, constants),
+                "let": {name: in_steps(sql, constants) for name, sql in self.let.items()},
+            }
+        return msgspec.structs.replace(self, constants=used | self.constants, **made)
 
     @property
     def words(self) -> set[str]:
@@ -439,7 +437,7 @@ def _query(
         f"({getattr(condition, part)}\n) AS column_{place}"
         for place, (condition, part) in enumerate(requested)
     )
-    query = select_of(f"{columns},\nrow_", _source(requested[0][0]))
+    query = SELECT.format(columns=f"{columns},\nrow_", source=_source(requested[0][0]))
     with _interrupted_after(connection, limit_s):
         rows = connection.sql(query).to_arrow_table()
     if not np.array_equal(rows["row_"].to_numpy(), np.arange(count)):

@@ -7,14 +7,16 @@ whole under any filter, sort or engine.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from restock.arrays import Ints
+from restock.ingest.task.conditions import NOMINAL
 from restock.ingest.task.signals import OPTIONAL_SIGNALS, STORED_SIGNALS, Signals
 
 # transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
@@ -25,6 +27,14 @@ def transition_ids(recording_id: str, tick: Ints) -> Ints:
     """Return the ids of a recording's steps (N,) by their places on its control clock."""
     number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
     return (number << STEP_BITS) + tick
+
+
+def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Mix 64-bit numbers, alike on every machine (Steele, Lea and Flood, OOPSLA 2014)."""
+    mixed = (states ^ (states >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
+    return result
 
 
 @dataclass(frozen=True)
@@ -424,3 +434,27 @@ def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
     if not isinstance(name, str) or not all(isfinite(value) for value in numbers.values()):
         return None
     return name, numbers
+
+
+# Where a reader needs one true condition: the first of these, then any other by its name.
+PRIMARY = ("recovery", "near_collision", "wheel_slip", "blocked_aisle")
+
+
+def truth_text(names: Iterable[str]) -> str:
+    """Join a step's true conditions to one text: sorted, commas between; "nominal" for none."""
+    return ",".join(sorted(set(names))) or NOMINAL
+
+
+def true_names(text: str) -> frozenset[str]:
+    """Return the true conditions that a text names: none for "nominal"."""
+    named = frozenset(part.strip() for part in text.split(","))
+    return named - {NOMINAL, ""}
+
+
+def primary_of(text: str) -> str:
+    """Return the one condition of a text that names all, for readers that need one."""
+    named = true_names(text)
+    for name in (*PRIMARY, *sorted(named)):
+        if name in named:
+            return name
+    return NOMINAL

@@ -13,8 +13,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.arrays import Bools, Ints, splitmix64
+from restock.arrays import Bools, Ints
 from restock.errors import MixtureError, counted
+from restock.ingest.task.schema import splitmix64
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.plan.candidates import Places, bools, codes
 from restock.replay.plan.strata import NO_STRATUM

@@ -18,8 +18,7 @@ from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
-from restock.ingest.steps.clearance import angle_keys, beam_angles
-from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.needs import angle_keys, beam_angles, read_topics
 from restock.ingest.task.scan import Body, outline_reach
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store

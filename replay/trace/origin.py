@@ -19,10 +19,11 @@ from restock.files import first_line
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
+from restock.ingest.profile.signal_paths import AXES, TURN
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.custom_columns import column_of, latest_samples
-from restock.ingest.steps.frames import AXES, PARENT, TURN
+from restock.ingest.steps.frames import PARENT
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.store.location import FRAMES
 from restock.ingest.task.schema import STEP_BITS

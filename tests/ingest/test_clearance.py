@@ -12,8 +12,8 @@ from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Input
-from restock.ingest.steps import clearance
-from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
+from restock.ingest.steps import needs
+from restock.ingest.steps.needs import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.scan import SectorMap
 
 TASK = load_profile("warehouse_amr").task
@@ -54,7 +54,7 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(
 ) -> None:
     fields = scans([beams for beams, _ in kinds], [first for _, first in kinds], seed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(clearance, "_VALUES", values)
+        patch.setattr(needs, "_VALUES", values)
         whole = REDUCE.apply(fields)
         rows = np.arange(len(kinds))
         parts = [

@@ -25,12 +25,7 @@ from restock.ingest.relabel import (
     relabel_store,
     remove_corrections,
 )
-from restock.ingest.store.manifest import (
-    Correction,
-    Moments,
-    corrected_version,
-    merged,
-)
+from restock.ingest.store.manifest import Correction, Moments, corrected_version, merged
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import Condition
 from restock.replay.store.store import Store

@@ -16,8 +16,8 @@ from restock.ingest.profile.profile import (
     profile_toml,
     read_profile_toml,
 )
+from restock.ingest.store.manifest import label_scores
 from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
-from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.replay.store.store import Store
 

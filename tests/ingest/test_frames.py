@@ -16,10 +16,11 @@ from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.signal_paths import FIELDS
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.steps.align import NS, align
 from restock.ingest.steps.episodes import steps_of
-from restock.ingest.steps.frames import FIELDS, Edges, Tree, rotations
+from restock.ingest.steps.frames import Edges, Tree, rotations
 
 SAMPLE = ROOT / "sample_logs" / "amr_monday.mcap"
 

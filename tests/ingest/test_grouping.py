@@ -18,7 +18,7 @@ from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 
 from restock.ingest.containers import mcap_file, sqlite_file
-from restock.ingest.containers import topic_reading as reading
+from restock.ingest.containers import storage as reading
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding import columns as columns_module
 from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of

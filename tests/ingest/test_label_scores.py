@@ -10,15 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from restock.ingest.task.label_scores import (
-    LabelScore,
-    label_scores,
-    pooled,
-    primary_of,
-    score,
-    true_names,
-    truth_text,
-)
+from restock.ingest.store.manifest import LabelScore, label_scores, pooled, score
+from restock.ingest.task.schema import primary_of, true_names, truth_text
 
 
 def test_the_true_conditions_of_a_step_are_one_text():

@@ -19,7 +19,7 @@ from restock.cli import main
 from restock.errors import LabelError
 from restock.ingest.relabel import correct_store
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.label_scores import true_names
+from restock.ingest.task.schema import true_names
 from restock.replay.review import (
     DoubtfulEvent,
     doubtful_events,

@@ -31,7 +31,7 @@ import pyarrow as pa
 
 from restock.errors import RunError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.store.manifest import definitions, manifest_row, software_version
+from restock.ingest.store.manifest import definitions, label_scores, manifest_row, software_version
 from restock.ingest.store.transitions import (
     EpisodeRows,
     Provenance,
@@ -41,7 +41,6 @@ from restock.ingest.store.transitions import (
 )
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import label, probabilities, reported, runnable
-from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import SIGNAL_COLUMNS, Perturbed, recording_schema
 from restock.train.run.run import now_ns
 

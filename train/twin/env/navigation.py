@@ -24,7 +24,7 @@ Exposures are what was so at t, whatever came of it:
 - slippery_floor: a wheel stood on a slippery patch.
 
 Several may hold at once: the text of a step names all of them, sorted, with commas between, and is
-"nominal" where none holds. `restock.ingest.task.label_scores.primary_of` makes it one.
+"nominal" where none holds. `restock.ingest.store.manifest.primary_of` makes it one.
 
 `info` says more of a step than observation and reward. It holds arrays (N,) about the step just
 taken, whole even if an episode ended:
@@ -59,8 +59,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.ingest.task.label_scores import truth_text
 from restock.ingest.task.scan import Body
+from restock.ingest.task.schema import truth_text
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.surroundings import view_route
 from restock.ingest.task.task import Task, reached_goal

@@ -21,7 +21,7 @@ import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.profile.tag_rules import tag_problem
-from restock.ingest.task.label_scores import primary_of
+from restock.ingest.task.schema import primary_of
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
 from restock.toml import typed
 from restock.train.twin.env.episode_queue import MissionOrders

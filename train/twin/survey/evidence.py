@@ -22,7 +22,7 @@ from restock.arrays import F64, Bools
 from restock.errors import RecordingError, RestockError, StoreError, counted
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.footprint import Footprint, footprint_of

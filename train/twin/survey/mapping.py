@@ -29,14 +29,14 @@ from scipy.spatial import cKDTree
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
+from restock.ingest.containers.storage import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint, SeenScans, scans_of
 from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
-from restock.ingest.steps.clearance import angle_keys
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.needs import angle_keys
 from restock.train.twin.floors.occupancy_grid import (
     FREE,
     OCCUPIED,

@@ -16,6 +16,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.signal_paths import AXES, FRAME_ID, TURN, plain, transform_fields
 from restock.ingest.profile.tables import Frames
 from restock.ingest.propose.pose_choice import transform_edges, transform_frames
 from restock.ingest.propose.roles import (
@@ -24,16 +25,7 @@ from restock.ingest.propose.roles import (
     usable_topics,
 )
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.frames import (
-    AXES,
-    FRAME_ID,
-    PARENT,
-    TURN,
-    Edges,
-    plain,
-    rotations,
-    transform_fields,
-)
+from restock.ingest.steps.frames import PARENT, Edges, rotations
 from restock.ingest.steps.input_columns import fixes_of
 from restock.ingest.task.signals import yaw_of
 

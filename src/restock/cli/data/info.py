@@ -151,7 +151,7 @@ def describe_recording(
         RecordingError: it cannot be opened; see `open_recording`.
     """
     from restock.ingest.containers.open_recording import open_recording
-    from restock.ingest.containers.topic_reading import LATEST_NS
+    from restock.ingest.containers.storage import LATEST_NS
 
     with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
         span = recording.span_ns

@@ -157,7 +157,7 @@ _LEFT_OUT = (
 
 def as_json(outcome: IngestResult) -> dict[str, Any]:
     """Return an outcome as `--json` prints it."""
-    from restock.ingest.task.label_scores import GOOD
+    from restock.ingest.store.manifest import GOOD
 
     # Of events, too; a recording that was ingested before there were such counts has none.
     counts = {row["condition"]: row for row in outcome.manifest.get("label_counts") or []}
