@@ -1,10 +1,19 @@
 -- What two stores have of each recording, episode and row: `a` and `b` are the schemas of their views.
+CREATE TEMP VIEW both_rows AS
+SELECT 'a' AS side, transition_id, recording_id, episode_id, episode_index, step_index, stamp_ns, action,
+    reward, terminated, truncated, observation::FLOAT[] AS observation,
+    next_observation::FLOAT[] AS next_observation, primary_condition AS condition, conditions
+FROM a.transitions
+UNION ALL
+SELECT 'b', transition_id, recording_id, episode_id, episode_index, step_index, stamp_ns, action,
+    reward, terminated, truncated, observation::FLOAT[], next_observation::FLOAT[], primary_condition,
+    conditions
+FROM b.transitions;
+
 -- An ingest is written once and never changed, so rows of the same ingest are the same, unread.
 CREATE TEMP TABLE recording_pairs AS
 SELECT
     recording_id,
-    one.ingest_id AS ingest_a,
-    other.ingest_id AS ingest_b,
     coalesce(other.source_file, one.source_file) AS source_file,
     CASE
         WHEN one.ingest_id IS NULL THEN 'in'
@@ -17,47 +26,30 @@ FULL JOIN b.recordings AS other USING (recording_id);
 
 -- Only what was written again is read whole; a match of all columns is a match of the episode.
 CREATE TEMP TABLE episode_pairs AS
-WITH of_a AS (
+WITH episodes AS (
     SELECT
+        side,
         recording_id,
         episode_id,
         episode_index,
         min(stamp_ns) AS start_ns,
         (max(stamp_ns) - min(stamp_ns)) / 1e9 AS duration_s,
         count(*) AS rows
-    FROM a.transitions
+    FROM both_rows
     GROUP BY ALL
-), of_b AS (
-    SELECT
-        recording_id,
-        episode_id,
-        episode_index,
-        min(stamp_ns) AS start_ns,
-        (max(stamp_ns) - min(stamp_ns)) / 1e9 AS duration_s,
-        count(*) AS rows
-    FROM b.transitions
+), contents AS (
+    SELECT side, episode_id, bit_xor(hash(step_index, stamp_ns, action, reward, terminated, truncated,
+        observation, next_observation)) AS content
+    FROM both_rows
+    WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
     GROUP BY ALL
-), content_a AS (
-    SELECT episode_id, bit_xor(hash(step_index, stamp_ns, action, reward, terminated, truncated,
-        observation::FLOAT[], next_observation::FLOAT[])) AS content
-    FROM a.transitions
-    WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
-    GROUP BY episode_id
-), content_b AS (
-    SELECT episode_id, bit_xor(hash(step_index, stamp_ns, action, reward, terminated, truncated,
-        observation::FLOAT[], next_observation::FLOAT[])) AS content
-    FROM b.transitions
-    WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
-    GROUP BY episode_id
-), numbered_a AS (
+), numbered AS (
     -- A clock that was set back can begin two episodes at one stamp.
-    SELECT *, row_number() OVER (PARTITION BY recording_id, start_ns ORDER BY episode_index) AS place
-    FROM of_a
-    LEFT JOIN content_a USING (episode_id)
-), numbered_b AS (
-    SELECT *, row_number() OVER (PARTITION BY recording_id, start_ns ORDER BY episode_index) AS place
-    FROM of_b
-    LEFT JOIN content_b USING (episode_id)
+    SELECT *, row_number() OVER (
+        PARTITION BY side, recording_id, start_ns ORDER BY episode_index
+    ) AS place
+    FROM episodes
+    LEFT JOIN contents USING (side, episode_id)
 )
 SELECT
     row_number() OVER (ORDER BY recording_id, start_ns, place) - 1 AS number,
@@ -74,51 +66,103 @@ SELECT
         WHEN one.content IS DISTINCT FROM other.content OR one.rows <> other.rows THEN 'changed'
         ELSE 'same'
     END AS change
-FROM numbered_a AS one
-FULL JOIN numbered_b AS other USING (recording_id, start_ns, place);
+FROM (FROM numbered WHERE side = 'a') AS one
+FULL JOIN (FROM numbered WHERE side = 'b') AS other USING (recording_id, start_ns, place);
 
 -- Rows of both, where one was written again: by id, else by recording and stamp.
 CREATE TEMP TABLE row_pairs AS
-WITH of_a AS (
-    SELECT transition_id, recording_id, stamp_ns, episode_id, primary_condition AS condition, conditions
-    FROM a.transitions
-    WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
-), of_b AS (
-    SELECT transition_id, recording_id, stamp_ns, episode_id, primary_condition AS condition, conditions
-    FROM b.transitions
+WITH again AS (
+    SELECT side, transition_id, recording_id, stamp_ns, episode_id, condition, conditions
+    FROM both_rows
     WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
 ), by_id AS (
     SELECT
-        of_a.transition_id AS row_a,
-        of_b.transition_id AS row_b,
-        of_b.recording_id AS recording_id,
-        of_b.episode_id AS episode_id,
-        of_a.condition AS condition_a,
-        of_b.condition AS condition_b,
-        of_a.conditions AS conditions_a,
-        of_b.conditions AS conditions_b
-    FROM of_a
-    JOIN of_b USING (transition_id)
-    WHERE abs(of_a.stamp_ns - of_b.stamp_ns) < 500_000_000 -- else the steps are others: a new clock
-), left_a AS (
-    SELECT recording_id, stamp_ns, any_value(transition_id) AS transition_id,
+        transition_id,
+        other.recording_id AS recording_id,
+        other.episode_id AS episode_id,
+        one.condition AS condition_a,
+        other.condition AS condition_b,
+        one.conditions AS conditions_a,
+        other.conditions AS conditions_b
+    FROM (FROM again WHERE side = 'a') AS one
+    JOIN (FROM again WHERE side = 'b') AS other USING (transition_id)
+    WHERE abs(one.stamp_ns - other.stamp_ns) < 500_000_000 -- else the steps are others: a new clock
+), others AS (
+    SELECT side, recording_id, stamp_ns, any_value(episode_id) AS episode_id,
         any_value(condition) AS condition, any_value(conditions) AS conditions
-    FROM of_a
-    WHERE transition_id NOT IN (SELECT row_a FROM by_id)
-    GROUP BY recording_id, stamp_ns
-    HAVING count(*) = 1
-), left_b AS (
-    SELECT recording_id, stamp_ns, any_value(transition_id) AS transition_id,
-        any_value(episode_id) AS episode_id,
-        any_value(condition) AS condition, any_value(conditions) AS conditions
-    FROM of_b
-    WHERE transition_id NOT IN (SELECT row_b FROM by_id)
-    GROUP BY recording_id, stamp_ns
+    FROM again
+    WHERE transition_id NOT IN (SELECT transition_id FROM by_id)
+    GROUP BY side, recording_id, stamp_ns
     HAVING count(*) = 1
 )
-FROM by_id
+SELECT * EXCLUDE (transition_id) FROM by_id
 UNION ALL
-SELECT left_a.transition_id, left_b.transition_id, recording_id, left_b.episode_id,
-    left_a.condition, left_b.condition, left_a.conditions, left_b.conditions
-FROM left_a
-JOIN left_b USING (recording_id, stamp_ns);
+SELECT recording_id, other.episode_id, one.condition, other.condition, one.conditions, other.conditions
+FROM (FROM others WHERE side = 'a') AS one
+JOIN (FROM others WHERE side = 'b') AS other USING (recording_id, stamp_ns);
+
+-- Those that differ: the same rows under another ingest are no difference.
+CREATE TEMP VIEW recording_changes AS
+SELECT * FROM (
+    SELECT
+        any_value(pair.change) AS change,
+        recording_id,
+        any_value(source_file) AS source_file,
+        count(*) FILTER (rows_a > 0) AS episodes_a,
+        count(*) FILTER (rows_b > 0) AS episodes_b,
+        coalesce(sum(rows_a), 0)::BIGINT AS rows_a,
+        coalesce(sum(rows_b), 0)::BIGINT AS rows_b,
+        count(*) FILTER (episode.change <> 'same') AS episodes_changed
+    FROM recording_pairs AS pair
+    LEFT JOIN episode_pairs AS episode USING (recording_id)
+    WHERE pair.change <> 'same'
+    GROUP BY recording_id
+)
+LEFT JOIN (
+    SELECT recording_id, count(*) AS rows_relabelled
+    FROM row_pairs
+    WHERE condition_a IS DISTINCT FROM condition_b
+        OR list_sort(conditions_a) IS DISTINCT FROM list_sort(conditions_b)
+    GROUP BY recording_id
+) USING (recording_id)
+WHERE change <> 'written again' OR episodes_changed > 0 OR rows_relabelled > 0
+ORDER BY change, source_file, recording_id;
+
+CREATE TEMP VIEW episode_changes AS
+SELECT change, recording_id, episode_a, episode_b, rows_a, rows_b
+FROM episode_pairs
+WHERE change <> 'same'
+ORDER BY change, recording_id, number;
+
+CREATE TEMP VIEW label_changes AS
+SELECT condition_a AS "from", condition_b AS "to", count(*) AS rows,
+    count(DISTINCT episode_id) AS episodes
+FROM row_pairs
+WHERE condition_a IS DISTINCT FROM condition_b
+GROUP BY ALL
+ORDER BY rows DESC, condition_a, condition_b;
+
+-- Conditions whose definition differs, and labels, profiles and software of the rows.
+CREATE TEMP VIEW definition_changes AS
+SELECT
+    'condition ' || condition AS what,
+    one.timing || ', priority ' || one.priority || ': ' || one.sql AS a,
+    other.timing || ', priority ' || other.priority || ': ' || other.sql AS b
+FROM a.conditions AS one
+FULL JOIN b.conditions AS other USING (condition)
+WHERE a IS DISTINCT FROM b
+UNION ALL
+SELECT
+    what,
+    string_agg(DISTINCT value, ', ' ORDER BY value) FILTER (side = 'a') AS a,
+    string_agg(DISTINCT value, ', ' ORDER BY value) FILTER (side = 'b') AS b
+FROM (
+    UNPIVOT (
+        SELECT 'a' AS side, labels_version, profile_hash, restock_version FROM a.versions
+        UNION ALL
+        SELECT 'b', labels_version, profile_hash, restock_version FROM b.versions
+    ) ON labels_version, profile_hash, restock_version INTO NAME what VALUE value
+)
+GROUP BY what
+HAVING a IS DISTINCT FROM b
+ORDER BY what;

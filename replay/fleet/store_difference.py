@@ -145,34 +145,6 @@ SHARES_OF = ("primary_condition", "zone", "behaviour_policy", "robot", "site", "
 _NOT_COMPARED = ("stamp_ns", "pose_stamp_ns", "pose_x_m", "pose_y_m", "pose_yaw_rad")
 Rows = list[dict[str, Any]]
 
-# Those that differ: the same rows under another ingest are no difference.
-_RECORDINGS = """
-SELECT * FROM (
-    SELECT
-        any_value(pair.change) AS change,
-        recording_id,
-        any_value(source_file) AS source_file,
-        count(*) FILTER (rows_a > 0) AS episodes_a,
-        count(*) FILTER (rows_b > 0) AS episodes_b,
-        coalesce(sum(rows_a), 0)::BIGINT AS rows_a,
-        coalesce(sum(rows_b), 0)::BIGINT AS rows_b,
-        count(*) FILTER (episode.change <> 'same') AS episodes_changed
-    FROM recording_pairs AS pair
-    LEFT JOIN episode_pairs AS episode USING (recording_id)
-    WHERE pair.change <> 'same'
-    GROUP BY recording_id
-)
-LEFT JOIN (
-    SELECT recording_id, count(*) AS rows_relabelled
-    FROM row_pairs
-    WHERE condition_a IS DISTINCT FROM condition_b
-        OR list_sort(conditions_a) IS DISTINCT FROM list_sort(conditions_b)
-    GROUP BY recording_id
-) USING (recording_id)
-WHERE change <> 'written again' OR episodes_changed > 0 OR rows_relabelled > 0
-ORDER BY change, source_file, recording_id
-"""
-
 
 @dataclass(frozen=True)
 class StoreDifference:
@@ -269,20 +241,8 @@ def _same_task(first: Store, second: Store) -> None:
 def _difference(
     connection: duckdb.DuckDBPyConnection, first: Store, second: Store, rng: np.random.Generator
 ) -> StoreDifference:
-    episodes = _rows(
-        connection,
-        "SELECT change, recording_id, episode_a, episode_b, rows_a, rows_b FROM episode_pairs"
-        " WHERE change <> 'same' ORDER BY change, recording_id, number",
-    )
+    episodes = _rows(connection, "FROM episode_changes")
     total = connection.sql("SELECT count(*) FROM episode_pairs").fetchall()[0][0]
-    recordings = _rows(connection, _RECORDINGS)
-    labels = _rows(
-        connection,
-        'SELECT condition_a AS "from", condition_b AS "to", count(*) AS rows,'
-        " count(DISTINCT episode_id) AS episodes FROM row_pairs"
-        " WHERE condition_a IS DISTINCT FROM condition_b GROUP BY ALL"
-        " ORDER BY rows DESC, condition_a, condition_b",
-    )
     pairs, others = connection.sql(
         "SELECT count(*), count(*) FILTER (condition_a IS NOT DISTINCT FROM condition_b AND"
         " list_sort(conditions_a) IS DISTINCT FROM list_sort(conditions_b)) FROM row_pairs"
@@ -293,12 +253,12 @@ def _difference(
             "a": _side(connection, first, "a"),
             "b": _side(connection, second, "b"),
         },
-        definitions=_definitions(connection),
-        recordings=recordings,
+        definitions=_rows(connection, "FROM definition_changes"),
+        recordings=_rows(connection, "FROM recording_changes"),
         episodes=episodes,
         same_episodes=int(total) - len(episodes),
         rows_paired=int(pairs),
-        labels=labels,
+        labels=_rows(connection, "FROM label_changes"),
         other_labels=int(others),
         shares=_shares(connection, rng),
         signals_of=compared,
@@ -316,27 +276,6 @@ def _side(connection: duckdb.DuckDBPyConnection, store: Store, name: str) -> dic
     )[0]
     tasks = sorted(store.task_hashes())
     return {"path": str(store.path), "version": store.version, "tasks": tasks, **counted}
-
-
-def _definitions(connection: duckdb.DuckDBPyConnection) -> Rows:
-    """Compare the rows' condition definitions, labels, profiles and software."""
-    found = _rows(
-        connection,
-        "SELECT 'condition ' || condition AS what,"
-        " one.timing || ', priority ' || one.priority || ': ' || one.sql AS a,"
-        " other.timing || ', priority ' || other.priority || ': ' || other.sql AS b"
-        " FROM a.conditions AS one FULL JOIN b.conditions AS other USING (condition) ORDER BY what",
-    )
-    for column in ("labels_version", "profile_hash", "restock_version"):
-        texts = [
-            connection.sql(
-                f"SELECT string_agg(one, ', ') FROM (SELECT DISTINCT {column} AS one"
-                f" FROM {schema}.versions ORDER BY one)"
-            ).fetchall()[0][0]
-            for schema in "ab"
-        ]
-        found.append({"what": column, "a": texts[0], "b": texts[1]})
-    return [row for row in found if row["a"] != row["b"]]
 
 
 def _shares(connection: duckdb.DuckDBPyConnection, rng: np.random.Generator) -> Rows:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
+from deltalake import write_deltalake
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
@@ -17,7 +17,8 @@ from support.stores import TASK, manifest, one, recording_transitions, write_sto
 
 from restock.cli import main
 from restock.errors import ArgumentError, StoreError
-from restock.ingest.store.version import parse_version, split_version
+from restock.ingest.store.transitions import replaced
+from restock.ingest.store.version import FORMAT, parse_version, split_version
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.fleet.store_difference import (
     diff_stores,
@@ -34,10 +35,10 @@ def relabelled(rows: pa.Table, steps: int) -> pa.Table:
     """Return the same rows of another ingest, the first of them slipping."""
     condition = rows["condition"].to_pylist()
     condition[:steps] = ["wheel_slip"] * steps
-    return rows.set_column(rows.schema.get_field_index("condition"), "condition", [condition])
+    return replaced(rows, {"condition": condition})
 
 
-def test_what_came_went_and_was_labelled_anew(tmp_path: Path) -> None:
+def test_what_came_went_and_was_labelled_anew(tmp_path):
     rows = [recording_transitions(number) for number in range(6)]
     first = write_store(tmp_path / "a", rows[:4])
     again = relabelled(recording_transitions(2, ingest="b"), 20)
@@ -67,7 +68,7 @@ def test_what_came_went_and_was_labelled_anew(tmp_path: Path) -> None:
     assert nominal["difference_low"] <= nominal["difference"] <= nominal["difference_high"]
 
 
-def test_rows_ingested_again_as_they_were_are_no_difference(tmp_path: Path) -> None:
+def test_rows_ingested_again_as_they_were_are_no_difference(tmp_path):
     first = write_store(tmp_path / "a", [recording_transitions(1)])
     second = write_store(tmp_path / "b", [recording_transitions(1, ingest="b")])
     with Store(first) as a, Store(second) as b:
@@ -77,12 +78,11 @@ def test_rows_ingested_again_as_they_were_are_no_difference(tmp_path: Path) -> N
     assert all(line["difference"] == 0 == line["difference_high"] for line in found.shares)
 
 
-def test_rows_that_changed_make_their_episode_another(tmp_path: Path) -> None:
+def test_rows_that_changed_make_their_episode_another(tmp_path):
     rows, again = recording_transitions(1), recording_transitions(1, ingest="b")
     reward = again["reward"].to_numpy().copy()
     reward[3] += 1
-    place = again.schema.get_field_index("reward")
-    again = again.set_column(place, again.schema.field(place), pa.array(reward))
+    again = replaced(again, {"reward": reward})
     first, second = (write_store(tmp_path / n, [t]) for n, t in (("a", rows), ("b", again)))
     with Store(first) as a, Store(second) as b:
         found = diff_stores(a, b).document()
@@ -90,9 +90,7 @@ def test_rows_that_changed_make_their_episode_another(tmp_path: Path) -> None:
     assert found["recordings"][0]["episodes_changed"] == 1
 
 
-def test_two_versions_of_a_store_by_number_and_by_time(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, capsys):
     writer = StoreWriter(tmp_path / "store")
     for number in (1, 2):
         newest = writer.write(*one(number))
@@ -128,9 +126,7 @@ def test_two_versions_of_a_store_by_number_and_by_time(
         Store(tmp_path / "store", version="newest")  # type: ignore[arg-type]
 
 
-def test_stores_of_two_tasks_are_refused_with_both_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_stores_of_two_tasks_are_refused_with_both_names(tmp_path, capsys):
     other = msgspec.structs.replace(TASK, actions=TASK.actions[:3])
     first = write_store(tmp_path / "a", [recording_transitions(1)])
     second = write_store(tmp_path / "b", [recording_transitions(1, task=other)], task=other)
@@ -141,11 +137,10 @@ def test_stores_of_two_tasks_are_refused_with_both_names(
     assert "--profile" in message
 
 
-def test_a_signal_that_moved_is_named(tmp_path: Path) -> None:
+def test_a_signal_that_moved_is_named(tmp_path):
     rows = [recording_transitions(number) for number in range(4)]
-    place = rows[3].schema.get_field_index("wheel_speed_mps")
-    faster = pa.array(rows[3]["wheel_speed_mps"].to_numpy() + 3)
-    rows[3] = rows[3].set_column(place, rows[3].schema.field(place), faster)
+    faster = rows[3]["wheel_speed_mps"].to_numpy() + 3
+    rows[3] = replaced(rows[3], {"wheel_speed_mps": faster})
     store = write_store(tmp_path / "store", rows)
     with Store(store, version=2) as a, Store(store) as b:
         found = diff_stores(a, b).document()["signals"]
@@ -159,7 +154,7 @@ def test_a_signal_that_moved_is_named(tmp_path: Path) -> None:
     assert shifted(bounds) == bounds[:2]
 
 
-def test_a_version_is_split_from_a_place_unless_a_folder_is_called_so(tmp_path: Path) -> None:
+def test_a_version_is_split_unless_a_folder_is_called_so(tmp_path):
     assert split_version("store@12") == ("store", 12)
     assert split_version("s3://bucket/store@2026-11-01T08:00Z")[0] == "s3://bucket/store"
     assert split_version("me@home/store") == ("me@home/store", None)
@@ -168,7 +163,7 @@ def test_a_version_is_split_from_a_place_unless_a_folder_is_called_so(tmp_path: 
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40))
-def test_a_sample_beside_itself_differs_in_nothing(seed: int, episodes: int) -> None:
+def test_a_sample_beside_itself_differs_in_nothing(seed, episodes):
     rng = np.random.default_rng(seed)
     rows = csr_array(rng.integers(1, 9, (episodes, 3)).astype(float))
     for one_ in share_differences(rows, rows, [slice(0, 3)], rng=rng, resamples=20):
@@ -177,7 +172,7 @@ def test_a_sample_beside_itself_differs_in_nothing(seed: int, episodes: int) -> 
     assert standardised_difference(values, values).value == 0
 
 
-def test_intervals_of_share_differences_hold_the_truth_as_often_as_they_say() -> None:
+def test_intervals_of_share_differences_hold_the_truth():
     rng, held = np.random.default_rng(1), 0
     for _ in range(200):
         # Episodes of 20 rows with a common rate each: rows are not independent.
@@ -194,7 +189,7 @@ def test_intervals_of_share_differences_hold_the_truth_as_often_as_they_say() ->
     assert 0.90 <= held / 200 <= 0.99
 
 
-def test_an_interval_comes_from_resamples_in_which_both_samples_have_rows() -> None:
+def test_intervals_are_of_resamples_with_rows_on_both_sides():
     """Of two episodes, a Poisson resample has neither in one of seven."""
     rng = np.random.default_rng(0)
     first = csr_array(np.array([[9.0, 0], [6, 0], [0, 0], [0, 0]]))
@@ -203,7 +198,7 @@ def test_an_interval_comes_from_resamples_in_which_both_samples_have_rows() -> N
         assert (found.low, found.value, found.high) == (0, 0, 0)
 
 
-def test_a_sample_of_one_episode_has_no_interval_and_one_of_none_no_difference() -> None:
+def test_one_episode_has_no_interval_and_none_no_difference():
     rng = np.random.default_rng(0)
     two = csr_array(np.array([[4.0, 0], [1, 3]]))
     (found, _) = share_differences(
@@ -215,7 +210,7 @@ def test_a_sample_of_one_episode_has_no_interval_and_one_of_none_no_difference()
     assert np.isnan([found.value, found.low, found.high]).all()
 
 
-def test_adjusted_p_values_are_those_of_scipy_and_unknown_ones_stay() -> None:
+def test_adjusted_p_values_are_scipys_and_unknown_ones_stay():
     from scipy.stats import false_discovery_control
 
     given_ = [0.001, 0.2, 0.03, 0.04, 0.9]
@@ -224,19 +219,15 @@ def test_adjusted_p_values_are_those_of_scipy_and_unknown_ones_stay() -> None:
     assert np.isnan(adjusted[5])
 
 
-def test_too_few_episodes_give_no_interval() -> None:
+def test_too_few_episodes_give_no_interval():
     found = shift(np.arange(3.0), np.arange(40.0))
     assert np.isnan(found.p_value)
     assert found.mean == (1.0, 19.5)
 
 
-def test_the_manifest_of_an_empty_store_is_no_task(tmp_path: Path) -> None:
+def test_the_manifest_of_an_empty_store_is_no_task(tmp_path):
     rows = recording_transitions(1)
     empty = write_store(tmp_path / "a", [])
-    from deltalake import write_deltalake
-
-    from restock.ingest.store.version import FORMAT
-
     write_deltalake(str(empty / "recordings"), manifest(rows).slice(0, 0), description=FORMAT)
     write_deltalake(str(empty / "transitions"), rows.slice(0, 0), description=FORMAT)
     full = write_store(tmp_path / "b", [rows])
