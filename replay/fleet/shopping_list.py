@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
-from restock.errors import ConfigError
+from restock.errors import ConfigError, figure, plural
 from restock.replay.fleet.gaps import Gap, Unit, Yields, find_gaps
 from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.plan.source_plan import (
@@ -340,6 +340,74 @@ def _gap(one: FilledGap) -> dict[str, Any]:
         supply, missions = one.see_one
         line |= {"never_seen_in": supply.name, "at_least": missions}
     return line
+
+
+Lines = list[dict[str, Any]]
+
+
+def readable(answer: dict[str, Any]) -> tuple[Lines, Lines, Lines]:
+    """Return a `document` as lines of tables: gaps with a rate, those without, and the plan."""
+    unit = answer["unit"]
+    known = [
+        {
+            "gap": gap["cell"],
+            "asked by": gap["asked_by"],
+            "of": gap["counted"],
+            **{name: gap[name] for name in ("needed", "there", "missing", "best")},
+            f"per {'mission' if unit == 'missions' else 'hour'}": _with_ends(gap, "rate"),
+            unit: _with_ends(gap, "amount"),
+            "thinnest in": ", ".join(gap["thinnest_zones"][:2]),
+            "the plan closes it": "" if gap["closes_with"] is None else f"{gap['closes_with']:.0%}",
+        }
+        for gap in answer["gaps"]
+        if gap["best"]
+    ]
+    # In one line the actions that nobody ever took in a condition.
+    groups: dict[tuple[Any, ...], Lines] = {}
+    for gap in answer["gaps"]:
+        if not gap["best"]:
+            key = (gap["stratum"] or gap["condition"], gap["zone"], gap["robot"], gap["asked_by"])
+            groups.setdefault(key, []).append(gap)
+    unknown = []
+    for (*cell, asked_by), members in groups.items():
+        actions = [
+            gap["action_name"] or f"action {gap['action']}"
+            for gap in members
+            if gap["action"] is not None
+        ]
+        least = min(members, key=lambda gap: gap["at_least"])
+        episodes = f"{least['at_least']:,} more {plural(least['at_least'], 'episode')}"
+        unknown.append(
+            {
+                "gap": ", ".join(str(part) for part in cell if part),
+                "actions": ", ".join(actions),
+                "asked by": asked_by,
+                "of": least["counted"],
+                "needed": least["needed"],
+                "to see one, with 95 %": f"at least {episodes} of {least['never_seen_in']}",
+            }
+        )
+    orders = [
+        {
+            "kind": order["kind"] or "logging",
+            **{name: order[name] or "" for name in ("zone", "robot", "missions")},
+            "hours": round(order["hours"], 2),
+            "fills": "; ".join(dict.fromkeys(order["fills"])),
+        }
+        for order in answer["plan"]["orders"]
+    ]
+    return _without_empty(known), _without_empty(unknown), _without_empty(orders)
+
+
+def _with_ends(gap: dict[str, Any], name: str) -> str:
+    value, low, high = (figure(gap[key]) for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{value} ({low} to {high})"
+
+
+def _without_empty(lines: Lines) -> Lines:
+    """Leave out the columns that say nothing in any line."""
+    kept = {name for line in lines for name, value in line.items() if value != ""}
+    return [{name: value for name, value in line.items() if name in kept} for line in lines]
 
 
 def install_gaps(store: Store) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ExitCode, figure, plural, visible
+from restock.errors import ExitCode, figure, visible
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
@@ -135,7 +135,6 @@ _MEANING = {
     "missions": "missions: of the kind that is best, until one gap is closed: median (95 %)."
     " `restock mix` counts hours of driving as logged, nothing chosen: --unit hours",
 }
-SHOWN = 15  # lines of a table on a terminal; --json has all
 
 
 @dataclass
@@ -231,26 +230,22 @@ class GapsCommand:
 
 def _print_gaps(answer: dict[str, Any]) -> None:
     from restock.cli import output
+    from restock.replay.fleet.shopping_list import readable
 
     unit = answer["unit"]
     name = f"{answer['store']} version {answer['store_version']}"
     if answer["closed"]:
         output.stdout().print(f"{name}: no gaps; it has all that {answer['mixture']} asks for")
         return
-    known = [gap for gap in answer["gaps"] if gap["best"]]
-    unknown = [gap for gap in answer["gaps"] if not gap["best"]]
+    known, unknown, orders = readable(answer)
     if known:
-        _table(
-            f"{name}: what is missing, at the rates of its {answer['episodes']:,} episodes",
-            [_gap_line(gap, unit) for gap in known],
-            note=_MEANING[unit],
-        )
+        title = f"{name}: what is missing, at the rates of its {answer['episodes']:,} episodes"
+        _table(title, known, note=_MEANING[unit])
     if unknown:
-        _table("never seen: no rate is known", _unknown(unknown, unit))
+        _table("never seen: no rate is known", unknown)
     plan = answer["plan"]
-    if plan["orders"]:
-        with_ = {n: any(order[n] for order in plan["orders"]) for n in ("zone", "robot")}
-        _table("what to log next", [_order(order, unit, with_) for order in plan["orders"]])
+    if orders:
+        _table("what to log next", orders)
         output.stdout().print(
             f"{figure(plan['total'])} {unit} in all (95 %: {figure(plan['total_low'])} to"
             f" {figure(plan['total_high'])})"
@@ -264,75 +259,11 @@ def _print_gaps(answer: dict[str, Any]) -> None:
 
 def _table(title: str, rows: list[dict[str, Any]], note: str = "") -> None:
     from restock.cli import output
+    from restock.cli.fleet.diff import section
 
-    shown = rows[:SHOWN] if sys.stdout.isatty() else rows
-    output.print_table(shown, title=title)
-    if len(shown) < len(rows):
-        output.stdout().print(f"… {len(rows) - len(shown):,} more: --json has all")
+    section(title, rows)
     if note:
         output.stdout().print(note, markup=False, soft_wrap=not sys.stdout.isatty())
-    output.stdout().print()
-
-
-def _gap_line(gap: dict[str, Any], unit: str) -> dict[str, Any]:
-    each = "mission" if unit == "missions" else "hour"
-    line = {
-        "gap": gap["cell"],
-        "asked by": gap["asked_by"],
-        "of": gap["counted"],
-        "needed": gap["needed"],
-        "there": gap["there"],
-        "missing": gap["missing"],
-        "best": gap["best"],
-        f"per {each}": _interval(gap, "rate"),
-        unit: _interval(gap, "amount"),
-        "thinnest in": ", ".join(gap["thinnest_zones"][:2]),
-    }
-    if gap["closes_with"] is not None:
-        line["the plan closes it"] = f"{gap['closes_with']:.0%}"
-    return line
-
-
-def _interval(gap: dict[str, Any], name: str) -> str:
-    value, low, high = (figure(gap[key]) for key in (name, f"{name}_low", f"{name}_high"))
-    return f"{value} ({low} to {high})"
-
-
-def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:
-    """Name in one line the actions that nobody ever took in a condition."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for gap in gaps:
-        key = (gap["stratum"] or gap["condition"], gap["zone"], gap["robot"], gap["asked_by"])
-        groups.setdefault(key, []).append(gap)
-    lines = []
-    for (condition, zone, robot, asked_by), members in groups.items():
-        actions = [
-            gap["action_name"] or f"action {gap['action']}"
-            for gap in members
-            if gap["action"] is not None
-        ]
-        least = min(members, key=lambda gap: gap["at_least"])
-        lines.append(
-            {
-                "gap": ", ".join(str(part) for part in (condition, zone, robot) if part),
-                "actions": ", ".join(actions),
-                "asked by": asked_by,
-                "to see one, with 95 %": f"at least {least['at_least']:,} more"
-                f" {plural(least['at_least'], 'episode')} of"
-                f" {least['never_seen_in']}",
-            }
-        )
-    return lines
-
-
-def _order(order: dict[str, Any], unit: str, with_: dict[str, bool]) -> dict[str, Any]:
-    return {
-        "kind": order["kind"] or "logging",
-        **{name: order[name] or "" for name in ("zone", "robot") if with_[name]},
-        **({"missions": order["missions"]} if unit == "missions" else {}),
-        "hours": round(order["hours"], 2),
-        "fills": "; ".join(dict.fromkeys(order["fills"])),
-    }
 
 
 @dataclass

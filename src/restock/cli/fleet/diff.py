@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -90,6 +91,28 @@ def _kind_of(place: str) -> str:
 
 
 SHOWN = 12  # rows of a table on a terminal; --json has all
+_RECORDINGS = {
+    **{"change": "change", "source_file": "recording", "episodes": "episodes", "rows": "rows"},
+    "rows_relabelled": "relabelled",
+}
+_SHARES = {"of": "of", "value": "value", "rows": "rows", "share": "%", "difference": "difference"}
+_SIGNALS = {
+    **{"signal": "signal", "mean": "mean", "standardised": "in units of its spread"},
+    **{"ks": "KS distance", "p_adjusted": "p (of all signals)"},
+}
+_STRATA = {
+    **{"stratum": "stratum", "rows": "rows", "natural_share": "natural", "wanted_share": "wanted"},
+    **{"share": "drawn", "effective_share": "weighted"},
+}
+_FED = {
+    **{"source": "source", "condition": "condition", "share": "drawn"},
+    **{"effective_share": "weighted", "episodes": "episodes"},
+}
+_EVALUATION = {
+    **{"perturbation": "perturbation", "condition": "condition", "episodes": "episodes"},
+    **{"success": "success", "difference": "difference", "return": "return"},
+    "return_difference": "of return",
+}
 
 
 def show(document: dict[str, Any]) -> None:
@@ -112,21 +135,21 @@ def _print_stores(document: dict[str, Any]) -> None:
     if not document["different"]:
         output.stdout().print("no difference in recordings, episodes, labels or definitions")
         return
-    _section(
-        "definitions that differ",
-        [{key: _short(value) for key, value in row.items()} for row in document["definitions"]],
-    )
-    _section("recordings", [_recording(row) for row in document["recordings"]])
+    section("definitions that differ", _lines(document["definitions"], _same("what", "a", "b")))
+    section("recordings", _lines(document["recordings"], _RECORDINGS))
     episodes = document["episodes"]
     output.stdout().print(
         f"episodes: {episodes['in']:,} added, {episodes['out']:,} removed, "
         f"{episodes['changed']:,} with changed rows, {episodes['same']:,} the same"
     )
     _print_labels(document["labels"])
-    _section(
-        "shares (difference b - a in points, 95 % interval over episodes)",
-        [_share(row) for row in document["shares"] if row["rows_a"] != row["rows_b"]],
-    )
+    shares = [
+        row | {f"difference{end}": 100 * row[f"difference{end}"] for end in ("", "_low", "_high")}
+        for row in document["shares"]
+        if row["rows_a"] != row["rows_b"]
+    ]
+    title = "shares (difference b - a in points, 95 % interval over episodes)"
+    section(title, _lines(shares, _SHARES))
     signals = document["signals"]
     if signals["compared"]:
         moved = shifted(signals["shifts"])
@@ -135,7 +158,7 @@ def _print_stores(document: dict[str, Any]) -> None:
             f" {signals['episodes_a']:,}), means of episodes"
         )
         if moved:
-            _section(title, [_signal(row) for row in moved])
+            section(title, _lines(moved, _SIGNALS))
         else:
             output.stdout().print(f"\nno signal shifted: {signals['compared']}")
 
@@ -155,52 +178,31 @@ def _print_panels(document: dict[str, Any]) -> None:
         f" {weights['rows_changed']:,} of those with another weight, largest"
         f" {weights['largest_a']:.3g} and {weights['largest_b']:.3g}"
     )
-    _section("rows of both in another stratum", rows["moved"])
-    _section(
-        "strata: % of rows, wanted, drawn, after weights", [_stratum(s) for s in document["strata"]]
-    )
+    section("rows of both in another stratum", rows["moved"])
+    strata = _lines(document["strata"], _STRATA)
+    section("strata: % of rows, wanted, drawn, after weights", strata)
 
 
 def _print_runs(document: dict[str, Any]) -> None:
     from restock.cli import output
 
     _sides(document, ("env_steps", "gradient_steps", "panel"))
-    settings = document["settings"]
-    _section(
-        "settings that differ",
-        [
-            {
-                "setting": row["setting"],
-                "kind": row["kind"],
-                "a": _short(row["first"]),
-                "b": _short(row["second"]),
-            }
-            for row in settings
-        ],
-    )
+    settings = [{**row, "a": row["first"], "b": row["second"]} for row in document["settings"]]
+    section("settings that differ", _lines(settings, _same("setting", "kind", "a", "b")))
     if (panels := document["panels"]) is not None:
         if "note" in panels:
             output.stdout().print(f"panels: {panels['note']}", markup=False)
         else:
             output.stdout().print("\nTheir panels:")
             _print_panels(panels)
-    _section("what the critics were fed, % of all rows drawn", [_fed(r) for r in document["fed"]])
-    _section(
-        "ages of the rows drawn, last interval",
-        [
-            {
-                "source": row["source"],
-                "unit": row["unit"],
-                **{f"{n} {side}": row[f"{n}_{side}"] for n in ("p50", "p90") for side in "ab"},
-            }
-            for row in document["ages"]
-        ],
-    )
+    section("what the critics were fed, % of all rows drawn", _lines(document["fed"], _FED))
+    ages = _lines(document["ages"], _same("source", "unit", "p50", "p90"))
+    section("ages of the rows drawn, last interval", ages)
     if document["evaluation_note"]:
         output.stdout().print(f"evaluation: {document['evaluation_note']}", markup=False)
-    _section(
+    section(
         f"evaluation ({document['evaluated_by']}): paired differences b - a, 95 % over episodes",
-        [_evaluation(row) for row in document["evaluation"]],
+        _lines(document["evaluation"], _EVALUATION),
     )
     verdict = document["comparable"]
     output.stdout().print(
@@ -224,53 +226,49 @@ def _sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
 
 
 def _keys(title: str, rows: list[dict[str, Any]]) -> None:
-    _section(
-        f"{title}: keys that differ",
-        [{"key": row["key"], "a": _short(row["a"]), "b": _short(row["b"])} for row in rows],
-    )
+    section(f"{title}: keys that differ", _lines(rows, _same("key", "a", "b")))
 
 
-def _stratum(row: dict[str, Any]) -> dict[str, Any]:
-    line = {"stratum": row["stratum"], "rows a": row["rows_a"], "rows b": row["rows_b"]}
-    for name, shown in (
-        ("natural_share", "natural"),
-        ("wanted_share", "wanted"),
-        ("share", "drawn"),
-        ("effective_share", "weighted"),
-    ):
-        line |= {f"{shown} {side}": _percent(row[f"{name}_{side}"]) for side in "ab"}
-    return line
+def _same(*names: str) -> dict[str, str]:
+    return {name: name for name in names}
 
 
-def _fed(row: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "source": row["source"],
-        "condition": row["condition"],
-        **{f"drawn {side}": _percent(row[f"share_{side}"]) for side in "ab"},
-        **{f"weighted {side}": _percent(row[f"effective_share_{side}"]) for side in "ab"},
-        **{f"episodes {side}": row[f"episodes_{side}"] for side in "ab"},
-    }
+def _lines(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:
+    """Return columns of the rows under titles: of both sides, or with an interval if they have."""
+    return [
+        {title: value for name, of in columns.items() for title, value in _cells(row, name, of)}
+        for row in rows
+    ]
 
 
-def _evaluation(row: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "perturbation": row["perturbation"],
-        "condition": row["condition"],
-        "episodes": row["episodes"],
-        "success a": row["success_a"],
-        "success b": row["success_b"],
-        "difference": _with_interval(row, "difference"),
-        "return a": row["return_a"],
-        "return b": row["return_b"],
-        "of return": _with_interval(row, "return_difference"),
-    }
+def _cells(row: dict[str, Any], name: str, title: str) -> Iterator[tuple[str, Any]]:
+    if f"{name}_a" in row:
+        for side in "ab":
+            yield f"{title} {side}", _value(name, row[f"{name}_{side}"])
+    elif f"{name}_low" in row:
+        yield title, _with_interval(row, name)
+    else:
+        yield title, _value(name, row[name])
+
+
+def _value(name: str, value: Any) -> Any:
+    """Return shares in percent, and other values cut on a terminal: --json has them whole."""
+    if name.endswith("share"):
+        return None if value is None else round(100 * value, 2)
+    if isinstance(value, int | float):
+        return value
+    text = " ".join(str(value).split()) if value is not None else "(none)"
+    return text if len(text) <= 100 or not sys.stdout.isatty() else f"{text[:99]}…"
 
 
 def _with_interval(row: dict[str, Any], name: str) -> str:
     value, low, high = (row[key] for key in (name, f"{name}_low", f"{name}_high"))
     if value is None:
         return "no goal"
-    return f"{value:+.2f}" + (f" ({low:+.2f} to {high:+.2f})" if low is not None else "")
+    if value != value:
+        return "unknown"
+    known = low is not None and low == low
+    return f"{value:+.2f}" + (f" ({low:+.2f} to {high:+.2f})" if known else "")
 
 
 def _print_labels(labels: dict[str, Any]) -> None:
@@ -278,7 +276,7 @@ def _print_labels(labels: dict[str, Any]) -> None:
 
     if not labels["rows_compared"]:
         return
-    _section("labels that changed", labels["changes"])
+    section("labels that changed", labels["changes"])
     line = f"{labels['rows_changed']:,} of {labels['rows_compared']:,} rows written again changed"
     line += " their condition"
     if labels["rows_with_other_changes"]:
@@ -286,7 +284,7 @@ def _print_labels(labels: dict[str, Any]) -> None:
     output.stdout().print(line)
 
 
-def _section(title: str, rows: list[dict[str, Any]]) -> None:
+def section(title: str, rows: list[dict[str, Any]]) -> None:
     """Print a table, cut on a terminal, with a note of what was left out."""
     from restock.cli import output
 
@@ -297,58 +295,3 @@ def _section(title: str, rows: list[dict[str, Any]]) -> None:
     output.print_table(shown, title=title)
     if len(shown) < len(rows):
         output.stdout().print(f"… {len(rows) - len(shown):,} more: --json has all")
-
-
-def _recording(row: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "change": row["change"],
-        "recording": row["source_file"],
-        "episodes a": row["episodes_a"],
-        "episodes b": row["episodes_b"],
-        "rows a": row["rows_a"],
-        "rows b": row["rows_b"],
-        "relabelled": row["rows_relabelled"],
-    }
-
-
-def _share(row: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "of": row["of"],
-        "value": row["value"],
-        "rows a": row["rows_a"],
-        "rows b": row["rows_b"],
-        "% a": _percent(row["share_a"]),
-        "% b": _percent(row["share_b"]),
-        "difference": _points(row["difference"]),
-        "interval": _ends(row["difference_low"], row["difference_high"]),
-    }
-
-
-def _signal(row: dict[str, Any]) -> dict[str, Any]:
-    low, high = row["standardised_low"], row["standardised_high"]
-    return {
-        "signal": row["signal"],
-        "mean a": row["mean_a"],
-        "mean b": row["mean_b"],
-        "in units of its spread": f"{row['standardised']:+.2f} ({low:+.2f} to {high:+.2f})",
-        "KS distance": round(row["ks"], 3),
-        "p (of all signals)": row["p_adjusted"],
-    }
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else round(100 * share, 2)
-
-
-def _points(difference: float) -> str:
-    return f"{100 * difference:+.2f}" if difference == difference else "unknown"
-
-
-def _ends(low: float, high: float) -> str:
-    return f"{_points(low)} to {_points(high)}" if low == low else "unknown"
-
-
-def _short(value: Any) -> Any:
-    """Shorten a definition's SQL for a terminal; --json has it whole."""
-    text = " ".join(str(value).split()) if value is not None else "(none)"
-    return text if len(text) <= 100 or not sys.stdout.isatty() else f"{text[:99]}…"

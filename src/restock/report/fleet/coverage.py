@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 import altair as alt
 from markupsafe import Markup
 
-from restock import __version__
-from restock.errors import by_priority, counted, plural, uncertain_labels
+from restock.errors import by_priority, counted, figure, plural, uncertain_labels
 from restock.replay.fleet.drift import Drift
+from restock.replay.fleet.shopping_list import readable
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 from restock.report.fleet.drift import findings_section
@@ -93,9 +92,8 @@ def coverage_page(
             *({"value": count(n), "label": plural(n, noun)} for noun, n in numbers.items()),
             to_log(gaps),
         ],
-        "sections": [section for section in sections if section is not None],
-        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
-        f" {gaps['store']}, version {gaps['store_version']}",
+        "sections": sections,
+        "source": f"{gaps['store']}, version {gaps['store_version']}",
     }
 
 
@@ -121,8 +119,8 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     plan = gaps["plan"]
     if plan["orders"]:
         text += (
-            f"; {amount(plan['total'])} {gaps['unit']} [{amount(plan['total_low'])}, "
-            f"{amount(plan['total_high'])}] would fill the gaps that can be filled"
+            f"; {figure(plan['total'])} {gaps['unit']} [{figure(plan['total_low'])}, "
+            f"{figure(plan['total_high'])}] would fill the gaps that can be filled"
         )
     return text.removeprefix("; ")
 
@@ -161,7 +159,7 @@ def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
         if rows
         else [],
         two=True,
-        tables=[Table(table, set(table[0]) - {"condition", "who drove"} if table else set())],
+        tables=[Table(table)],
     )
 
 
@@ -263,7 +261,7 @@ def _robots(rows: Rows) -> Section | None:
         "Which robot has seen which condition?",
         intro="Rows in which each condition holds, and their share of the robot's own. "
         "A condition that only one robot has seen is learned only from that robot's hardware.",
-        tables=[Table(table, {"hours", *names})],
+        tables=[Table(table)],
     )
 
 
@@ -331,12 +329,12 @@ def to_log(gaps: dict[str, Any]) -> dict[str, str]:
             " never logged (95 %)",
         }
     label = (
-        f"{unit} to log next (95 %: {amount(plan['total_low'])} to {amount(plan['total_high'])})"
+        f"{unit} to log next (95 %: {figure(plan['total_low'])} to {figure(plan['total_high'])})"
     )
     if unknown:
         verb = "has no rate and is" if len(unknown) == 1 else "have no rate and are"
         label += f"; {counted(len(unknown), 'gap')} {verb} not in it"
-    return {"value": amount(plan["total"]), "label": label}
+    return {"value": figure(plan["total"]), "label": label}
 
 
 def _to_see_one(gaps: Rows) -> dict[str, int]:
@@ -349,39 +347,14 @@ def _to_see_one(gaps: Rows) -> dict[str, int]:
 
 
 def shopping_section(gaps: dict[str, Any]) -> Section:
-    unit, plan = gaps["unit"], gaps["plan"]
+    unit = gaps["unit"]
     if gaps["closed"]:
         return Section("shopping", "What to log next", intro="Nothing: there are no gaps.")
-    orders = [
-        {
-            "kind": words(order["kind"] or "logging"),
-            "zone": words(order["zone"] or ""),
-            "robot": order["robot"] or "",
-            **({"missions": count(order["missions"])} if unit == "missions" else {}),
-            "hours": f"{order['hours']:.2f}",
-            "fills": "; ".join(words(name) for name in dict.fromkeys(order["fills"])),
-        }
-        for order in plan["orders"]
-    ]
-    ordered = sorted(gaps["gaps"], key=lambda gap: gap["there"] / max(gap["needed"], 1))
-    table = [
-        {
-            "gap": words(gap["cell"]),
-            "there": count(gap["there"]),
-            "needed": count(gap["needed"]),
-            "of": gap["counted"],
-            unit: ""
-            if gap["amount"] is None
-            else f"{amount(gap['amount'])} [{amount(gap['amount_low'])},"
-            f" {amount(gap['amount_high'])}]",
-            "best": words(gap["best"]) if gap["best"] else _no_rate(gap),
-            "asked by": gap["asked_by"],
-        }
-        for gap in ordered[:MAX_GAPS]
-    ]
-    left = len(gaps["gaps"]) - len(table)
-    unknown = _to_see_one([gap for gap in gaps["gaps"] if gap["best"] is None])
-    never = " and ".join(_more_of(kind, least) for kind, least in unknown.items())
+    gaps = gaps | {
+        "gaps": sorted(gaps["gaps"], key=lambda gap: gap["there"] / max(gap["needed"], 1))
+    }
+    known, unknown, orders = readable(gaps)
+    left = len(known) - MAX_GAPS
     intro = []
     if orders:
         which = "every gap that has a rate" if unknown else "every gap"
@@ -392,46 +365,33 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
     if orders and unit == "missions":  # the twin drives no hours
         intro.append("`restock coverage gaps --missions-out FILE` writes it as missions to drive.")
     if unknown:
-        intro.append(
-            "What was never logged has no rate, so no amount to fill it is known: to see one"
-            f" with 95 %, log at least {never}."
-        )
+        intro.append("What was never logged has no rate, so no amount to fill it is known.")
     return Section(
         "shopping",
         "What to log next",
         intro=" ".join(intro),
         tables=[
-            Table(_without_empty(orders), {"missions", "hours"}, title="What to drive"),
+            Table(_in_words(orders), title="What to drive"),
             Table(
-                _without_empty(table),
-                {"there", "needed", unit},
+                _in_words(known[:MAX_GAPS]),
                 title="What is missing",
                 caption=f"{left:,} more gaps: `restock coverage gaps --json` has all."
-                if left
+                if left > 0
                 else "",
             ),
+            Table(_in_words(unknown), title="What was never seen"),
         ],
     )
 
 
-def _no_rate(gap: dict[str, Any]) -> str:
-    ((kind, least),) = _to_see_one([gap]).items()
-    return f"no rate is known: at least {_more_of(kind, least)}"
+def _in_words(lines: Rows) -> Rows:
+    return [{name: _in_word(name, value) for name, value in line.items()} for line in lines]
 
 
-def _more_of(kind: str, episodes: int) -> str:
-    """Return a need in words: `9 more episodes of blocked aisle`."""
-    return f"{episodes:,} more {plural(episodes, 'episode')} of {kind}"
+def _in_word(name: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value if name == "asked by" else words(value)
+    return f"{value:,}"
 
 
-def _without_empty(rows: Rows) -> Rows:
-    """Remove columns that are empty in every row."""
-    reported = {name for row in rows for name, value in row.items() if value != ""}
-    return [{name: value for name, value in row.items() if name in reported} for row in rows]
-
-
-def amount(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
-
-
-__all__ = ["amount", "coverage_facts", "coverage_page", "headline", "shopping_section", "to_log"]
+__all__ = ["coverage_facts", "coverage_page", "headline", "shopping_section", "to_log"]

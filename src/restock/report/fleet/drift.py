@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from typing import Any
 
 import altair as alt
 
-from restock import __version__
 from restock.errors import counted, plural
 from restock.replay.fleet.drift import OWN, Drift
 from restock.replay.store.definitions import UNITS
 from restock.replay.store.definitions import unit as unit_of
 from restock.report.look import charts
-from restock.report.look.blocks import MAX_ROWS, Figure, Rows, Section, Table, words
+from restock.report.look.blocks import MAX_ROWS, Figure, Rows, Section, Table, listed, words
 
 MAX_ROBOTS = 12  # in a chart: those with findings first
 MAX_PERIODS = 26  # the newest
@@ -63,9 +61,8 @@ def drift_page(drift: Drift) -> dict[str, Any]:
                 ),
             )
         ],
-        "sections": [section for section in sections if section is not None],
-        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
-        f" {drift.store}, version {drift.version}",
+        "sections": sections,
+        "source": f"{drift.store}, version {drift.version}",
     }
 
 
@@ -78,7 +75,7 @@ def headline(drift: Drift) -> str:
             who = f"site {row['site']}" if row["scope"] == "site" else row["robot"]
             named += [] if who in named else [who]
     if parts:
-        text = "Changed: " + "; ".join(f"{part} of {_list(who)}" for part, who in parts.items())
+        text = "Changed: " + "; ".join(f"{part} of {listed(who)}" for part, who in parts.items())
         hardware = [row for row in drift.findings if row["part"] not in _BESIDE]
         if len(hardware) == 1:
             (row,) = hardware
@@ -258,7 +255,7 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
         figures=[
             Figure(
                 charts.draw(chart, charts.FULL),
-                caption=f"Never seen: {_list(sorted(never))}." if never else "",
+                caption=f"Never seen: {listed(sorted(never))}." if never else "",
             )
         ],
     )
@@ -290,7 +287,7 @@ def _differences_section(drift: Drift) -> Section | None:
         intro="The newest difference of each signal from the mean of the other robots of the "
         "site. Robots may differ since they were built: that alone is not drift. In a small "
         "fleet, one robot that changed also moves the mean with which the others are compared.",
-        tables=[Table(rows[:40], numbers={"the others", "this robot"})],
+        tables=[Table(rows[:40])],
     )
 
 
@@ -317,7 +314,6 @@ def _comparisons_section(own: Rows) -> Section | None:
         }
         for row in sorted(newest.values(), key=lambda row: _VERDICTS.index(row["verdict"]))
     ]
-    numbers = {"reference", "now", "Cliff's delta", "KS", "corrected p"}
     return Section(
         "comparisons",
         "The newest comparison of each signal",
@@ -327,7 +323,6 @@ def _comparisons_section(own: Rows) -> Section | None:
         tables=[
             Table(
                 rows[:120],
-                numbers=numbers,
                 title=counted(min(len(rows), 120), "comparison"),
                 folded=len(rows) > MAX_ROWS,
             ),
@@ -345,10 +340,6 @@ def _newest(rows: Rows) -> Rows:
     """Return the rows of the newest periods."""
     kept = sorted({row["period"] for row in rows})[-MAX_PERIODS:]
     return [row for row in rows if row["period"] in kept]
-
-
-def _list(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
 _MEANINGS = {  # what a signal measures; docs/coverage.md says how

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -61,17 +62,22 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows with the same keys, which are the columns; those in `numbers` are right-aligned."""
+    """Rows with the same keys, which are the columns, without those that are empty everywhere."""
 
     rows: Rows
-    numbers: frozenset[str] | set[str] = frozenset()
     title: str = ""
     caption: str = ""
     folded: bool = False  # shown once its title is clicked
 
     @property
     def columns(self) -> list[str]:
-        return list(self.rows[0]) if self.rows else []
+        names = list(self.rows[0]) if self.rows else []
+        return [name for name in names if any(row[name] not in ("", None) for row in self.rows)]
+
+    @property
+    def numbers(self) -> set[str]:
+        """Return the columns of numbers, which are right-aligned."""
+        return {name for name in self.columns if all(_is_number(row[name]) for row in self.rows)}
 
     @property
     def stacks(self) -> str:
@@ -104,11 +110,73 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
+_BESIDE_NUMBERS = {*("to", "of", "and", "or", "more", "e", "s", "min", "h", "m", "points")}
+
+
+def _is_number(cell: Any) -> bool:
+    """Return whether a cell shows a number, perhaps with its unit and interval, or nothing."""
+    text = "" if cell is None else str(cell)
+    begins = re.match(r"[<×+−-]?\s?\.?\d", text)
+    return not text or (bool(begins) and set(re.findall("[A-Za-z]+", text)) <= _BESIDE_NUMBERS)
+
+
+_NAMES = ("condition", "stratum", "arm")  # columns of names that people read with spaces
+_SHARES = ("agreement", "changed", "chosen_agreement")
+
+
+def shown(rows: Rows, columns: dict[str, str]) -> Rows:
+    """Return rows as a page shows them: some columns under titles, values formatted by name."""
+    return [{title: _cell(name, row[name]) for name, title in columns.items()} for row in rows]
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None or isinstance(value, str):
+        return words(value or "") if name in _NAMES else value or ""
+    if name.endswith("share") or name in _SHARES:
+        return percent(value)
+    return count(value) if isinstance(value, int) else number(value)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Join names: `a, b and c`."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+
+
+def points(value: float) -> str:
+    """Format a difference of shares in points, with a true minus sign."""
+    return f"{100 * value:+.0f}".replace("-", "−")
+
+
+def points_text(row: dict[str, Any]) -> str:
+    """Format a row's `difference` in points, with its interval."""
+    low, high = points(row["difference_low"]), points(row["difference_high"])
+    return f"{points(row['difference'])} points [{low}, {high}]"
+
+
+MAX_NAMED = 3  # conditions in a headline
+
+
+def named(rows: Rows) -> str:
+    """Name the conditions that differ most, with their differences."""
+    ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
+    texts = [f"{words(row['condition'])} ({points_text(row)})" for row in ordered[:MAX_NAMED]]
+    return listed(texts + [f"{len(rows) - MAX_NAMED} more"] * (len(rows) > MAX_NAMED))
+
+
 def estimate(row: dict[str, Any]) -> str:
     """Return a value with its interval, or why there is none."""
     if row["value"] is None:
         return f"refused: {row['refused']}"
     return interval_text(row["value"], row["low"], row["high"])
+
+
+def measured(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
+    """Format a value of a row with its unit and interval; nothing if it is unknown."""
+    if row[name] is None:
+        return ""
+    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+    ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
+    return f"{row[name]:{form}}{unit}{ends}"
 
 
 def percent(value: float | None) -> str:

@@ -224,28 +224,72 @@ def in_words(rows: Sequence[Row], key: str = "condition") -> list[dict[str, Any]
     return [{**row, key: words(row[key])} for row in rows]
 
 
-def success(rows: Sequence[Row]) -> Drawing:
-    """Draw success with intervals: rows of cell, perturbation, policy, success, low, high."""
-    policies = ordered(rows, "policy", POLICY_COLOURS)
-    cells = list(dict.fromkeys(row["cell"] for row in rows))
-    perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
+def estimates(
+    rows: Sequence[Row],
+    *,
+    y: str,
+    series: str,
+    names: Sequence[str],
+    colours: Mapping[str, str],
+    value: str,
+    ends: tuple[str, str],
+    title: str | None = None,
+    axis: Any = alt.Undefined,
+    x_scale: Any = alt.Undefined,
+    neutral: float | None = None,
+    tick: str | None = None,
+    beside: str | None = None,
+) -> Drawing:
+    """Draw a dot and its interval for each series in each row of the chart.
+
+    A dashed line marks the `neutral` value, at which nothing differs, and `tick` is a column of
+    values that are marked too. Values of the column `beside` have charts side by side.
+    """
+    lines_of = list(dict.fromkeys(str(row[y]) for row in rows))
+    labels_px, (low, high) = label_px(lines_of), ends
+    known = any(row[low] is not None for row in rows)
 
     def chart(width: int) -> Any:
         base = plot(rows).encode(
-            y=alt.Y("cell:N", sort=cells, title=None, axis=alt.Axis(grid=False, ticks=False)),
-            yOffset=alt.YOffset("policy:N", sort=policies),
-            color=coloured("policy", policies, POLICY_COLOURS, width, label_px(cells)),
+            y=alt.Y(f"{y}:N", sort=lines_of, title=None, axis=_QUIET),
+            yOffset=alt.YOffset(f"{series}:N", sort=list(names)),
+            color=coloured(series, names, colours, width, labels_px),
         )
-        percent = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
-        x_scale = alt.Scale(domain=[0, 1])
-        bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
-            x=alt.X("low:Q", title=None, axis=percent, scale=x_scale), x2="high:Q"
-        )
-        dots = base.mark_circle(size=70, opacity=1).encode(x=alt.X("success:Q", scale=x_scale))
-        layered = alt.layer(bars, dots).properties(height=46 * max(len(cells), 1))
-        return side_by_side(layered, "perturbation", perturbations, width, label_px(cells))
 
-    return draw(chart, FULL)
+        def along(column: str) -> alt.X:
+            return alt.X(f"{column}:Q", title=title, axis=axis, scale=x_scale)
+
+        bars = base.transform_filter(f"isValid(datum.{low})").mark_rule(strokeWidth=3, opacity=0.45)
+        layers = [bars.encode(x=along(low), x2=f"{high}:Q")] if known else []
+        layers.append(base.mark_circle(size=70, opacity=1).encode(x=along(value)))
+        if tick is not None:
+            layers.append(base.mark_tick(thickness=2, size=9).encode(x=along(tick)))
+        if neutral is not None:
+            rule = plot([{"at": neutral}]).mark_rule(strokeDash=[4, 3], color="#475569")
+            layers.insert(0, rule.encode(x="at:Q"))
+        layered = alt.layer(*layers).properties(height=(16 * len(names) + 18) * len(lines_of))
+        if beside is None:
+            return layered
+        across = list(dict.fromkeys(row[beside] for row in rows))
+        return side_by_side(layered, beside, across, width, labels_px)
+
+    return draw(chart, HALF if beside is None else FULL)
+
+
+def success(rows: Sequence[Row]) -> Drawing:
+    """Draw success with intervals: rows of cell, perturbation, policy, success, low, high."""
+    return estimates(
+        rows,
+        y="cell",
+        series="policy",
+        names=ordered(rows, "policy", POLICY_COLOURS),
+        colours=POLICY_COLOURS,
+        value="success",
+        ends=("low", "high"),
+        axis=_PERCENT,
+        x_scale=_SHARE,
+        beside="perturbation",
+    )
 
 
 def lines(
@@ -377,84 +421,61 @@ def colours(arms: list[str]) -> dict[str, str]:
 
 def intervals(rows: Rows, arms: list[str]) -> Drawing:
     """Draw success by condition: rows of arm, condition, value, low, high (None: unknown)."""
-    conditions = _conditions(rows)
-    shown = in_words(rows)
-    known = [row for row in shown if row["low"] is not None]
-
-    def chart(width: int) -> Any:
-        def base(of: Rows) -> Any:
-            return plot(of).encode(
-                y=alt.Y("condition:N", sort=conditions, title=None, axis=_QUIET),
-                yOffset=alt.YOffset("arm:N", sort=arms),
-                color=coloured("arm", arms, colours(arms), width, label_px(conditions)),
-            )
-
-        bars = (
-            base(known)
-            .mark_bar(size=10, opacity=0.35)
-            .encode(x=alt.X("low:Q", title="success", axis=_PERCENT, scale=_SHARE), x2="high:Q")
-        )
-        ticks = (
-            base(shown)
-            .mark_tick(thickness=3, size=14)
-            .encode(x=alt.X("value:Q", title="success", axis=_PERCENT, scale=_SHARE))
-        )
-        layers = [bars, ticks] if known else [ticks]
-        return alt.layer(*layers).properties(height=(16 * len(arms) + 18) * len(conditions))
-
-    return draw(chart)
+    return estimates(
+        _by_condition(in_words(rows)),
+        y="condition",
+        series="arm",
+        names=arms,
+        colours=colours(arms),
+        value="value",
+        ends=("low", "high"),
+        title="success",
+        axis=_PERCENT,
+        x_scale=_SHARE,
+    )
 
 
 def differences(rows: Rows) -> Drawing:
     """Draw differences in success by condition, perturbations side by side."""
-    shown = _outcomes(rows)
-    return _forest(shown, "difference", "difference in success (points)", 0.0, x_scale=alt.Scale())
+    return _outcomes(rows, "difference", "difference in success (points)", 0.0, alt.Scale())
 
 
 def improvements(rows: Rows) -> Drawing:
     """Draw the probability that the second arm's return is higher."""
-    shown = _outcomes(rows)
-    return _forest(shown, "improvement", "P(higher return)", 0.5, x_scale=alt.Scale(domain=[0, 1]))
+    return _outcomes(rows, "improvement", "P(higher return)", 0.5, _SHARE)
 
 
-def _forest(rows: Rows, value: str, title: str, neutral: float, *, x_scale: alt.Scale) -> Drawing:
-    """Draw a dot and its interval for each condition, beside the value of no difference."""
-    conditions = _conditions(rows)
-    perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
-    low, high = f"{value}_low", f"{value}_high"
-
-    def chart(width: int) -> Any:
-        base = plot(rows).encode(
-            y=alt.Y("condition:N", sort=conditions, title=None, axis=_QUIET),
-            yOffset=alt.YOffset("perturbation:N", sort=perturbations),
-            color=alt.Color(
-                "perturbation:N",
-                sort=perturbations,
-                scale=scale(perturbations, colours(perturbations)),
-                legend=legend(perturbations, width, label_px(conditions))
-                if len(perturbations) > 1
-                else None,
-            ),
-        )
-        dots = base.mark_circle(size=70, opacity=1).encode(
-            x=alt.X(f"{value}:Q", title=title, scale=x_scale)
-        )
-        bars = (
-            base.transform_filter(f"isValid(datum.{low})")
-            .mark_rule(strokeWidth=3, opacity=0.5)
-            .encode(x=alt.X(f"{low}:Q", title=title, scale=x_scale), x2=f"{high}:Q")
-        )
-        rule = plot([{"at": neutral}]).mark_rule(strokeDash=[4, 3], color="#475569")
-        layers = alt.layer(rule.encode(x="at:Q"), bars, dots)
-        return layers.properties(height=(16 * len(perturbations) + 18) * len(conditions))
-
-    return draw(chart)
+def _outcomes(rows: Rows, value: str, title: str, neutral: float, x_scale: alt.Scale) -> Drawing:
+    """Draw one measure of outcomes beside the value of no difference; differences in points."""
+    factor = 100 if value == "difference" else 1
+    columns = (value, f"{value}_low", f"{value}_high")
+    shown = [
+        {
+            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
+            "condition": words(row["condition"]),
+            **{name: None if row.get(name) is None else factor * row[name] for name in columns},
+        }
+        for row in rows
+    ]
+    names = list(dict.fromkeys(row["perturbation"] for row in shown))
+    return estimates(
+        _by_condition(shown),
+        y="condition",
+        series="perturbation",
+        names=names,
+        colours=colours(names),
+        value=value,
+        ends=columns[1:],
+        title=title,
+        x_scale=x_scale,
+        neutral=neutral,
+    )
 
 
 def curves(rows: Rows, arms: list[str]) -> Drawing:
     """Draw success over environment steps for each condition, with bands for intervals."""
-    conditions = _conditions(rows)
     shown = in_words(rows)
+    conditions = ordered(shown, "condition", WORDS_COLOURS)
 
     def chart(width: int) -> Any:
         most = 1 if width < 600 else 2 if width < 900 else 4
@@ -483,26 +504,10 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
     return draw(chart, FULL)
 
 
-def _outcomes(rows: Rows) -> Rows:
-    """Return outcomes with words for names, and differences in points."""
-    points = ("difference", "difference_low", "difference_high")
-    return [
-        {
-            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
-            "condition": words(row["condition"]),
-            **{name: None if row[name] is None else 100 * row[name] for name in points},
-            "improvement": row["improvement"],
-            "improvement_low": row.get("improvement_low"),
-            "improvement_high": row.get("improvement_high"),
-        }
-        for row in rows
-    ]
-
-
-def _conditions(rows: Rows) -> list[str]:
-    """Return conditions as words, in the order of every page."""
-    named = [{"condition": words(row["condition"])} for row in rows]
-    return ordered(named, "condition", WORDS_COLOURS)
+def _by_condition(rows: Rows) -> Rows:
+    """Return rows in the order of their conditions on every page."""
+    order = ordered(rows, "condition", WORDS_COLOURS)
+    return sorted(rows, key=lambda row: order.index(row["condition"]))
 
 
 __all__ = ["colours", "curves", "differences", "improvements", "intervals"]

@@ -17,6 +17,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
+from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -26,6 +27,7 @@ import jinja2
 import vl_convert
 from markupsafe import Markup, escape
 
+from restock import __version__
 from restock.files import write_bytes, write_text
 from restock.report.look.blocks import Figure, Section, Table, words
 from restock.report.look.charts import CONFIG
@@ -38,7 +40,7 @@ def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | N
 
     Args:
         content: what the template asks for: kicker, title, headline, lead, cards, sections,
-            footer, and a verdict if there is one.
+            a verdict if there is one, and the source that the footer names. Sections may be None.
     """
     out, folder = Path(out), files("restock.report.look")
     environment = jinja2.Environment(
@@ -49,22 +51,29 @@ def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | N
     style = (folder / "style.css").read_text(encoding="utf-8")
     style = style.replace("/* dark figures */", dark_rules())
     out.parent.mkdir(parents=True, exist_ok=True)
-    has_charts = any(figure.drawing.spec for part in content["sections"] for figure in part.figures)
+    sections = [section for section in content["sections"] if section is not None]
+    has_charts = any(figure.drawing.spec for part in sections for figure in part.figures)
     own = {
         "style": Markup(style),
         "charts": Charts(CONFIG),
         "policy": policy(has_charts),
     }
+    source = f" from {content['source']}" if "source" in content else ""
+    own |= {
+        "sections": sections,
+        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC{source}",
+    }
     write_text(out, template.render({"verdict": None, **content, **own}))
     if figures is not None:
-        write_figures(content["sections"], Path(figures))
+        write_figures(sections, Path(figures))
     return out
 
 
 def as_markdown(content: dict[str, Any]) -> str:
     """Return a page's words and tables as Markdown, without its figures."""
-    lines = [f"# {content['title']}", "", f"{content['headline']}.", "", content["lead"]]
-    for section in content["sections"]:
+    lines = [f"# {_plain(content['title'])}", "", f"{_plain(content['headline'])}."]
+    lines += ["", content["lead"]] if content["lead"] else []
+    for section in filter(None, content["sections"]):
         lines += ["", f"## {section.title}"]
         for text in filter(None, (section.intro, section.callout)):
             lines += ["", text]
@@ -77,10 +86,16 @@ def _table_lines(table: Table) -> list[str]:
     if not table.rows:
         return []
     rows = [table.columns, *([row[name] for name in table.columns] for row in table.rows)]
-    head, *body = [" | ".join(str(cell).replace("|", "\\|") for cell in row) for row in rows]
+    head, *body = [" | ".join(map(_plain, row)) for row in rows]
     lines = ["", f"**{table.title}**"] if table.title else []
     lines += ["", f"| {head} |", f"| {' | '.join('---' for _ in table.columns)} |"]
     return lines + [f"| {row} |" for row in body]
+
+
+def _plain(value: Any) -> str:
+    """Return text that cannot leave its cell or be markup: names come from recordings."""
+    text = "" if value is None else str(value)
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("\n", " ")
 
 
 def write_figures(sections: Sequence[Section], folder: Path) -> list[Path]:

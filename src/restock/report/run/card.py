@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 
 from restock.replay.sampling.rules import RULES
-from restock.report.look.blocks import Rows, count, estimate, number
+from restock.report.look import write
+from restock.report.look.blocks import Rows, Section, Table, count, estimate, percent, shown
 from restock.report.run.facts import Facts, evaluation_bias
 from restock.report.run.fed import by_arm
 
@@ -109,51 +110,26 @@ def replay_card(facts: Facts) -> dict[str, Any]:
     }
 
 
-_TABLES = (
-    (
-        "Quotas of the batch, and what filled them (shares of all rows fed)",
-        "fed",
-        {
-            "stratum": "stratum",
-            "natural_share": "natural",
-            "wanted_share": "wanted",
-            "drawn_share": "drawn",
-            "logs_share": "from logs",
-            "fresh_share": "fresh",
-            "short_share": "short",
-            "reason": "why short",
-        },
-    ),
-    (
-        "Conditions in the sampled batches",
-        "conditions",
-        {
-            "source": "source",
-            "condition": "condition",
-            "drawn_rows": "rows",
-            "drawn_share": "drawn",
-            "effective_share": "after weights",
-            "td_abs_mean": "mean absolute TD error at the end",
-        },
-    ),
-    (
-        "Age of the sampled rows",
-        "ages",
-        {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")},
-    ),
-    (
-        "Whose behaviour it was",
-        "behaviour_policies",
-        {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"},
-    ),
-    (
-        "Off-policy evaluation on held-out logs, before it drove",
-        "off_policy",
-        {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},
-    ),
-)
-
-
+_FED = {
+    "stratum": "stratum",
+    "natural_share": "natural",
+    "wanted_share": "wanted",
+    "drawn_share": "drawn",
+    "logs_share": "from logs",
+    "fresh_share": "fresh",
+    "short_share": "short",
+    "reason": "why short",
+}
+_CONDITIONS = {
+    "source": "source",
+    "condition": "condition",
+    "drawn_rows": "rows",
+    "drawn_share": "drawn",
+    "effective_share": "after weights",
+    "td_abs_mean": "mean absolute TD error at the end",
+}
+_AGES = {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")}
+_POLICIES = {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"}
 _PRACTICE = {
     "arm": "missions",
     "natural_share": "natural",
@@ -162,8 +138,6 @@ _PRACTICE = {
     "given_share": "given",
     "episodes": "ended",
 }
-
-
 _TEACHER = {
     "source": "source",
     "condition": "condition",
@@ -177,39 +151,58 @@ _TEACHER = {
 
 def as_markdown(card: dict[str, Any]) -> str:
     """Write the card as a page of Markdown."""
-    capacity, sampling = card["capacity"], card["sampling"]
-    lines = [f"# Replay card of {_cell(card['run'])}", ""]
-    lines += [f"**Evaluation bias.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
+    capacity, sampling, moved = card["capacity"], card["sampling"], card["corrections"]
+    teacher = card["teacher"]
     facts = {
-        "Policy": _or_none(card["policy"] and card["policy"]["text"]),
+        "Policy": card["policy"] and card["policy"]["text"],
         "Capacity": f"{count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
-        "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
-        f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
+        "Sampling rule": f"batches of {sampling['batch_size']},"
+        f" {percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
         f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
-        "Teacher": _teacher(card["teacher"], card["behaviour_policies"]),
+        "Teacher": _teacher(teacher, card["behaviour_policies"]),
         "Practice": f"missions by the rule {card['practice']['rule']}",
-        "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
-        f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
+        "Returns": f"{sampling['n_step']['logs']}-step in the logs,"
+        f" {sampling['n_step']['fresh']}-step fresh",
         "Target rule": _words(card["target"]),
-        "Corrections": f"{_words(card['corrections']['rules'])}; outcome strata:"
-        f" {', '.join(card['corrections']['post_strata']) or 'none'}; weights moved"
-        f" {_percent(card['corrections']['moved_by_weights'])} of the logs' mix",
+        "Corrections": f"{_words(moved['rules'])}; outcome strata:"
+        f" {', '.join(moved['post_strata']) or 'none'}; weights moved"
+        f" {percent(moved['moved_by_weights'])} of the logs' mix",
         "Left out of the panel": _words(card["left_out"]),
-        "Evaluation shown": _or_none(card["evaluation"]),
+        "Evaluation shown": card["evaluation"],
     }
-    lines += ["| | |", "| --- | --- |"]
-    lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]
-    for title, key, columns in _TABLES:
-        if card[key] or key != "off_policy":
-            lines += ["", f"## {title}", "", *_table(card[key], columns)]
-    lines += ["", "## Missions that the twin gave", ""]
-    lines += _table(card["practice"]["arms"], _PRACTICE)
-    if card["teacher"] is not None:
-        lines += ["", "## What the teacher's filter did at the end", ""]
-        lines += _table(card["teacher"]["states"], _TEACHER)
-    if card["missing"]:
-        lines += ["", "## Unknown", "", *(f"- {_cell(line)}" for line in card["missing"])]
-    return "\n".join(lines) + "\n"
+    off_policy = [
+        {
+            "measure": row["measure"],
+            "estimator": row["estimator"],
+            "value [95 %]": estimate(row),
+        }
+        for row in card["off_policy"]
+    ]
+    tables = {
+        "What it was": [{"of the run": name, "": _words(text)} for name, text in facts.items()],
+        "Quotas of the batch, and what filled them (shares of all rows fed)": shown(
+            card["fed"], _FED
+        ),
+        "Conditions in the sampled batches": shown(card["conditions"], _CONDITIONS),
+        "Age of the sampled rows": shown(card["ages"], _AGES),
+        "Whose behaviour it was": shown(card["behaviour_policies"], _POLICIES),
+        "Off-policy evaluation on held-out logs, before it drove": off_policy,
+        "Missions that the twin gave": shown(card["practice"]["arms"], _PRACTICE),
+        "What the teacher's filter did at the end": shown(
+            teacher["states"] if teacher else [], _TEACHER
+        ),
+        "Unknown": [{"why": line} for line in card["missing"]],
+    }
+    return write.as_markdown(
+        {
+            "title": f"Replay card of {card['run']}",
+            "headline": f"Evaluation bias: {card['imbalance'] or _UNKNOWN}".removesuffix("."),
+            "lead": "",
+            "sections": [
+                Section("", title, tables=[Table(rows)]) for title, rows in tables.items() if rows
+            ],
+        }
+    )
 
 
 def _teacher(teacher: dict[str, Any] | None, sampled: list[dict[str, Any]]) -> str:
@@ -299,45 +292,11 @@ def _columns(rows: Rows, *names: str) -> Rows:
     return [{name: row[name] for name in names} for row in rows]
 
 
-def _table(rows: Rows, columns: dict[str, str]) -> list[str]:
-    if not rows:
-        return ["nothing"]
-    lines = [f"| {' | '.join(columns.values())} |", f"|{' --- |' * len(columns)}"]
-    return lines + [f"| {' | '.join(_shown(row, name) for name in columns)} |" for row in rows]
-
-
-def _shown(row: dict[str, Any], name: str) -> str:
-    """Return a row's column as its cell shows it."""
-    if name in ("available_rows", "drawn_rows", "rows", "episodes", "asked_rows"):
-        return count(row[name])
-    if name == "plausible_actions":
-        return number(row[name])
-    if name.endswith("share") or name in ("agreement", "changed", "chosen_agreement"):
-        return _percent(row[name])
-    if name == "td_abs_mean":
-        return number(row[name])
-    return _cell(estimate(row) if name == "value" else row[name])
-
-
-def _percent(value: float | None) -> str:
-    return "" if value is None else f"{value:.1%}"
-
-
-def _or_none(value: Any) -> str:
-    return "none" if value is None else str(value)
-
-
 def _words(value: Any) -> str:
     """Write a small document for people."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "none"
-    return _or_none(value)
-
-
-def _cell(value: Any) -> str:
-    """Return text that cannot leave its cell or be markup: names come from recordings."""
-    text = "" if value is None else str(value)
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("\n", " ")
+    return "none" if value is None else str(value)
 
 
 __all__ = ["as_markdown", "replay_card"]

@@ -5,16 +5,25 @@ The gate's verdicts come first.
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Any
 
-from restock import __version__
 from restock.errors import counted, verdict_said
 from restock.report.look import charts
-from restock.report.look.blocks import Figure, Rows, Section, Table, count, number, span, words
+from restock.report.look.blocks import (
+    MAX_NAMED,
+    Figure,
+    Rows,
+    Section,
+    Table,
+    count,
+    named,
+    number,
+    points_text,
+    span,
+    words,
+)
 from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
 
-MAX_NAMED = 3
 MAX_SETTINGS = 4  # differing settings that are named in a line
 FREE_KINDS = ("free", "software")
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
@@ -46,8 +55,7 @@ def comparison_page(found: dict[str, Any]) -> dict[str, Any]:
         "headline": headline(found, first, second),
         "lead": found["sentence"] + ".",
         "cards": cost_cards(found["cost"]),
-        "sections": [section for section in sections if section is not None],
-        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        "sections": sections,
     }
 
 
@@ -69,7 +77,7 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
     known = [row for row in rows if row["difference_low"] is not None]
     better = [row for row in known if row["difference_low"] > 0]
     worse = [row for row in known if row["difference_high"] < 0]
-    parts = [f"{word} in {_named(of)}" for word, of in (("better", better), ("worse", worse)) if of]
+    parts = [f"{word} in {named(of)}" for word, of in (("better", better), ("worse", worse)) if of]
     if parts:
         rest = len(rows) - len(better) - len(worse)
         more = f"; no difference shown in {rest} more" if rest else ""
@@ -80,7 +88,7 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
     widest = max(known, key=lambda row: row["difference_high"] - row["difference_low"])
     return (
         f"No difference between {second} and {first} is shown in any condition; the widest"
-        f" interval is {_difference(widest)} in {words(widest['condition'])}"
+        f" interval is {points_text(widest)} in {words(widest['condition'])}"
     )
 
 
@@ -99,18 +107,6 @@ def why_refused(found: dict[str, Any]) -> str:
     if found["verdict"] == "inconclusive":
         return f"too few episodes or seeds to show that they were fed the same ({shown})"
     return f"their critics were fed differently ({shown})"
-
-
-def _named(rows: Rows) -> str:
-    ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
-    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MAX_NAMED]]
-    named += [f"{len(rows) - MAX_NAMED} more"] * (len(rows) > MAX_NAMED)
-    return named[0] if len(named) == 1 else ", ".join(named[:-1]) + " and " + named[-1]
-
-
-def _difference(row: dict[str, Any]) -> str:
-    ends = [f"{100 * row[name]:+.0f}" for name in ("difference_low", "difference_high")]
-    return f"{100 * row['difference']:+.0f} points [{ends[0]}, {ends[1]}]".replace("-", "−")
 
 
 def outcome_sections(
@@ -164,7 +160,6 @@ def outcome_sections(
                 f"Right of the line {second} is better.",
             ),
         )
-    numbers = set(table[0]) - {"perturbation", "condition"}
     return [
         Section(
             f"{prefix}outcomes",
@@ -173,7 +168,7 @@ def outcome_sections(
             f" {_INTERVALS}" + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
             figures=figures,
             two=True,
-            tables=[Table(table, numbers)],
+            tables=[Table(table)],
         )
     ]
 
@@ -261,7 +256,7 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
         "treatment allows to differ is shown last, and decides nothing.",
         tables=[
             Table(differences, title="What differs"),
-            Table(checks, {"value", "95 %", "limit"}, title="What was fed", folded=True),
+            Table(checks, title="What was fed", folded=True),
         ],
     )
 
@@ -345,8 +340,7 @@ def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
         + f"{len(arms)} arms, seeds {', '.join(map(str, study['seeds']))}, all evaluated on the"
         " same episodes.",
         "cards": cost_cards(study.get("cost", [])),
-        "sections": [section for section in sections if section is not None],
-        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        "sections": sections,
     }
 
 
@@ -422,7 +416,7 @@ def _contrasts(contrasts: Rows, rare: list[str]) -> Section | None:
         "Contrasts",
         intro=f"Paired by seed, with Student's t over seeds. {which_adjusted(primary)} The rare"
         f" conditions are {', '.join(words(name) for name in rare)}.",
-        tables=[Table(rows, set(rows[0]) - {"contrast", "measure"})],
+        tables=[Table(rows)],
     )
 
 
@@ -461,7 +455,7 @@ def _arms(arms: Rows, order: list[str]) -> Section | None:
         "values alone.",
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
         two=True,
-        tables=[Table(rows, set(rows[0]) - {"arm"})],
+        tables=[Table(rows)],
     )
 
 

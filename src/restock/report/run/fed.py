@@ -18,9 +18,7 @@ from restock.report.look.blocks import (
     Rows,
     Section,
     Table,
-    count,
-    number,
-    percent,
+    shown,
     span,
     words,
 )
@@ -127,24 +125,17 @@ def share_bars(facts: Facts) -> Rows:
 
 def fed_table(facts: Facts) -> Table:
     """Show the feed in numbers, with sources, shortages and their reasons."""
-    shares = ("natural", "wanted", "drawn", "logs", "fresh", "short")
+    columns = {
+        "stratum": "stratum",
+        **{f"{name}_share": name for name in ("natural", "wanted", "drawn")},
+        **{"logs_share": "from logs", "fresh_share": "fresh", "short_share": "short"},
+        **{"drawn_rows": "rows drawn", "reason": "why short"},
+    }
     return Table(
-        [
-            {
-                "stratum": words(row["stratum"]),
-                **{_SHARE_TITLES.get(name, name): percent(row[f"{name}_share"]) for name in shares},
-                "rows drawn": count(row["drawn_rows"]),
-                "why short": row["reason"] or "",
-            }
-            for row in facts.fed
-        ],
-        {*(_SHARE_TITLES.get(name, name) for name in shares), "rows drawn"},
+        shown(facts.fed, columns),
         caption="Shares are of all rows fed, over the whole run. Natural: what the same sources "
         "would have given if drawn from uniformly.",
     )
-
-
-_SHARE_TITLES = {"logs": "from logs", "fresh": "fresh"}
 
 
 def remarks(facts: Facts) -> list[str]:
@@ -195,30 +186,27 @@ def source_table(facts: Facts) -> Table:
     wanted = {stratum.name: stratum.wanted_share for stratum in facts.strata}
     rows = []
     for row in facts.sampled:
-        of_panel = row["source"] != "fresh"
-        name, available = row["stratum"], row["available_rows"]
-        share = natural.get(name, row["available_share"]) if of_panel else row["available_share"]
-        replays = f"{row['drawn_rows'] / available:.1f}" if available else ""
+        of_panel, available = row["source"] != "fresh", row["available_rows"]
+        wanted_share = wanted.get(row["stratum"], row["quota_share"])
         rows.append(
             {
-                "source": row["source"],
-                "stratum": words(name),
-                "timing": row["timing"] or "",
-                "available": count(available),
-                "natural": percent(share),
-                "wanted": percent(wanted.get(name, row["quota_share"]) if of_panel else None),
-                "drawn": percent(row["drawn_share"]),
-                "after weights": percent(row["effective_share"]),
-                "rows drawn": count(row["drawn_rows"]),
-                "replays per row": replays,
-                "mean reward": number(row["reward_mean"]),
-                "terminal": percent(row["terminal_share"]),
+                **row,
+                "natural_share": natural.get(row["stratum"], row["available_share"])
+                if of_panel
+                else row["available_share"],
+                "wanted_share": wanted_share if of_panel else None,
+                "replays": f"{row['drawn_rows'] / available:.1f}" if available else "",
             }
         )
-    numbers = set(rows[0]) - {"source", "stratum", "timing"} if rows else set()
+    columns = {
+        **{name: name for name in ("source", "stratum", "timing")},
+        **{"available_rows": "available", "natural_share": "natural", "wanted_share": "wanted"},
+        **{"drawn_share": "drawn", "effective_share": "after weights", "drawn_rows": "rows drawn"},
+        **{"replays": "replays per row", "reward_mean": "mean reward"},
+        "terminal_share": "terminal",
+    }
     return Table(
-        rows,
-        numbers,
+        shown(rows, columns),
         caption="Shares are of the source. Replays per row: rows drawn divided by rows available "
         "at the end; for a ring that was overwritten, this is an upper bound.",
     )
@@ -257,18 +245,11 @@ def practice_section(facts: Facts) -> Section | None:
     rows = by_arm(facts)
     if not rows:
         return None
-    shown = [
-        {
-            "missions": words(row["arm"]),
-            "natural": percent(row["natural_share"]),
-            "wanted at first": percent(row["first_share"]),
-            "wanted at last": percent(row["last_share"]),
-            "given": percent(row["given_share"]),
-            "ended": count(row["episodes"]),
-            "success, exploring": "" if row["success"] is None else f"{row['success']:.2f}",
-        }
-        for row in rows
-    ]
+    columns = {
+        **{"arm": "missions", "natural_share": "natural", "first_share": "wanted at first"},
+        **{"last_share": "wanted at last", "given_share": "given", "episodes": "ended"},
+        "success": "success, exploring",
+    }
     rule = rows[0]["rule"]
     return Section(
         "practice",
@@ -276,7 +257,7 @@ def practice_section(facts: Facts) -> Section | None:
         intro=f"Missions in the twin, by the rule “{rule}”. Shares are of missions that ended "
         "while the agent explored; its success is lower there than in evaluations.",
         figures=[] if rule in FIXED else [Figure(_wanted_shares(facts.practice), "Wanted shares")],
-        tables=[Table(shown, set(shown[0]) - {"missions"})],
+        tables=[Table(shown(rows, columns))],
     )
 
 
@@ -434,20 +415,14 @@ def _action_table(rows: Rows) -> list[Table]:
         if row["wanted_share"] > 2 * share:
             gaps.append((row["wanted_share"] - share, share, row))
     gaps.sort(key=lambda gap: -gap[0])
-    lines = [
-        {
-            "condition": words(row["condition"]),
-            "action": row["name"],
-            "wanted": percent(row["wanted_share"]),
-            "in the logs": percent(share),
-            "in fresh rows": percent(row["drawn_share"]),
-            "rows checked": count(row["audited_rows"]),
-        }
-        for _, share, row in gaps[:_LINES]
-    ]
-    numbers = {"wanted", "in the logs", "in fresh rows", "rows checked"}
+    columns = {
+        **{"condition": "condition", "name": "action", "wanted_share": "wanted"},
+        **{"logged_share": "in the logs", "drawn_share": "in fresh rows"},
+        "audited_rows": "rows checked",
+    }
     title = "Preferred more than twice as often as in the logs"
-    return [Table(lines, numbers, title=title)] if lines else []
+    lines = [row | {"logged_share": share} for _, share, row in gaps[:_LINES]]
+    return [Table(shown(lines, columns), title=title)] if lines else []
 
 
 def capacity_section(facts: Facts) -> Section | None:
@@ -464,18 +439,12 @@ def capacity_section(facts: Facts) -> Section | None:
         else (f"by the panel's diversity, {requested:,} would be enough")
     )
     intro = f"The ring holds {ring or 0:,} rows; {how}: {capacity['reason']}."
-    rows = [
-        {
-            "newest rows": count(point["capacity"]),
-            "cells": count(point["cells"]),
-            "share of cells": percent(point["cells_share"]),
-            "conditions": count(point["conditions"]),
-            "episodes": count(point["episodes"]),
-            "effective episodes": f"{point['effective_episodes']:.1f}",
-        }
-        for point in capacity["curve"]
-        if point["capacity"] >= 64
-    ]
+    columns = {
+        **{"capacity": "newest rows", "cells": "cells", "cells_share": "share of cells"},
+        **{"conditions": "conditions", "episodes": "episodes"},
+        "effective_episodes": "effective episodes",
+    }
+    rows = [point for point in capacity["curve"] if point["capacity"] >= 64]
     return Section(
         "capacity",
         "How large must the buffer be?",
@@ -483,7 +452,7 @@ def capacity_section(facts: Facts) -> Section | None:
         "buffer forgets whole cells, which no sampling can bring back.",
         figures=[Figure(_cells_kept(capacity), "Cells covered by the newest logged rows")],
         two=True,
-        tables=[Table(rows, set(rows[0]) if rows else set())],
+        tables=[Table(shown(rows, columns))],
     )
 
 

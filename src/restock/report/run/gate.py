@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import altair as alt
 
-from restock import __version__
 from restock.report.look.blocks import Drawing, Figure, Section, Table, count, words
 from restock.report.look.charts import FULL, draw, label_px, plot, side_by_side
 from restock.stats import interval_text
@@ -37,7 +35,6 @@ def gate_page(document: dict[str, Any]) -> dict[str, Any]:
             for word, number in of.items()
         ],
         "sections": [_evidence(cells), _limits(document)],
-        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
 
 
@@ -70,7 +67,7 @@ def _evidence(cells: list[dict[str, Any]]) -> Section:
         )
         for measure, of in by_measure.items()
     ]
-    return Section("evidence", "Evidence", figures=figures, tables=[Table(rows, {"pairs"})])
+    return Section("evidence", "Evidence", figures=figures, tables=[Table(rows)])
 
 
 def _curves(cells: list[dict[str, Any]], *, several_floors: bool) -> Drawing:

@@ -9,7 +9,19 @@ from __future__ import annotations
 from typing import Any
 
 from restock.errors import RunError, quoted
-from restock.report.look.blocks import Rows, Section, Table, estimate, span, words
+from restock.report.look.blocks import (
+    Rows,
+    Section,
+    Table,
+    estimate,
+    listed,
+    measured,
+    named,
+    points,
+    points_text,
+    span,
+    words,
+)
 from restock.report.run.facts import Facts, mean_success
 from restock.report.run.twin_gap import find_gap
 from restock.train.evaluation.regression import EVERY, read_run_evaluation, regression
@@ -20,7 +32,6 @@ BASELINES = {
     "cloned": "the logs' drivers, cloned,",
     "random": "a random policy",
 }
-MAX_NAMED = 3  # conditions of a verdict in the headline
 _WITHOUT = "evaluate it together with one: `restock eval --policies agent,planner`"
 
 
@@ -114,7 +125,7 @@ def _against_baseline(facts: Facts) -> str:
         for verdict in ("worse", "better")
     }
     parts = [
-        f"{verdict} than {who} in {_named(by[verdict])}"
+        f"{verdict} than {who} in {named(by[verdict])}"
         for verdict in ("better", "worse")
         if by[verdict]
     ]
@@ -123,49 +134,28 @@ def _against_baseline(facts: Facts) -> str:
     apart = [words(row["condition"]) for row in rows if row["verdict"] == "refused"]
     if same:
         against = "" if parts else f" from {who}"
-        names = _listed([words(row["condition"]) for row in same])
+        names = listed([words(row["condition"]) for row in same])
         alone = not parts and len(same) == len(rows) > 1
         parts.append(f"no difference{against} is shown in {'any condition' if alone else names}")
         if against and len(same) == 1:
-            parts[-1] += f" ({_difference(same[0])})"
+            parts[-1] += f" ({points_text(same[0])})"
         elif against:
             lowest = min(same, key=lambda row: row["difference"])
-            parts[-1] += f"; the lowest is {_difference(lowest)} in {words(lowest['condition'])}"
+            parts[-1] += f"; the lowest is {points_text(lowest)} in {words(lowest['condition'])}"
     if few:
         against = "" if parts else f" from {who}"
         parts.append(f"too few episodes to tell a difference{against} in {_few(few)}")
     if apart:
         as_who = "" if parts else f" as {who}"
-        parts.append(f"not on the same episodes{as_who} in {_listed(apart)}")
+        parts.append(f"not on the same episodes{as_who} in {listed(apart)}")
     text = "; ".join(parts)
     return text[0].upper() + text[1:]
 
 
 def _few(rows: Rows) -> str:
-    return _listed(
-        [f"{words(row['condition'])} ({_signed(row['difference'])} points)" for row in rows]
+    return listed(
+        [f"{words(row['condition'])} ({points(row['difference'])} points)" for row in rows]
     )
-
-
-def _named(rows: Rows) -> str:
-    ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
-    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MAX_NAMED]]
-    return _listed(named + [f"{len(rows) - MAX_NAMED} more"] * (len(rows) > MAX_NAMED))
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
-
-
-def _difference(row: dict[str, Any]) -> str:
-    """Format points of success, with their interval."""
-    low, high = _signed(row["difference_low"]), _signed(row["difference_high"])
-    return f"{_signed(row['difference'])} points [{low}, {high}]"
-
-
-def _signed(value: float) -> str:
-    """Format points of a share, with a true minus sign."""
-    return f"{100 * value:+.0f}".replace("-", "−")
 
 
 def _alone(row: dict[str, Any]) -> str:
@@ -216,18 +206,12 @@ def _safety(facts: Facts, name: str) -> str:
         return ""
     who = BASELINES[name].removesuffix(",")
     text = (
-        f"It bumped {_told(own, 'bumps_per_km', '.0f')} times per km, {who} "
-        f"{_told(other, 'bumps_per_km', '.0f')}"
+        f"It bumped {measured(own, 'bumps_per_km', '.0f')} times per km, {who} "
+        f"{measured(other, 'bumps_per_km', '.0f')}"
     )
     if name == "planner" and own.get("time_lost_s") is not None:
-        text += f"; where both arrived it took {_told(own, 'time_lost_s', '+.1f')} s"
-    return text + "."
-
-
-def _told(row: dict[str, Any], name: str, form: str) -> str:
-    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
-    ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
-    return f"{row[name]:{form}}{ends}".replace("-", "−")
+        text += f"; where both arrived it took {measured(own, 'time_lost_s', '+.1f')} s"
+    return text.replace("-", "−") + "."
 
 
 _ESTIMATORS = {
@@ -304,7 +288,6 @@ def off_policy_table(rows: Rows) -> Table:
     ]
     return Table(
         shown,
-        {"episodes"},
         title="Off-policy evaluation on held-out logs, before it drove",
         caption="Over all conditions. An estimate is refused if the weights leave too few "
         "episodes. Fitted Q evaluation rests only on a model of the values, and has no "

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 from restock.errors import counted, policy_words
@@ -14,6 +12,7 @@ from restock.report.look.blocks import (
     Section,
     Table,
     count,
+    measured,
     percent,
     pretty,
     span,
@@ -50,9 +49,8 @@ def page(facts: Facts) -> dict[str, Any]:
         "headline": headline(facts),
         "lead": lead(facts),
         "cards": _cards(facts),
-        "sections": [section for section in sections if section is not None],
-        "footer": f"restock {facts.config.get('versions', {}).get('restock', '')} · written"
-        f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from {facts.run}",
+        "sections": sections,
+        "source": str(facts.run),
     }
 
 
@@ -126,13 +124,13 @@ def success(facts: Facts) -> Section | None:
             if row["success"] is None
             else f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]",
             "episodes": row["episodes"],
-            "discounted return": _told(row, "discounted_return", ".2f"),
-            "bumps per km": _told(row, "bumps_per_km", ".1f"),
-            "least distance to people": _told(row, "closest_person_least_m", ".2f", " m"),
-            "time to goal": _told(row, "time_s", ".1f", " s"),
+            "discounted return": measured(row, "discounted_return", ".2f"),
+            "bumps per km": measured(row, "bumps_per_km", ".1f"),
+            "least distance to people": measured(row, "closest_person_least_m", ".2f", " m"),
+            "time to goal": measured(row, "time_s", ".1f", " s"),
             "time lost to the planner": ""
             if row["policy"] == "planner"
-            else _told(row, "time_lost_s", "+.1f", " s"),
+            else measured(row, "time_lost_s", "+.1f", " s"),
         }
         for row in sorted(shown, key=lambda row: (places[_place(row)], row["policy"] != "agent"))
         if row["policy"] != "random"
@@ -157,36 +155,22 @@ def success(facts: Facts) -> Section | None:
 
 def _success_table(perturbation: str, rows: Rows) -> Table:
     """Show the success under one perturbation, folded unless that is the clean one."""
-    reported = {name for row in rows for name, value in row.items() if value != ""} - {
-        "perturbation"
-    }
     shown, before = [], None
     for row in rows:
         kind = row["kind of episode"]
-        line = {name: value for name, value in row.items() if name in reported}
-        shown.append(line | {"kind of episode": "" if kind == before else kind})
+        shown.append(row | {"perturbation": "", "kind of episode": "" if kind == before else kind})
         before = kind
     clean = perturbation == "clean"
-    return replace(
-        _table(
-            shown,
-            {"policy", "kind of episode"},
-            title="Success, return and safety side by side"
-            + ("" if clean else f": {perturbation}"),
-            caption="Intervals are 95 % over episodes. People include forklifts; the distance is "
-            "the true one from the edge of the body. Time lost is over the missions in which "
-            "both arrived."
-            if clean
-            else "",
-        ),
+    return Table(
+        shown,
+        title="Success, return and safety side by side" + ("" if clean else f": {perturbation}"),
+        caption="Intervals are 95 % over episodes. People include forklifts; the distance is "
+        "the true one from the edge of the body. Time lost is over the missions in which "
+        "both arrived."
+        if clean
+        else "",
         folded=not clean,
     )
-
-
-def _table(rows: Rows, texts: set[str], *, title: str = "", caption: str = "") -> Table:
-    """Make a table whose columns are numbers, except `texts`."""
-    numbers = set(rows[0]) - texts if rows else set()
-    return Table(rows, numbers, title=title, caption=caption)
 
 
 def _cell_order(row: dict[str, Any]) -> tuple[str, int, str]:
@@ -198,15 +182,6 @@ def _cell_order(row: dict[str, Any]) -> tuple[str, int, str]:
 
 def _place(row: dict[str, Any]) -> tuple[str, str]:
     return row["perturbation"], row["cell"]
-
-
-def _told(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
-    """Format a value with its unit and interval; nothing if it is unknown."""
-    if row[name] is None:
-        return ""
-    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
-    ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
-    return f"{row[name]:{form}}{unit}{ends}"
 
 
 def learning(facts: Facts) -> Section:
@@ -326,7 +301,7 @@ def provenance(facts: Facts) -> Section:
             }
             for row in facts.recordings
         ]
-        tables.append(Table(rows, {"length", "episodes", "transitions"}, title="Recordings"))
+        tables.append(Table(rows, title="Recordings"))
     tables.append(Table(unlabelled, title="Conditions of the logs that the twin cannot show"))
     versions = facts.config.get("versions", {})
     software = [{"software": name, "version": str(value)} for name, value in versions.items()]
@@ -347,10 +322,10 @@ def labels_section(facts: Facts) -> Section | None:
         return None
     rows = [_score(row) for row in facts.labels]
     reliability = _reliability(facts.reliability)
-    tables = [Table(rows, set(rows[0]) - {"condition"})]
+    tables = [Table(rows)]
     if reliability:
         title = "Steps with probability p: the share that is true should be p"
-        tables.append(Table(reliability, set(reliability[0]) - {"condition"}, title=title))
+        tables.append(Table(reliability, title=title))
     return Section(
         "labels",
         "How good are the labels?",
@@ -366,24 +341,19 @@ def _score(row: dict[str, Any]) -> dict[str, str]:
     return {
         "condition": words(row["condition"]),
         "true steps": count(row["support"]),
-        "precision": _two_decimals(row["precision"]),
-        "recall": _two_decimals(row["recall"]),
-        "true events": count(row["event_support"]) if row["event_support"] is not None else "",
+        "precision": measured(row, "precision", ".2f"),
+        "recall": measured(row, "recall", ".2f"),
+        "true events": count(row["event_support"]),
         "event precision": _with_range(row["event_precision"], row["event_labelled"]),
         "event recall": _with_range(row["event_recall"], row["event_support"]),
         "uncertain": percent(row["uncertain_share"] or 0.0),
     }
 
 
-def _two_decimals(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
 def _with_range(value: float | None, events: int | None) -> str:
     if value is None or not events:
         return ""
-    low, high = wilson(round(value * events), events)
-    return f"{value:.2f} ({low:.2f} to {high:.2f})"
+    return interval_text(value, *wilson(round(value * events), events))
 
 
 def _reliability(bins: list[dict[str, Any]]) -> list[dict[str, str]]:
@@ -436,7 +406,6 @@ def ways_section(facts: Facts) -> Section | None:
         tables=[
             Table(
                 shown,
-                set(shown[0]) - {"kind of episode", "policy"},
                 title="Success on logged routes",
                 caption="Intervals are 95 % Wilson intervals over routes; with few routes they "
                 "are wide.",

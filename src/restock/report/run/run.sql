@@ -18,7 +18,6 @@ SELECT source,
        sum(drawn_rows) AS drawn_rows,
        sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source) AS drawn_share,
        sum(effective_share * source_rows) / nullif(any_value(totals.rows), 0) AS effective_share,
-       last(td_abs_mean ORDER BY gradient_steps) AS td_abs_mean,
        sum(reward_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS reward_mean,
        sum(terminal_share * drawn_rows) / nullif(sum(drawn_rows), 0) AS terminal_share
 FROM drawn JOIN totals USING (source)
@@ -80,7 +79,7 @@ ORDER BY source DESC, rows DESC;
 -- name: learning
 -- Success per condition at each periodic greedy evaluation on fixed episodes.
 SELECT env_steps, CASE WHEN block IN ('partial', 'full') THEN condition || ' (' || block || ')' ELSE condition END AS condition,
-       avg(success::INT) AS success, avg("return") AS mean_return, bool_or(best) AS best, count(*) AS episodes
+       avg(success::INT) AS success
 FROM evaluations
 GROUP BY ALL
 ORDER BY env_steps, condition;
@@ -95,13 +94,13 @@ ORDER BY gradient_steps, condition;
 
 -- name: lag
 -- How far the target network is behind.
-SELECT gradient_steps, target_q_lag, target_param_distance
+SELECT gradient_steps, target_q_lag
 FROM progress
 WHERE gradient_steps > 0
 ORDER BY gradient_steps;
 
 -- name: loss
-SELECT gradient_steps, env_steps, phase, loss, q_mean, epsilon, wall_s
+SELECT gradient_steps, phase, loss
 FROM progress
 WHERE updates > 0
 ORDER BY gradient_steps;

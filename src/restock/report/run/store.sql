@@ -28,8 +28,7 @@ ORDER BY hash(transition_id)
 LIMIT $most;
 
 -- name: recordings
-SELECT source_file, format, duration_s, steps, episodes, transitions, recording_id, profile,
-       profile_hash, labels_version, restock_version
+SELECT source_file, format, duration_s, episodes, transitions, recording_id, profile, profile_hash
 FROM recordings
 ORDER BY source_file;
 
@@ -45,7 +44,7 @@ LEFT JOIN (
 ORDER BY condition;
 
 -- name: reliability
-SELECT condition, from_probability, mean_probability, true_share, known
+SELECT condition, from_probability, true_share, known
 FROM label_reliability
 WHERE known > 0
 ORDER BY condition, from_probability;

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import altair as alt
-
-from restock import __version__
 from restock.errors import RestockError, counted
 from restock.report.look import charts
 from restock.report.look.blocks import (
@@ -104,16 +100,11 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
             for kind, meaning in _MEANING.items()
         ],
         "sections": [
-            section
-            for section in (
-                replace(gap_section(gap), callout=""),  # the headline says it
-                _steps_section(gap),
-                _signals_section(gap),
-            )
-            if section is not None
+            replace(gap_section(gap), callout=""),  # the headline says it
+            _steps_section(gap),
+            _signals_section(gap),
         ],
-        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
-        f" {about['store']}, version {about['store_version']}",
+        "source": f"{about['store']}, version {about['store_version']}",
     }
 
 
@@ -181,41 +172,25 @@ def gap_section(gap: TwinGap) -> Section:
         if shown
         else [],
         tables=[
-            Table(rows, numbers={"segments", "episodes"}),
+            Table(rows),
             Table([{"notes": note} for note in gap.not_done]),
         ],
     )
 
 
 def _positions(rows: Rows) -> Drawing:
-    sources = charts.ordered(rows, "source", COLOURS)
-    conditions = list(dict.fromkeys(row["condition"] for row in rows))
-    horizons = list(dict.fromkeys(row["horizon"] for row in rows))
-    known = any(row["median_low"] is not None for row in rows)
-
-    def chart(width: int) -> Any:
-        quiet = alt.Axis(grid=False, ticks=False)
-        metres = alt.Axis(tickCount=max(3, width // len(horizons) // 90))
-        base = charts.plot(rows).encode(
-            y=alt.Y("condition:N", sort=conditions, title=None, axis=quiet),
-            yOffset=alt.YOffset("source:N", sort=sources),
-            color=charts.coloured("source", sources, COLOURS, width, charts.label_px(conditions)),
-        )
-        bars = (
-            base.transform_filter("isValid(datum.median_low)")
-            .mark_rule(strokeWidth=3, opacity=0.45)
-            .encode(x=alt.X("median_low:Q", title="metres", axis=metres), x2="median_high:Q")
-        )
-        dots = base.mark_circle(size=60, opacity=1).encode(
-            x=alt.X("median:Q", title="metres", axis=metres)
-        )
-        ticks = base.mark_tick(thickness=2, size=9).encode(x=alt.X("p90:Q"))
-        layers = [bars, dots, ticks] if known else [dots, ticks]
-        layered = alt.layer(*layers).properties(height=60 * len(conditions))
-        labels_px = charts.label_px(conditions)
-        return charts.side_by_side(layered, "horizon", horizons, width, labels_px)
-
-    return charts.draw(chart, charts.FULL)
+    return charts.estimates(
+        rows,
+        y="condition",
+        series="source",
+        names=charts.ordered(rows, "source", COLOURS),
+        colours=COLOURS,
+        value="median",
+        ends=("median_low", "median_high"),
+        title="metres",
+        tick="p90",
+        beside="horizon",
+    )
 
 
 def _steps_section(gap: TwinGap) -> Section:
@@ -244,13 +219,11 @@ def _steps_section(gap: TwinGap) -> Section:
         tables=[
             Table(
                 rewards,
-                numbers={"logged mean", "logged spread", *map(source_name, twins)},
                 title="Reward, by term",
                 caption="Terms that are the same on both sides everywhere are left out.",
             ),
             Table(
                 _observations(gap),
-                numbers={*map(source_name, twins), "persistence"},
                 title="Observation, by component, in nominal driving",
                 caption="As the policy sees them, scaled to about -1 to 1. The sectors of a lidar "
                 "are shown together; observations.parquet has each component and condition.",
@@ -288,7 +261,6 @@ def _signals_section(gap: TwinGap) -> Section | None:
         tables=[
             Table(
                 rows,
-                numbers={"segments", *sources},
                 title=counted(len(rows), "median"),
                 folded=len(rows) > MAX_ROWS,
             )
