@@ -449,7 +449,7 @@ def _outcomes(rows: Rows, value: str, title: str, neutral: float, x_scale: alt.S
     """Draw one measure of outcomes beside the value of no difference; differences in points."""
     factor = 100 if value == "difference" else 1
     columns = (value, f"{value}_low", f"{value}_high")
-    shown = [
+    shown: Rows = [
         {
             "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
             "condition": words(row["condition"]),
