@@ -6,7 +6,6 @@ import gc
 import json
 import re
 import weakref
-from pathlib import Path
 from typing import Any
 
 import duckdb
@@ -16,7 +15,6 @@ import pytest
 from deltalake import write_deltalake
 from support.stores import TASK, manifest, one, recording_transitions, write_store
 
-import restock
 from restock.cli import main
 from restock.errors import QueryError, StoreError
 from restock.ingest.profile.tag_rules import NAMED
@@ -29,7 +27,7 @@ from restock.replay.store.store import Store, is_store
 
 
 @pytest.fixture(scope="module")
-def store(store_path: Path) -> Store:
+def store(store_path) -> Store:
     return Store(store_path)
 
 
@@ -38,7 +36,7 @@ def rows(store: Store, query: str) -> list[dict[str, object]]:
     return found
 
 
-def test_transitions_are_those_that_were_written(store: Store, transitions: pa.Table) -> None:
+def test_transitions_are_those_that_were_written(store, transitions):
     read = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
     expected = transitions.sort_by("transition_id")
     expected = expected.rename_columns({"condition": "primary_condition"})
@@ -53,7 +51,7 @@ def test_transitions_are_those_that_were_written(store: Store, transitions: pa.T
 
 
 @pytest.mark.parametrize("attached", [False, True])
-def test_no_join_holds_the_transitions_in_memory(store: Store, attached: bool) -> None:
+def test_no_join_holds_the_transitions_in_memory(store, attached):
     def held(node: dict[str, Any]) -> list[str]:
         """Return what the joins of a plan keep: their right sides."""
         of_join = [str(node["children"][1])] if node["name"] == "HASH_JOIN" else []
@@ -73,13 +71,8 @@ def test_no_join_holds_the_transitions_in_memory(store: Store, attached: bool) -
         assert not any("transitions" in text or "reward" in text for text in joins), query
 
 
-def test_a_store_opens_from_the_front_door(store_path: Path) -> None:
-    with restock.open(str(store_path)) as opened:
-        assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(3,)]
-
-
-def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path: Path) -> None:
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
+def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path):
+    path = write_store(tmp_path / "Läger 7 (neu)" / "my store", [recording_transitions(1)])
     write_deltalake(str(path / "recordings"), manifest(recording_transitions(2)), mode="append")
     with Store(path) as store:
         assert store.sql("SELECT DISTINCT recording_id FROM recordings").fetchall() == [
@@ -87,7 +80,7 @@ def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path: Path) -> N
         ]
 
 
-def test_an_older_version_can_be_opened(store_path: Path, transitions: pa.Table) -> None:
+def test_an_older_version_can_be_opened(store_path, transitions):
     with Store(store_path, version=0) as store:
         assert store.sql("SELECT count(DISTINCT recording_id) FROM transitions").fetchall() == [
             (1,)
@@ -97,19 +90,21 @@ def test_an_older_version_can_be_opened(store_path: Path, transitions: pa.Table)
         Store(store_path, version=9)
 
 
-@pytest.mark.parametrize("found", [None, "restock-store/1", "restock-store/99"])
-@pytest.mark.parametrize("command", [["sql", "FROM recordings"], ["audit"], ["store", "compact"]])
+@pytest.mark.parametrize(
+    ("found", "command"),
+    [(None, "sql"), ("restock-store/1", "audit"), ("restock-store/99", "store compact")],
+)
 def test_a_store_of_another_format_is_refused(tmp_path, monkeypatch, capsys, found, command):
     monkeypatch.setattr("support.stores.FORMAT", found)
     path = write_store(tmp_path / "store", [recording_transitions(1)])
-    words = command if command[0] == "store" else command[:1]
-    assert main([*words, str(path), *command[len(words) :]]) == 2
+    query = ["FROM recordings"] if command == "sql" else []
+    assert main([*command.split(), str(path), *query]) == 2
     said = capsys.readouterr().err
     assert str(path) in said
     assert "restock ingest RECORDINGS --store NEW" in said
 
 
-def test_columns_that_older_rows_lack_are_null(tmp_path: Path) -> None:
+def test_columns_that_older_rows_lack_are_null(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     newer = recording_transitions(2)
     newer = newer.append_column("payload_kg", pa.array(np.full(len(newer), 3.0)))
@@ -122,7 +117,7 @@ def test_columns_that_older_rows_lack_are_null(tmp_path: Path) -> None:
     assert found == [(f"{1:016x}", None), (f"{2:016x}", 3.0)]
 
 
-def test_episodes_are_those_of_a_naive_reading(store: Store, transitions: pa.Table) -> None:
+def test_episodes_are_those_of_a_naive_reading(store, transitions):
     by_episode: dict[str, list[dict[str, object]]] = {}
     for row in transitions.to_pylist():
         by_episode.setdefault(row["episode_id"], []).append(row)
@@ -143,11 +138,10 @@ def test_episodes_are_those_of_a_naive_reading(store: Store, transitions: pa.Tab
         assert episode["handovers"] == 0
 
 
-def test_a_handover_is_counted_and_a_missing_step_is_seen(tmp_path: Path) -> None:
+def test_a_handover_is_counted_and_a_missing_step_is_seen(tmp_path):
     table = recording_transitions(1, episodes=1)
     policy = np.where(np.arange(len(table)) < 5, "planner", "operator")
-    place = table.schema.get_field_index("behaviour_policy")
-    table = table.set_column(place, table.schema.field(place), pa.array(policy))
+    table = replaced(table, {"behaviour_policy": policy.tolist()})
     table = pa.concat_tables([table.slice(0, 3), table.slice(4)])
     with Store(write_store(tmp_path / "s", [table])) as store:
         (episode,) = rows(store, "FROM episodes")
@@ -156,7 +150,7 @@ def test_a_handover_is_counted_and_a_missing_step_is_seen(tmp_path: Path) -> Non
     assert episode["first_policy"] == "planner"
 
 
-def test_without_a_goal_there_is_no_success(tmp_path: Path) -> None:
+def test_without_a_goal_there_is_no_success(tmp_path):
     task = Task(body=TASK.body, actions=TASK.actions, sectors=4, goal="none")
     path = write_store(tmp_path / "s", [recording_transitions(1, task=task)], task=task)
     with Store(path) as store:
@@ -164,7 +158,7 @@ def test_without_a_goal_there_is_no_success(tmp_path: Path) -> None:
         assert store.sql("SELECT DISTINCT success_share FROM coverage").fetchall() == [(None,)]
 
 
-def test_coverage_counts_every_row_once_by_priority(store: Store, transitions: pa.Table) -> None:
+def test_coverage_counts_every_row_once_by_priority(store, transitions):
     found = rows(store, "FROM coverage")
     assert sum(row["primary_rows"] for row in found) == len(transitions)  # type: ignore[misc]
     assert sum(row["primary_share"] for row in found) == pytest.approx(1)  # type: ignore[misc]
@@ -177,7 +171,7 @@ def test_coverage_counts_every_row_once_by_priority(store: Store, transitions: p
         assert 1 <= row["effective_episodes"] <= row["episodes_held"]  # type: ignore[operator]
 
 
-def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path: Path) -> None:
+def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path):
     table = recording_transitions(1)
     keep = [
         "wheel_slip" not in held and not ("recovery" in held and action == 2)
@@ -196,9 +190,7 @@ def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path: Path) -> No
         ]
 
 
-def test_a_row_counts_for_every_condition_that_holds_in_it(
-    store: Store, transitions: pa.Table
-) -> None:
+def test_a_row_counts_for_every_condition_that_holds_in_it(store, transitions):
     held = [conditions or ["nominal"] for conditions in transitions["conditions"].to_pylist()]
     lines = rows(store, "FROM coverage_by_condition")
     assert {line["condition"]: line["rows_held"] for line in lines} == {
@@ -222,7 +214,7 @@ def test_a_row_counts_for_every_condition_that_holds_in_it(
             assert sum(row.get("rows_held", 1) for row in found) == len(mine), question
 
 
-def test_a_filter_by_condition_is_not_answered_with_a_part_of_the_rows(store: Store) -> None:
+def test_a_filter_by_condition_is_not_answered_in_part(store):
     for text in (
         "SELECT median(reward) FROM transitions WHERE condition = 'wheel_slip'",
         "SELECT t.condition, count(*) FROM transitions AS t GROUP BY ALL",
@@ -236,26 +228,20 @@ def test_a_filter_by_condition_is_not_answered_with_a_part_of_the_rows(store: St
         assert "`primary_condition`" in str(refused.value)
 
 
-def test_actions_of_coverage_have_their_names(store: Store) -> None:
+def test_actions_have_names_unless_two_tasks_differ(store, tmp_path):
     for view in ("coverage", "cells_below(10000)"):
         named = store.sql(f"SELECT DISTINCT action, action_name FROM {view} ORDER BY 1").fetchall()
         assert dict(named).items() <= dict(enumerate(TASK.action_names)).items()
         assert len(named) > 1
-
-
-def test_an_action_that_two_tasks_name_differently_has_no_name(tmp_path: Path) -> None:
     other = Task(body=TASK.body, actions=(TASK.actions[0], *reversed(TASK.actions[1:])), sectors=4)
     path = write_store(tmp_path / "s", [recording_transitions(1)])
-    second = recording_transitions(2, task=other)
-    write_deltalake(str(path / "recordings"), manifest(second, task=other), mode="append")
-    write_deltalake(str(path / "transitions"), second, mode="append")
-    with Store(path) as store:
-        assert store.sql(
-            "SELECT DISTINCT action_name FROM coverage WHERE action = 1"
-        ).fetchall() == [(None,)]
+    write_store(path, [recording_transitions(2, task=other)], task=other)
+    question = "SELECT DISTINCT action_name FROM coverage WHERE action = 1"
+    with Store(path) as of_two:
+        assert of_two.sql(question).fetchall() == [(None,)]
 
 
-def test_overlap_counts_pairs_both_ways(store: Store, transitions: pa.Table) -> None:
+def test_overlap_counts_pairs_both_ways(store, transitions):
     held = [set(conditions) for conditions in transitions["conditions"].to_pylist()]
     for row in rows(store, "FROM label_overlap"):
         both = sum({row["condition"], row["other"]} <= names for names in held)
@@ -264,39 +250,30 @@ def test_overlap_counts_pairs_both_ways(store: Store, transitions: pa.Table) -> 
         assert row["share"] == pytest.approx(both / one)
 
 
-def test_near_duplicates_are_found(tmp_path: Path) -> None:
+def test_near_duplicates_are_found(tmp_path):
     table = recording_transitions(1)
     observation = table["observation"].to_pylist()
     observation[9] = [value + 1e-7 for value in observation[4]]
     action = table["action"].to_pylist()
     action[9] = action[4]
-    for name, values in (("observation", observation), ("action", action)):
-        place = table.schema.get_field_index(name)
-        table = table.set_column(
-            place, table.schema.field(place), pa.array(values, table.schema.field(place).type)
-        )
+    table = replaced(table, {"observation": observation, "action": action})
     with Store(write_store(tmp_path / "s", [table])) as store:
         found = rows(store, "FROM near_duplicates(4)")
     assert [row["copies"] for row in found] == [2]
     assert found[0]["transition_id"] == (1 << 25) + 4
 
 
-def test_ages_are_against_the_moment_asked_for(store: Store, transitions: pa.Table) -> None:
+def test_ages_are_against_the_moment_asked_for(store, transitions):
     newest = max(transitions["stamp_ns"].to_pylist())
     day = "make_timestamp_ns(" + str(newest + 3 * 86400 * 10**9) + ")"
     ages = rows(store, f"FROM ages_at({day})")
     assert min(row["age_min_days"] for row in ages) == pytest.approx(3, abs=1e-3)  # type: ignore[type-var]
 
 
-def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path: Path) -> None:
-    table = recording_transitions(1)
-    place = table.schema.get_field_index("stamp_ns")
-    simulated = pa.array(np.arange(len(table)) * 200_000_000)
-    table = table.set_column(place, table.schema.field(place), simulated)
-    row = manifest(table)
-    place = row.schema.get_field_index("clock_offset_ns")
-    offset = pa.array([1_700_000_000 * 10**9])
-    row = row.set_column(place, row.schema.field(place), offset)
+def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path):
+    simulated = np.arange(len(recording_transitions(1))) * 200_000_000
+    table = replaced(recording_transitions(1), {"stamp_ns": simulated})
+    row = replaced(manifest(table), {"clock_offset_ns": [1_700_000_000 * 10**9]})
     write_deltalake(str(tmp_path / "recordings"), row, description=FORMAT)
     write_deltalake(str(tmp_path / "transitions"), table, description=FORMAT)
     with Store(tmp_path) as store:
@@ -304,7 +281,7 @@ def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path: Path) -> N
     assert oldest == "2023-11-14 22:13:20"
 
 
-def test_every_column_of_every_view_is_documented(store: Store) -> None:
+def test_every_column_of_every_view_is_documented(store):
     undocumented = rows(store, "FROM columns WHERE meaning IS NULL OR meaning = ''")
     assert undocumented == []
     views = {
@@ -318,7 +295,7 @@ def test_every_column_of_every_view_is_documented(store: Store) -> None:
     assert {key for key in column_docs() if key[0] != "shared"} <= there  # no doc of nothing
 
 
-def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
+def test_queries_are_read_only(store, tmp_path):
     for text in (
         f"COPY transitions TO '{tmp_path}/out.parquet'",
         f"ATTACH '{tmp_path}/other.db'",
@@ -344,7 +321,7 @@ def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
         assert store.sql(text).columns
 
 
-def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path: Path, capsys) -> None:
+def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path, capsys):
     for text in (
         "CREATE TABLE mine AS SELECT 1",
         "SET threads = 1",
@@ -357,9 +334,7 @@ def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path: Path, c
     assert main(["sql", str(store_path), "CREATE MACRO more(x) AS x + 1; SELECT more(1) AS n"]) == 0
 
 
-def test_an_episode_of_two_conditions_that_held_as_long_is_of_the_first_by_name(
-    tmp_path: Path,
-) -> None:
+def test_an_episode_of_two_equal_conditions_is_of_the_first(tmp_path):
     steps = recording_transitions(1)
     both = pa.array([["wheel_slip", "near_collision"]] * len(steps), pa.list_(pa.string()))
     steps = replaced(steps, {"conditions": both})
@@ -369,7 +344,7 @@ def test_an_episode_of_two_conditions_that_held_as_long_is_of_the_first_by_name(
 
 
 @pytest.mark.parametrize("before", ["", "SELECT 1; "])
-def test_tables_between_commas_are_not_crossed(store_path: Path, before: str) -> None:
+def test_tables_between_commas_are_not_crossed(store_path, before):
     text = f"""
         {before}SELECT count(*) FROM transitions AS t, recordings AS r, episodes AS e
         WHERE t.episode_id = e.episode_id AND e.recording_id = r.recording_id
@@ -382,7 +357,7 @@ def test_tables_between_commas_are_not_crossed(store_path: Path, before: str) ->
         assert store.sql(text).fetchall() == every
 
 
-def test_a_pivot_takes_its_columns_from_the_data(store: Store) -> None:
+def test_a_pivot_takes_its_columns_from_the_data(store):
     found = store.sql(
         "PIVOT (SELECT zone, primary_condition FROM transitions) ON primary_condition"
     )
@@ -406,31 +381,33 @@ def test_a_pivot_takes_its_columns_from_the_data(store: Store) -> None:
         ("", "empty"),
     ],
 )
-def test_wrong_sql_says_what_duckdb_says(store: Store, query: str, message: str) -> None:
+def test_wrong_sql_says_what_duckdb_says(store, query, message):
     with pytest.raises(QueryError, match=message):
         store.sql(query)
 
 
-def test_what_is_no_store_is_said_to_be_none(tmp_path: Path) -> None:
-    assert not is_store(tmp_path)
-    with pytest.raises(StoreError, match="not a store"):
-        Store(tmp_path)
-    with pytest.raises(StoreError, match="no such store"):
-        Store(tmp_path / "x")
-    for name, said in (("panel.json", "is a panel"), ("config.json", "is the folder of a run")):
-        (tmp_path / name).write_text("{}")
-        with pytest.raises(StoreError, match=f"{said}, not a store\n  give the store that it was"):
-            Store(tmp_path)
-        with pytest.raises(StoreError, match="is a file, not a store\n  give the folder"):
-            Store(tmp_path / name)
-        (tmp_path / name).unlink()
+def test_what_is_no_store_is_refused_by_what_it_is(tmp_path):
     write_store(tmp_path / "s", [recording_transitions(1)])
     assert is_store(tmp_path / "s")
-    with pytest.raises(StoreError, match="has no version 3"):
-        Store(f"{tmp_path / 's'}@3")
+    for folder, file in (("empty", None), ("panel", "panel.json"), ("run", "config.json")):
+        (tmp_path / folder).mkdir()
+        if file:
+            (tmp_path / folder / file).write_text("{}")
+    assert not is_store(tmp_path / "empty")
+    for place, problem in (
+        ("empty", "not a store"),
+        ("x", "no such store"),
+        ("panel", "is a panel"),
+        ("run", "is the folder of a run"),
+        ("run/config.json", "is a file"),
+        ("s@3", "--version 3"),
+    ):
+        with pytest.raises(StoreError, match=problem) as refused:
+            Store(tmp_path / place)
+        assert str(refused.value.where) == str(tmp_path / place)
 
 
-def test_a_file_of_rows_that_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
+def test_a_missing_file_of_rows_is_named_with_a_remedy(tmp_path):
     StoreWriter(tmp_path / "s").write(*one(1))
     next((tmp_path / "s" / "transitions").glob("*/*.parquet")).unlink()
     with pytest.raises(StoreError, match="--force"):
@@ -438,19 +415,19 @@ def test_a_file_of_rows_that_is_missing_is_said_with_what_to_do(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("limit", ["lots", "5", "0 kib", "0%", "-1", "none"])
-def test_a_memory_limit_that_is_none_is_refused(store_path: Path, limit: str) -> None:
+def test_a_memory_limit_that_is_none_is_refused(store_path, limit):
     with pytest.raises(StoreError, match="4GB"):
         Store(store_path, memory_limit=limit)
 
 
 @pytest.mark.parametrize(("limit", "kept"), [("300MB", "286"), ("0.5 GB", "476"), ("2 GiB", "2.0")])
-def test_a_memory_limit_is_kept(store_path: Path, limit: str, kept: str) -> None:
+def test_a_memory_limit_is_kept(store_path, limit, kept):
     with Store(store_path, memory_limit=limit) as store:
         ((held,),) = store.sql("SELECT current_setting('memory_limit')").fetchall()
     assert held.startswith(kept)  # MiB, GiB
 
 
-def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
+def test_the_views_run_over_tables_in_memory_too(transitions):
     """views.sql asks for two relations and nothing else."""
     from restock.replay.store.definitions import definitions
 
@@ -460,13 +437,6 @@ def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
         connection.execute(definitions())
         ((count,),) = connection.sql("SELECT count(*) FROM transitions").fetchall()
     assert count == len(recording_transitions(1))
-
-
-def test_a_store_may_lie_in_a_folder_with_spaces_and_umlauts(tmp_path: Path) -> None:
-    path = write_store(tmp_path / "Läger 7 (neu)" / "my store", [recording_transitions(1)])
-    with Store(path) as store:
-        ((rows,),) = store.sql("SELECT count(*) FROM transitions").fetchall()
-    assert rows > 0
 
 
 @pytest.mark.parametrize("closed", [True, False])

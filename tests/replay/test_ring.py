@@ -82,9 +82,7 @@ def oracle(steps: list[dict[str, Any]], discount: float, n_step: int) -> dict[tu
     steps=st.integers(1, 25),
     seed=st.integers(0, 2**32),
 )
-def test_rows_are_those_of_a_naive_n_step_oracle(
-    num_envs: int, n_step: int, steps: int, seed: int
-) -> None:
+def test_rows_are_those_of_a_naive_n_step_oracle(num_envs, n_step, steps, seed):
     ring = FreshRing(500, num_envs, SIZE, discount=0.9, n_step=n_step)
     drive = Drive(num_envs, seed)
     keys = []
@@ -110,7 +108,7 @@ def test_rows_are_those_of_a_naive_n_step_oracle(
     assert not expected
 
 
-def test_known_values_of_termination_truncation_and_bootstrap() -> None:
+def test_known_values_of_termination_truncation_and_bootstrap():
     ring = FreshRing(10, 2, 1, discount=0.5, n_step=3)
     for index in range(2):  # environment 0 terminates after two steps, environment 1 is cut
         ring.append(
@@ -149,7 +147,7 @@ def advance(ring: FreshRing, drive: Drive, steps: int) -> None:
             ring.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
 
 
-def test_the_oldest_rows_go_first() -> None:
+def test_the_oldest_rows_go_first():
     ring, drive = filled(capacity=20, steps=100)
     kept = ring.meta["env_step"]
     assert len(ring) == 20
@@ -158,7 +156,7 @@ def test_the_oldest_rows_go_first() -> None:
     assert kept.min() >= len(drive.steps) - 14
 
 
-def test_labels_put_rows_in_their_strata_and_eviction_takes_them_out() -> None:
+def test_labels_put_rows_in_strata_and_eviction_takes_them_out():
     ring, _ = filled(capacity=30, steps=200)
     ended = ~np.isin(ring.meta["episode"][: len(ring)], ring.episode_key)
     codes = ring.condition(np.arange(len(ring)))
@@ -180,17 +178,14 @@ def assert_alike(one: FreshRing, other: FreshRing) -> None:
 
 
 @pytest.mark.parametrize("steps", [9, 150])  # before and after the ring is full
-def test_a_restored_ring_goes_on_exactly(steps: int) -> None:
-    ring, drive = filled(capacity=60, steps=steps, seed=5)
-    other = FreshRing(60, 2, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS)
+@pytest.mark.parametrize("reserved", [{}, {"wheel_slip": 20}])
+def test_a_restored_ring_goes_on_exactly(steps, reserved):
+    ring, drive = reserving(seed=5, **reserved)
+    label_rarely(ring, drive, steps)
+    other, _ = reserving(seed=5, **reserved)
     other.load_state_dict(through_json(ring.state_dict()))
-    began = len(drive.steps)
-    advance(ring, drive, 40)
-    for step in drive.steps[began:]:
-        keys = other.append(**step, env_step=began + 1, gradient_step=0, policy_version=7)
-        began += 1
-        for key in keys[step["terminated"] | step["truncated"]].tolist():
-            other.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
+    for one in (ring, other):
+        label_rarely(one, Drive(2, 11), 200)
     assert_alike(ring, other)
     rngs = [np.random.default_rng(9), np.random.default_rng(9)]
     for _ in range(5):
@@ -198,37 +193,23 @@ def test_a_restored_ring_goes_on_exactly(steps: int) -> None:
         np.testing.assert_array_equal(one, two)
 
 
-def test_a_state_of_another_ring_is_refused() -> None:
-    ring, _ = filled()
-    other = FreshRing(41, 2, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS)
-    with pytest.raises(MixtureError, match="another shape"):
-        other.load_state_dict(ring.state_dict())
-
-
-def test_wrong_labels_are_refused() -> None:
+def test_wrong_labels_are_refused():
     ring = FreshRing(50, 1, SIZE, discount=0.9, conditions=CONDITIONS)
     drive = Drive(1, 0)
     key = -1
     for index in range(3):
         step = drive.step() | {"terminated": np.array([index == 2]), "truncated": np.array([False])}
         key = int(ring.append(**step, env_step=0, gradient_step=0)[0])
-    with pytest.raises(MixtureError, match="name no condition"):
-        ring.set_labels(key, np.array([0, 1, 3]))
-    with pytest.raises(MixtureError, match="2 labels"):
-        ring.set_labels(key, np.array([0, 1]))
+    for labels, problem in (([0, 1, 3], "name no condition"), ([0, 1], "2 labels")):
+        with pytest.raises(MixtureError, match=problem):
+            ring.set_labels(key, np.array(labels))
 
 
 def reserving(
     capacity: int = 60, seed: int = 0, num_envs: int = 2, **reserved: int
 ) -> tuple[FreshRing, Drive]:
     ring = FreshRing(
-        capacity,
-        num_envs,
-        SIZE,
-        discount=0.9,
-        n_step=3,
-        conditions=CONDITIONS,
-        reserved=reserved,
+        capacity, num_envs, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS, reserved=reserved
     )
     return ring, Drive(num_envs, seed)
 
@@ -242,7 +223,7 @@ def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
             ring.set_labels(key, np.full(500, 0 if key % 10 == 0 else 2))
 
 
-def test_rare_rows_are_not_washed_out_where_they_are_reserved() -> None:
+def test_rare_rows_are_not_washed_out_where_they_are_reserved():
     plain, drive = reserving(seed=3)
     label_rarely(plain, drive, 1500)
     kept, drive = reserving(seed=3, wheel_slip=25, blocked_aisle=10)
@@ -265,9 +246,7 @@ def test_rare_rows_are_not_washed_out_where_they_are_reserved() -> None:
     parts=st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 4)),
     seed=st.integers(0, 2**32),
 )
-def test_a_ring_with_reserves_stays_whole(
-    capacity: int, steps: int, parts: tuple[int, int, int], seed: int
-) -> None:
+def test_a_ring_with_reserves_stays_whole(capacity, steps, parts, seed):
     reserved = {
         name: part * capacity // max(sum(parts), 1)
         for name, part in zip(CONDITIONS, parts, strict=True)
@@ -289,21 +268,14 @@ def test_a_ring_with_reserves_stays_whole(
         assert ring.meta["env_step"][slot] == first + 1
 
 
-def test_a_restored_ring_with_reserves_goes_on_exactly() -> None:
-    ring, drive = reserving(seed=5, wheel_slip=20)
-    label_rarely(ring, drive, 150)
-    other, _ = reserving(seed=5, wheel_slip=20)
-    other.load_state_dict(ring.state_dict())
-    for one in (ring, other):
-        label_rarely(one, Drive(2, 11), 200)
-    assert_alike(ring, other)
+@pytest.mark.parametrize("reserved", [{"wheel_slip": 40, "nominal": 30}, {"unheard_of": 1}])
+def test_what_cannot_be_reserved_is_refused(reserved):
+    with pytest.raises(MixtureError, match="cannot be reserved"):
+        reserving(60, **reserved)
 
 
-def test_what_cannot_be_reserved_is_refused() -> None:
-    with pytest.raises(MixtureError, match="cannot be reserved"):
-        reserving(60, wheel_slip=40, nominal=30)
-    with pytest.raises(MixtureError, match="cannot be reserved"):
-        reserving(60, unheard_of=1)
+@pytest.mark.parametrize("other", [{"capacity": 61}, {"wheel_slip": 20}])
+def test_a_state_of_another_ring_is_refused(other):
     ring, _ = reserving(60, wheel_slip=40)
-    with pytest.raises(MixtureError, match="reserved"):
-        reserving(60, wheel_slip=20)[0].load_state_dict(ring.state_dict())
+    with pytest.raises(MixtureError, match=r"another shape|reserved"):
+        reserving(**other)[0].load_state_dict(ring.state_dict())

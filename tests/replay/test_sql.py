@@ -32,7 +32,7 @@ def out_of(capsys: pytest.CaptureFixture[str], *args: str, code: int = 0) -> str
 
 
 @pytest.fixture
-def run_dir(tmp_path: Path) -> Path:
+def run_dir(tmp_path) -> Path:
     """Return a run directory as far as SQL looks at it."""
     path = tmp_path / "run"
     (path / "eval").mkdir(parents=True)
@@ -45,9 +45,7 @@ def run_dir(tmp_path: Path) -> Path:
     return path
 
 
-def test_json_is_a_list_of_row_objects(
-    store_path: Path, capsys: pytest.CaptureFixture[str], transitions: pa.Table
-) -> None:
+def test_json_is_a_list_of_row_objects(store_path, capsys, transitions):
     query = "SELECT count(*) AS rows, ['a', 'b'] AS list, 0.0/0 AS nothing FROM transitions"
     rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
     assert rows == [{"rows": len(transitions), "list": ["a", "b"], "nothing": None}]
@@ -56,9 +54,7 @@ def test_json_is_a_list_of_row_objects(
     ]
 
 
-def test_decimals_are_numbers_and_columns_of_one_name_keep_their_values(
-    store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_decimals_are_numbers_and_columns_keep_their_values(store_path, capsys):
     """A script would compare "278.2" as text; and of two columns `a`, both were the second's."""
     query = "SELECT 2782 * 0.1 AS s, 2.50 * 2 AS whole, 1 AS a, 2 AS a_1, 3 AS a, 4 AS a"
     rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
@@ -70,17 +66,13 @@ def test_decimals_are_numbers_and_columns_of_one_name_keep_their_values(
     assert lines.splitlines()[2].split() == ["1", "2", "1,234,568", "-600,000"]
 
 
-def test_times_with_a_zone_are_text_in_utc(
-    store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_times_with_a_zone_are_text_in_utc(store_path, capsys):
     query = "SELECT ingested_at, ingested_at AS again FROM recordings LIMIT 1"
     rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
     assert rows == [{"ingested_at": "2026-01-01 00:00:00Z", "again": "2026-01-01 00:00:00Z"}]
 
 
-def test_csv_has_a_header_even_without_rows(
-    store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_csv_has_a_header_even_without_rows(store_path, capsys):
     text = out_of(capsys, str(store_path), "SELECT condition, rows_held FROM ages", "--csv")
     found = list(csv.DictReader(io.StringIO(text)))
     assert {row["condition"] for row in found} >= {"nominal", "wheel_slip"}
@@ -88,28 +80,24 @@ def test_csv_has_a_header_even_without_rows(
     assert out_of(capsys, str(store_path), query, "--csv") == "condition,rows_held\n"
 
 
-def test_a_table_is_for_people(store_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_is_for_people(store_path, capsys):
     text = out_of(capsys, str(store_path), "FROM coverage_by_condition")
     assert "behaviour_policies" in text
     assert "operator, planner" in text
 
 
-def test_rows_too_wide_for_a_table_are_printed_one_below_the_other(
-    store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_too_wide_for_a_table_are_printed_in_turn(store_path, capsys):
     text = out_of(capsys, str(store_path), "FROM recordings ORDER BY recording_id LIMIT 2")
     assert "row 2" in text
     assert "conditions_json" in text
 
 
-def test_a_query_comes_from_stdin(
-    store_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_query_comes_from_stdin(store_path, capsys, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("SELECT 1 AS one;\nSELECT 2 AS two"))
     assert json.loads(out_of(capsys, str(store_path), "-", "--json")) == [{"two": 2}]
 
 
-def test_a_run_is_queried_by_its_tables(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_queried_by_its_tables(run_dir, capsys):
     assert json.loads(out_of(capsys, str(run_dir), "FROM progress", "--json")) == [
         {"env_steps": 10, "loss": 0.5}
     ]
@@ -117,9 +105,7 @@ def test_a_run_is_queried_by_its_tables(run_dir: Path, capsys: pytest.CaptureFix
     assert "gradient_step" in out_of(capsys, str(run_dir), "FROM columns")
 
 
-def test_a_runs_columns_are_listed_with_their_meanings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_runs_columns_are_listed_with_their_meanings(tmp_path, capsys):
     Run.create(tmp_path / "run", {})
     query = "SELECT * FROM columns WHERE column_name = 'row_hash'"
     assert json.loads(out_of(capsys, str(tmp_path / "run"), query, "--json")) == [
@@ -134,9 +120,7 @@ def test_a_runs_columns_are_listed_with_their_meanings(
     assert json.loads(out_of(capsys, str(tmp_path / "run"), undocumented, "--json")) == [{"n": 0}]
 
 
-def test_what_was_sampled_joins_what_was_logged(
-    store_path: Path, run_dir: Path, capsys: pytest.CaptureFixture[str], transitions: pa.Table
-) -> None:
+def test_what_was_sampled_joins_what_was_logged(store_path, run_dir, capsys, transitions):
     query = (
         "SELECT transition_id, source_file FROM run.audit JOIN transitions USING (transition_id)"
         " ORDER BY ALL"
@@ -147,9 +131,7 @@ def test_what_was_sampled_joins_what_was_logged(
     ]
 
 
-def test_a_panel_is_queried_by_its_tables(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, capsys):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
     query = "SELECT sum(rows) AS rows FROM strata"
     assert json.loads(out_of(capsys, str(panel.path), query, "--json")) == [{"rows": len(panel)}]
@@ -166,17 +148,13 @@ def test_a_panel_is_queried_by_its_tables(
         ("FROM ages_at('2026-12-01')", "\n    epoch_ns("),  # its tabs were written out
     ],
 )
-def test_wrong_sql_is_one_message_and_exit_2(
-    store_path: Path, capsys: pytest.CaptureFixture[str], query: str, message: str
-) -> None:
+def test_wrong_sql_is_one_message_and_exit_2(store_path, capsys, query, message):
     err = out_of(capsys, str(store_path), query, code=2)
     assert message in err
     assert "Traceback" not in err
 
 
-def test_a_view_that_a_panel_lacks_is_not_taken_for_one_of_duckdbs_own(
-    tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_view_that_a_panel_lacks_is_not_duckdbs_own(tmp_path, store_path, capsys):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
     err = out_of(capsys, str(panel.path), "FROM transitions", code=2)
     assert "does not exist" in err
@@ -184,33 +162,21 @@ def test_a_view_that_a_panel_lacks_is_not_taken_for_one_of_duckdbs_own(
     assert 'try "FROM columns"' in out_of(capsys, str(panel.path), "", code=2)
 
 
-def test_wrong_places_are_refused(
-    tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "it is not a store" in out_of(capsys, str(tmp_path), "SELECT 1", code=2)
-    assert "it does not exist" in out_of(capsys, str(tmp_path / "x"), "SELECT 1", code=2)
-    err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(tmp_path), code=2)
-    assert "not a run" in err
-    err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(tmp_path / "x"), code=2)
-    assert "no such run" in err
-    err = out_of(capsys, str(store_path), "SELECT 1", "--json", "--csv", code=2)
-    assert "choose one" in err
+def test_wrong_places_are_refused(tmp_path, store_path, run_dir, capsys):
+    panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p").path
+    for place, words, problem in (
+        (tmp_path, [], "it is not a store"),
+        (tmp_path / "x", [], "it does not exist"),
+        (store_path, ["--run", tmp_path], "not a run"),
+        (store_path, ["--run", tmp_path / "x"], "no such run"),
+        (store_path, ["--run", panel], "is a panel, not a run"),
+        (store_path, ["--panel", run_dir], "is a run, not a panel"),
+        (store_path, ["--json", "--csv"], "choose one"),
+    ):
+        assert problem in out_of(capsys, str(place), "SELECT 1", *map(str, words), code=2)
 
 
-def test_a_run_is_not_taken_for_a_panel_nor_a_panel_for_a_run(
-    store_path: Path, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    err = out_of(capsys, str(store_path), "SELECT 1", "--panel", str(run_dir), code=2)
-    assert f"{run_dir}: is a run, not a panel" in err
-    assert "`restock mix --out`" in err
-    panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
-    err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(panel.path), code=2)
-    assert f"{panel.path}: is a panel, not a run" in err
-
-
-def test_without_a_query_there_is_a_prompt(
-    store_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_query_there_is_a_prompt(store_path, capsys, monkeypatch):
     lines = iter(["SELECT 41 + 1", "AS answer;", "FROM nope;", "SELECT 7 AS seven;"])
 
     def answer(prompt: str) -> str:
@@ -228,9 +194,7 @@ def test_without_a_query_there_is_a_prompt(
 
 
 @pytest.mark.parametrize("name", one_in(2, ["views.sql", "views.duckdb"]))
-def test_any_duckdb_sees_the_exported_views(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, capsys, name):
     out = tmp_path / name
     assert cli.main(["sql", str(store_path), "--export", str(out)]) == 0
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -255,7 +219,7 @@ def test_any_duckdb_sees_the_exported_views(
     assert "no export to .db" in err
 
 
-def test_ctrl_c_stops_a_query_at_once(store_path: Path) -> None:
+def test_ctrl_c_stops_a_query_at_once(store_path):
     endless = "SELECT count(*) FROM range(100000000) a, range(100000000) b WHERE a.range % 7 = 3"
     command = [sys.executable, "-m", "restock", "sql", str(store_path), endless]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
