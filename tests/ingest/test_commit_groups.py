@@ -40,6 +40,16 @@ def waiting(
     return Prepared(IngestResult("x", "written", {}), staged, repeated, 0.2)
 
 
+@pytest.fixture
+def store(tmp_path: Path) -> StoreWriter:
+    return StoreWriter(tmp_path / "s")
+
+
+@pytest.fixture
+def group(store: StoreWriter) -> CommitGroup:
+    return CommitGroup(store, clock=lambda: 0.0)
+
+
 def versions(store: Path) -> list[int]:
     """Of both tables: how often each was committed to after it was made."""
     return [DeltaTable(str(store / name)).version() for name in ("recordings", "transitions")]
@@ -49,7 +59,7 @@ def files(store: Path) -> set[str]:
     return {path.relative_to(store).as_posix() for path in store.rglob("*.parquet")}
 
 
-def test_the_first_is_committed_at_once_and_then_those_of_some_seconds_together(tmp_path):
+def test_the_first_is_committed_at_once_then_groups(tmp_path):
     store, now = StoreWriter(tmp_path / "s"), [0.0]
     group = CommitGroup(store, clock=lambda: now[0])
     assert group.due_in_s() is None
@@ -69,19 +79,15 @@ def test_the_first_is_committed_at_once_and_then_those_of_some_seconds_together(
     assert len(shown(tmp_path / "s")) == 4
 
 
-def test_no_more_than_so_many_wait(tmp_path, monkeypatch):
+def test_no_more_than_so_many_wait(store, group, tmp_path, monkeypatch):
     monkeypatch.setattr(prepared_module, "MAX_WAITING", 2)
-    store = StoreWriter(tmp_path / "s")
-    group = CommitGroup(store, clock=lambda: 0.0)
     for place in range(5):
         group.add(place, waiting(store, one(place + 1)))
     assert list(group.results) == [0, 1, 2, 3, 4]
     assert versions(tmp_path / "s") == [3, 3]
 
 
-def test_what_waits_and_is_not_wanted_leaves_no_file(tmp_path):
-    store = StoreWriter(tmp_path / "s")
-    group = CommitGroup(store, clock=lambda: 0.0)
+def test_what_waits_and_is_not_wanted_leaves_no_file(store, group, tmp_path):
     group.add(0, waiting(store, one(1)))
     before = files(tmp_path / "s")
     group.add(1, waiting(store, one(2)))
@@ -91,9 +97,7 @@ def test_what_waits_and_is_not_wanted_leaves_no_file(tmp_path):
     assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
 
 
-def test_one_that_cannot_be_committed_costs_itself_alone(tmp_path):
-    store = StoreWriter(tmp_path / "s")
-    group = CommitGroup(store, clock=lambda: 0.0)
+def test_one_that_cannot_be_committed_costs_itself_alone(store, group, tmp_path):
     group.add(0, waiting(store, one(1, "a")))
     group.add(1, waiting(store, one(2)))
     group.add(2, waiting(store, one(1, "c"), instead_of="b"))  # which is not there
@@ -105,9 +109,7 @@ def test_one_that_cannot_be_committed_costs_itself_alone(tmp_path):
     assert set(shown(tmp_path / "s")) == kept
 
 
-def test_the_later_ingest_of_a_recording_replaces_the_one_before_it_in_the_group(tmp_path):
-    store = StoreWriter(tmp_path / "s")
-    group = CommitGroup(store, clock=lambda: 0.0)
+def test_the_later_ingest_replaces_one_before_it_in_the_group(store, group, tmp_path):
     group.add(0, waiting(store, one(1)))
     group.add(1, waiting(store, one(2, "a")))
     group.add(2, waiting(store, one(2, "b", seed=9)))
@@ -117,8 +119,7 @@ def test_the_later_ingest_of_a_recording_replaces_the_one_before_it_in_the_group
 
 
 @pytest.mark.parametrize("repeated", ["refuse", "keep"])
-def test_the_same_drive_twice_in_a_group_is_found_as_one_after_the_other(tmp_path, repeated):
-    store = StoreWriter(tmp_path / "s")
+def test_the_same_drive_twice_in_a_group_is_found(store, group, tmp_path, repeated):
     rows = recording_transitions(2, episodes=5)
     copy = replaced(
         rows,
@@ -128,7 +129,6 @@ def test_the_same_drive_twice_in_a_group_is_found_as_one_after_the_other(tmp_pat
             "ingest_id": "z",
         },
     )
-    group = CommitGroup(store, clock=lambda: 0.0)
     group.add(0, waiting(store, one(1), repeated))
     group.add(1, waiting(store, (manifest(rows), rows), repeated))
     group.add(2, waiting(store, (manifest(copy), copy), repeated))
@@ -148,12 +148,10 @@ def test_the_same_drive_twice_in_a_group_is_found_as_one_after_the_other(tmp_pat
 
 
 @pytest.mark.parametrize("repeated", ["refuse", "keep"])
-def test_of_a_part_and_the_whole_it_is_the_part_that_is_to_go(tmp_path, repeated):
+def test_of_a_part_and_the_whole_the_part_is_to_go(store, group, tmp_path, repeated):
     """As of a bag that the night before was still being written."""
-    store = StoreWriter(tmp_path / "s")
     rows = recording_transitions(2, episodes=5)
     part = replaced(rows.slice(0, len(rows) // 2), {"recording_id": f"{7:016x}", "ingest_id": "z"})
-    group = CommitGroup(store, clock=lambda: 0.0)
     group.add(0, waiting(store, (manifest(part), part), repeated))
     group.add(1, waiting(store, (manifest(rows), rows), repeated))
     group.commit()
@@ -165,7 +163,7 @@ def test_of_a_part_and_the_whole_it_is_the_part_that_is_to_go(tmp_path, repeated
     assert isinstance(result, IngestResult) == (repeated == "keep")
 
 
-def test_a_recording_that_is_given_twice_is_unchanged_the_second_time(tmp_path):
+def test_a_recording_given_twice_is_unchanged_the_second_time(tmp_path):
     for number in (1, 2):
         write_bag(Drive(duration_s=3.0 + number, truth="nominal"), tmp_path / f"bag{number}")
     shutil.copytree(tmp_path / "bag2", tmp_path / "bag3")
@@ -215,7 +213,7 @@ group.commit()
         ],
     ),
 )
-def test_a_killed_process_leaves_whole_groups_and_the_same_again_goes_on(tmp_path, when, there):
+def test_a_killed_process_leaves_whole_groups(tmp_path, when, there):
     place = tmp_path / "s"
     StoreWriter(place).write(*one(3, "old"))  # one of the second group replaces
     child = subprocess.run(
@@ -264,15 +262,11 @@ def on_a_full_disk(monkeypatch, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", one_in(2, ["transitions", "recordings"]))
-def test_a_commit_on_a_full_disk_leaves_no_file_and_the_same_again_goes_on(
-    tmp_path, monkeypatch, name
-):
-    store = StoreWriter(tmp_path / "s")
+def test_a_commit_on_a_full_disk_leaves_no_file(store, group, tmp_path, monkeypatch, name):
     store.write(*one(1, "old"))
     before, manifests = files(tmp_path / "s"), store.files("recordings")
     with monkeypatch.context() as patched:
         on_a_full_disk(patched, name)
-        group = CommitGroup(store, clock=lambda: 0.0)
         for place in (1, 2, 3):  # the first replaces
             group.add(place, waiting(store, one(place)))
         group.commit()
@@ -293,8 +287,7 @@ def test_a_commit_on_a_full_disk_leaves_no_file_and_the_same_again_goes_on(
     assert set(shown(tmp_path / "s")) == {f"{number:016x}-a" for number in (1, 2, 3)}
 
 
-def test_a_commit_that_is_interrupted_between_the_tables_leaves_no_file(tmp_path, monkeypatch):
-    store = StoreWriter(tmp_path / "s")
+def test_an_interrupt_between_the_tables_leaves_no_file(store, group, tmp_path, monkeypatch):
     store.write(*one(1))
     before = files(tmp_path / "s")
     commit = StoreWriter.commit
@@ -305,7 +298,6 @@ def test_a_commit_that_is_interrupted_between_the_tables_leaves_no_file(tmp_path
         return commit(self, name, *rest)
 
     monkeypatch.setattr(StoreWriter, "commit", interrupted)
-    group = CommitGroup(store, clock=lambda: 0.0)
     with pytest.raises(KeyboardInterrupt):
         group.add(2, waiting(store, one(2)))
     assert files(tmp_path / "s") == before

@@ -22,11 +22,12 @@ from support.driven_robot import (
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.steps.needs import read_topics
+from restock.replay.store.store import Store
 
 NS = 10**9
 DURATION_S = 45.0
@@ -157,7 +158,7 @@ def test_a_robot_that_slips_or_not_does_not_contradict_itself(profile, tmp_path,
 
 @pytest.mark.parametrize(
     ("topic", "ahead_s"),
-    [("/cmd_vel", 0.4), ("/cmd_vel", -0.4), ("/cmd_vel", -0.7), ("/scan", 0.8), ("/imu", 0.5)],
+    [("/cmd_vel", 0.4), ("/cmd_vel", -0.7), ("/scan", 0.8)],
 )
 def test_a_topic_of_another_clock_counts_from_its_reception(profile, tmp_path, topic, ahead_s):
     topics = shifted(winding(), topic, ahead_s)
@@ -266,7 +267,7 @@ def test_what_contradicts_itself_is_kept_and_said(profile, tmp_path, case):
     assert 0 < one.steps <= len(steps["stamp_ns"])
 
 
-@pytest.mark.parametrize("seen_s", [-0.6, -0.4, 0.0, 0.1, 0.4, 0.8])
+@pytest.mark.parametrize("seen_s", [-0.4, 0.1, 0.8])
 def test_scans_that_turn_before_or_after_the_poses(profile, tmp_path, seen_s):
     found, _ = found_in(in_a_hall(winding(), seen_s), profile, tmp_path)
     if abs(seen_s) < 0.3:  # a lidar takes time to turn, and its messages to arrive
@@ -301,41 +302,20 @@ def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
     assert (audit["status"], audit["rows"]) == ("warn", 1)
 
 
-def test_profile_new_does_not_use_wheels_that_are_none(tmp_path, capsys):
+def test_profile_new_does_not_use_wheels_that_are_none(tmp_path):
     bag = written(scaled(winding(), "/odom", 0, SPEED, RATE), tmp_path / "bag")
-    file = tmp_path / "p.toml"
+    file, store = tmp_path / "p.toml", tmp_path / "store"
     assert main(["profile", "new", str(bag), "--out", str(file), "--hindsight-goals"]) == 0
-    text = file.read_text()
-    assert "/odom is not used, as its speed stays at 0" in text
-    assert "[motion]" in text
-    assert "localiser_m" not in text
-    assert "[inputs.wheels]\n" not in text
-    store = tmp_path / "store"
+    made = load_profile(file)
+    assert (made.inputs.wheels, made.motion is None) == (None, False)
     assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
-    capsys.readouterr()
-    query = "SELECT avg(wheel_speed_mps) AS mean FROM transitions"
-    assert main(["sql", str(store), query, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["mean"] == pytest.approx(motion(np.arange(0, DURATION_S, 0.1))[0].mean(), abs=0.02)
-    wrong = written(two_publishers(winding()), tmp_path / "wrong")
-    other = tmp_path / "other.toml"
-    assert main(["profile", "new", str(wrong), "--out", str(other), "--hindsight-goals"]) == 3
-    assert "localiser_m" not in other.read_text()
-    assert "# CONTRADICTS ITSELF: /odom: its poses step" in other.read_text()
+    with Store(store) as opened:
+        ((mean,),) = opened.sql("SELECT avg(wheel_speed_mps) FROM transitions").fetchall()
+    assert mean == pytest.approx(motion(np.arange(0, DURATION_S, 0.1))[0].mean(), abs=0.02)
 
 
-def test_a_repaired_clock_does_not_hide_localiser_noise(tmp_path):
-    """Noise that slip must exceed is told of a drive whose other clock was repaired, too."""
-    noisy = winding()
-    pose, rng = noisy["/odom"], np.random.default_rng(0)
-    path = "pose.pose.position.x"
-    x = np.asarray(pose.fields[path])
-    noisy["/odom"] = replace(pose, fields=pose.fields | {path: x + rng.normal(0, 0.04, len(x))})
-    reported = []
-    for number, topics in enumerate((noisy, shifted(noisy, "/cmd_vel", 0.4))):
-        bag = written(topics, tmp_path / str(number))
-        with open_recording(bag) as recording:
-            proposal = propose_profile(recording, "r", hindsight_goals=True)
-        reported.append([line for line in proposal.toml.splitlines() if "localiser_m" in line])
-        assert [one.repaired for one in proposal.findings] == [True] * number
-    assert reported[0] == reported[1] != []
+def test_profile_new_names_two_publishers(tmp_path):
+    wrong, file = written(two_publishers(winding()), tmp_path / "wrong"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(wrong), "--out", str(file), "--hindsight-goals"]) == 3
+    assert "localiser_m" not in file.read_text()
+    assert "# CONTRADICTS ITSELF: /odom: its poses step" in file.read_text()

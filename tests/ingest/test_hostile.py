@@ -42,35 +42,26 @@ def bag_with(folder: Path, script: str) -> Path:
     return file
 
 
-@pytest.mark.parametrize(
-    ("script", "says"),
-    [
-        (
-            "ALTER TABLE messages RENAME TO m; CREATE VIEW messages AS WITH RECURSIVE n(id) AS"
-            " (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id,"
-            " id AS timestamp, zeroblob(1000000) AS data FROM n",
-            "messages is not a plain table",
-        ),
-        (
-            "ALTER TABLE topics RENAME TO t; CREATE VIEW topics AS SELECT * FROM t",
-            "topics is not a plain table",
-        ),
-        (
-            "DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER,"
-            " timestamp INTEGER, data BLOB AS (zeroblob(900000000)));"
-            "INSERT INTO messages (topic_id, timestamp) VALUES (1, 1)",
-            "messages has computed columns",
-        ),
-        ("DROP TABLE messages", "no such table"),
-        ("ALTER TABLE messages RENAME COLUMN data TO datum", "no such column"),
-    ],
-)
-def test_sqlite_files_that_are_programs_are_refused(script: str, says: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=says):
+SCRIPTS = {
+    "ALTER TABLE messages RENAME TO m; CREATE VIEW messages AS WITH RECURSIVE n(id) AS"
+    " (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id,"
+    " id AS timestamp, zeroblob(1000000) AS data FROM n": "messages is not a plain table",
+    "DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER,"
+    " timestamp INTEGER, data BLOB AS (zeroblob(900000000)));"
+    "INSERT INTO messages (topic_id, timestamp) VALUES (1, 1)": "messages has computed columns",
+    "DROP TABLE messages": "no such table",
+    "ALTER TABLE messages RENAME COLUMN data TO datum": "no such column",
+    "DROP TABLE messages; DROP TABLE topics": "not a rosbag2 recording",
+}
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_sqlite_files_that_are_programs_are_refused(script, tmp_path):
+    with pytest.raises(RecordingError, match=SCRIPTS[script]):
         open_recording(bag_with(tmp_path, script))
 
 
-def test_sqlite_values_of_the_wrong_kind_are_counted(tmp_path: Path) -> None:
+def test_sqlite_values_of_the_wrong_kind_are_counted(tmp_path):
     file = bag_with(
         tmp_path,
         "UPDATE messages SET timestamp = 'noon' WHERE id = 1;"
@@ -86,7 +77,7 @@ def test_sqlite_values_of_the_wrong_kind_are_counted(tmp_path: Path) -> None:
         assert recording.span_ns is not None
 
 
-def test_a_sqlite_tree_that_multiplies_its_pages_is_refused(tmp_path: Path) -> None:
+def test_a_sqlite_tree_that_multiplies_its_pages_is_refused(tmp_path):
     """Interior pages whose every child is the same page: a few kB that hold 10^14 rows."""
     file = tmp_path / "loop.db3"
     base = sqlite3.connect(file)
@@ -189,10 +180,10 @@ def family(*types: str) -> bytes:
 
 @cache
 def bomb() -> bytes:
-    """Two thousand million zeros."""
-    pack = zstandard.ZstdCompressor().compressobj(size=2000 << 20)
+    """Return a thousand million zeros."""
+    pack = zstandard.ZstdCompressor().compressobj(size=1000 << 20)
     zeros = bytes(1 << 20)
-    return b"".join(pack.compress(zeros) for _ in range(2000)) + pack.flush()
+    return b"".join(pack.compress(zeros) for _ in range(1000)) + pack.flush()
 
 
 DEEP = family("pkg/T1 a", *(f"pkg/T{n}\npkg/T{n + 1} a" for n in range(1, 500)), "pkg/T500\nbool a")
@@ -215,24 +206,19 @@ def sequence_of_sequences(depth: int) -> bytes:
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a zstd file that is a bomb": (bomb, "refused"),
     "a chunk that is a zstd bomb": (
-        lambda: mcap_of(chunk(b"zstd", bomb(), 2000 << 20)),
+        lambda: mcap_of(chunk(b"zstd", bomb(), 1000 << 20)),
         "that claim to hold",
     ),
     "a chunk that claims little and holds much": (
         lambda: mcap_of(chunk(b"zstd", bomb(), 100)),
         "more than it claims",
     ),
-    "a chunk that claims 2^63": (lambda: mcap_of(chunk(b"lz4", b"x", 1 << 63)), "claim to hold"),
     "a record of 2^63 bytes": (
         lambda: mcap_of(struct.pack("<BQ", 6, 1 << 63)),
         "more than there are",
     ),
     "zstd messages that are bombs": (
         lambda: one_topic("pkg/msg/T", b"uint8[] a", bomb()[: 1 << 16]),
-        "",
-    ),
-    "a zstd message that claims 2^62": (
-        lambda: one_topic("pkg/msg/T", b"uint8[] a", b"\x28\xb5\x2f\xfd\xe0" + b"\x3f" * 99),
         "",
     ),
     "a definition 500 messages deep": (
@@ -246,18 +232,6 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "an array of 2^31": (
         lambda: one_topic("pkg/msg/T", b"float64[2147483648] a", bytes(9)),
         "an array of 2,147,483,648",
-    ),
-    "arrays of arrays": (
-        lambda: one_topic(
-            "pkg/msg/T",
-            family(
-                "pkg/A[1000000] a",
-                "pkg/A\npkg/B[1000000] b",
-                "pkg/B\nfloat64[1000000] c",
-            ),
-            b"\0\1\0\0" + bytes(64),
-        ),
-        "",
     ),
     "counts of 2^32 within each other": (
         lambda: one_topic("pkg/msg/T", sequence_of_sequences(20), b"\0\1\0\0" + b"\xff" * 4000),
@@ -275,10 +249,6 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: one_topic("T", b"{}", b'{"a":' * 100_000, "jsonschema", "json"),
         "",
     ),
-    "JSON of brackets": (
-        lambda: one_topic("T", b"{}", b'{"a":[' + b"[]," * 300_000 + b"0]}", "jsonschema", "json"),
-        "",
-    ),
     "a protobuf definition of noise": (
         lambda: one_topic("p.T", b"\x0a\xff\xff\xff\x0f" * 99, b"", "protobuf", "protobuf"),
         "cannot be parsed",
@@ -291,26 +261,28 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("name", one_in(6, HOSTILE))
-def test_little_memory_is_enough_for_hostile_files(name: str, tmp_path: Path) -> None:
+def test_little_memory_is_enough_for_hostile_files(name, tmp_path):
     make, says = HOSTILE[name]
     path = tmp_path / "run.mcap"
     path.write_bytes(make())
-    shown = limited("-m", "restock", "info", str(path), "--json")
-    assert "Traceback" not in shown.stderr, shown.stderr
-    assert shown.returncode in (0, 2, 3)
-    assert says in shown.stdout + shown.stderr
-    if shown.returncode == 0:
-        reading = limited("-c", READ, str(path))
-        assert reading.returncode == 0, reading.stderr
-        assert int(reading.stdout) == 1  # counted, whatever it was
+    done = limited("-c", READ, str(path))
+    assert "Traceback" not in done.stderr, done.stderr
+    assert says in done.stdout + done.stderr
+    *_, code, counted = done.stdout.split()
+    assert (code, counted) in {("0", "1"), ("2", "-"), ("3", "-")}  # counted, whatever it was
 
 
 READ = """
 import sys
+from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
-with open_recording(sys.argv[1]) as recording:
-    recording.read({topic: recording.leaves(topic) for topic in recording.topics})
-    print(sum(a.decoded + sum(a.reasons.values()) for a in recording.accounts.values()))
+code, counted = main(["info", sys.argv[1], "--json"]), "-"
+if code == 0:
+    with open_recording(sys.argv[1]) as recording:
+        wanted = recording.leaves if len(sys.argv) == 2 else lambda topic: []
+        recording.read({topic: wanted(topic) for topic in recording.topics})
+        counted = sum(a.decoded + sum(a.reasons.values()) for a in recording.accounts.values())
+print(code, counted)
 """
 
 
@@ -326,7 +298,7 @@ IDL = "module pkg {{ module msg {{ {} struct T {{ {} double x; }}; }}; }};"
         "/*" * 99_999 + "(",
     ],
 )
-def test_idl_that_would_take_its_parser_hours_is_refused(text: str) -> None:
+def test_idl_that_would_take_its_parser_hours_is_refused(text):
     channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", text.encode())
     with pytest.raises(CannotDecode, match=r"nests brackets|cannot be parsed"):
         message_type(channel, "humble")
@@ -344,20 +316,16 @@ LAUGHS = "\n".join(
     "text",
     [
         LAUGHS + "\nrosbag2_bagfile_information: {relative_file_paths: [*a29], version: *a29}",
-        LAUGHS + "\nrosbag2_bagfile_information: {topics_with_message_count: *a29}",
         "rosbag2_bagfile_information: {topics_with_message_count: [{topic_metadata:"
         " {name: [1], serialization_format: [cdr]}, message_count: {}}]}",
-        "rosbag2_bagfile_information: {relative_file_paths: 7, topics_with_message_count: 7}",
         "rosbag2_bagfile_information: {relative_file_paths: ['', '..', '/', 'a\\0b', null]}",
         "rosbag2_bagfile_information: " + "[" * 300,
         "rosbag2_bagfile_information: !!python/object:os.system {}",
-        "rosbag2_bagfile_information: !!timestamp 2001-99-99",
-        "? [1]\n: 2",
         "{" * 100 + "\x1b[2J",
         "\xff",
     ],
 )
-def test_metadata_of_any_kind_leaves_the_files_as_they_are(text: str, tmp_path: Path) -> None:
+def test_metadata_of_any_kind_leaves_the_files_as_they_are(text, tmp_path):
     bag = write_bag(tmp_path / "run", 2)
     (bag / "metadata.yaml").write_text(text, encoding="latin-1")
     with open_recording(bag) as recording:
@@ -370,9 +338,7 @@ def test_metadata_of_any_kind_leaves_the_files_as_they_are(text: str, tmp_path: 
 EVIL = "/t\x1b[2J\x07\n/other\u202egpj.\x9b31m"
 
 
-def test_no_control_character_of_a_file_reaches_the_terminal(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_control_character_reaches_the_terminal(tmp_path, capsys):
     path = tmp_path / "evil.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -409,20 +375,16 @@ def test_no_control_character_of_a_file_reaches_the_terminal(
 @pytest.mark.parametrize(
     "name", one_in(3, [b"a\x1b[2J\nb\xe2\x80\xaec", b"bad\xff", b"[red]caf\xc3\xa9 [b]"])
 )
-def test_any_name_of_a_file_is_ingested_and_escaped(
-    name: bytes, storage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bag = write_drive(Drive(4.0, truth="nominal"), tmp_path / "run", storage=storage)
+def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, capsys):
+    bag = write_drive(Drive(2.0, truth="nominal"), tmp_path / "run", storage=storage)
     (file,) = bag.glob("run.*")
     odd = tmp_path / os.fsdecode(name)
     odd.mkdir()
     given = str(file.rename(odd / f"{odd.name}{file.suffix}"))
     store, profile = str(tmp_path / "store"), str(tmp_path / "new.toml")
     assert main(["ingest", given, "--store", store]) == 0
-    assert main(["ingest", given, "--store", store]) == 0  # it is there already
     assert main(["sql", store, "SELECT source_file FROM recordings"]) == 0
     assert main(["profile", "new", given, "--out", profile]) in (0, 3)
-    assert main(["profile", "check", profile, given]) in (0, 2)
     printed = capsys.readouterr()
     for text in (printed.out, printed.err, Path(profile).read_text(encoding="utf-8")):
         assert all(letter.isprintable() or letter == "\n" for letter in text)
@@ -436,7 +398,8 @@ def test_any_name_of_a_file_is_ingested_and_escaped(
     assert row["path"] == given
 
 
-def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path):
     """Ninety messages of 8 MiB in a few kB, in a process that could not hold them all."""
     packed = zstandard.ZstdCompressor().compress(
         b"\0\1\0\0" + (8 << 20).to_bytes(4, "little") + bytes(8 << 20)
@@ -449,15 +412,12 @@ def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:
         for row in range(90):
             writer.add_message(channel, row, packed, row)
         writer.finish()
-    code = READ.replace("recording.leaves(topic)", "[]")
-    done = limited("-c", code, str(tmp_path / "run.mcap"))
-    assert (done.returncode, done.stdout) == (0, "90\n"), done.stderr
+    done = limited("-c", READ, str(tmp_path / "run.mcap"), "no field")
+    assert done.stdout.split()[-2:] == ["0", "90"], done.stderr
 
 
 @pytest.mark.long
-def test_definitions_are_parsed_up_to_a_sum(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_definitions_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
     """Check thirty definitions of 40 kB that differ, against a tenth of the limit.
 
     The parser takes a second for a MB.

@@ -20,9 +20,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_json_names_every_recording_and_topic(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_names_every_recording_and_topic(folder, capsys):
     assert main(["info", str(folder), "--json"]) == 0
     printed = capsys.readouterr()
     recordings = json.loads(printed.out)["recordings"]
@@ -42,16 +40,7 @@ def test_json_names_every_recording_and_topic(
             assert topic["skipped"] is None
 
 
-def test_a_table_for_people(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(folder / "one.mcap")]) == 0
-    text = capsys.readouterr().out
-    assert "140 messages" in text
-    assert "nav_msgs/msg/Odometry" in text
-
-
-def test_one_bad_recording_does_not_hide_the_others(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_bad_recording_does_not_hide_the_others(folder, tmp_path, capsys):
     empty = tmp_path / "empty.mcap"
     empty.touch()
     assert main(["info", str(empty), str(folder / "one.mcap"), "--json"]) == 2
@@ -61,14 +50,7 @@ def test_one_bad_recording_does_not_hide_the_others(
     assert "Traceback" not in printed.err
 
 
-def test_no_such_path(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["info", str(tmp_path / "nothing")]) == 2
-    assert "no such file" in capsys.readouterr().err
-
-
-def test_it_says_when_it_ends_and_how_an_mcap_file_is_packed(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_says_when_it_ends_and_how_an_mcap_file_is_packed(folder, capsys):
     from mcap.reader import make_reader
 
     assert main(["info", str(folder), "--json"]) == 0
@@ -89,48 +71,27 @@ def test_it_says_when_it_ends_and_how_an_mcap_file_is_packed(
     ]
 
 
-@pytest.mark.parametrize(
-    ("text", "profiles"),
-    [
-        ("", []),
-        ("not yaml: [", []),
-        (
-            "- history: 1\n  depth: 10\n  reliability: 2\n  durability: 2\n  deadline:\n   sec: 9",
-            [
-                {
-                    "reliability": "best_effort",
-                    "durability": "volatile",
-                    "history": "keep_last",
-                    "depth": 10,
-                }
-            ],
-        ),
-        (
-            "- depth: 1\n  durability: transient_local\n  reliability: reliable\n"
-            "- depth: 1\n  durability: transient_local\n  reliability: reliable\n"
-            "- reliability: 7\n",
-            [
-                {"reliability": "reliable", "durability": "transient_local", "depth": 1},
-                {"reliability": "7"},
-            ],
-        ),
+OFFERED = {
+    "": [],
+    "not yaml: [": [],
+    "- depth: 1\n  durability: 2\n  reliability: reliable\n  deadline:\n   sec: 9\n" * 2
+    + "- reliability: 7\n": [
+        {"reliability": "reliable", "durability": "volatile", "depth": 1},
+        {"reliability": "7"},
     ],
-)
-def test_offered_qos_is_named_whatever_version_wrote_it(
-    text: str, profiles: list[dict[str, object]]
-) -> None:
-    assert offered(text) == profiles
+}
 
 
-def test_it_says_that_damage_is_unseen_until_messages_are_read(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("text", OFFERED)
+def test_offered_qos_is_named_whatever_version_wrote_it(text):
+    assert offered(text) == OFFERED[text]
+
+
+def test_it_says_that_damage_is_unseen_until_messages_are_read(folder, capsys):
     path = folder / "one.mcap"
     content = bytearray(path.read_bytes())
     content[len(content) // 4] ^= 0xFF  # within the messages of a chunk
     path.write_bytes(content)
-    assert main(["info", str(path)]) == 0
-    assert "--clocks reads every message" in capsys.readouterr().out
     assert main(["info", str(path), "--json"]) == 0
     (entry,) = json.loads(capsys.readouterr().out)["recordings"]
     assert (entry["integrity"], entry["damage"]) == (None, [])
@@ -138,22 +99,3 @@ def test_it_says_that_damage_is_unseen_until_messages_are_read(
     (entry,) = json.loads(capsys.readouterr().out)["recordings"]
     assert entry["integrity"] == "damaged"
     assert "is lost" in entry["damage"][0]
-    assert main(["info", str(path), "--clocks"]) == 3
-    assert "--clocks reads" not in capsys.readouterr().out
-
-
-def test_equal_names_of_metadata_records_are_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from mcap.writer import Writer as McapWriter
-
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = McapWriter(file)
-        writer.start()
-        for name in ("rosbag2", "site", "rosbag2"):
-            writer.add_metadata(name, {"a": "b"})
-        writer.finish()
-    assert main(["info", str(path)]) == 0
-    text = capsys.readouterr().out
-    assert "metadata records, 3: rosbag2 (2), site\n" in text
