@@ -3,8 +3,8 @@
     python benchmarks/fleet.py [--out FOLDER] [--quick] [--json] [--check]
 
 Records the drives in the twin (each robot has hardware of its own, and payload and floor vary from
-day to day), ingests them into FOLDER/store, writes FOLDER/drift.html, and measures how often a worn
-wheel would be found: drives of one robot, drawn again as four weeks of which the last two are
+day to day), ingests them into FOLDER/store, writes FOLDER/coverage.html, and measures how often a
+worn wheel would be found: drives of one robot, drawn again as four weeks of which the last two are
 scaled. What is in FOLDER already is kept. `--check` exits 1 unless drift names the worn wheel, in
 both weeks in which it was worn, and nothing else, and unless 3 % of wear is found in most fleets
 with four drives a week, and false alarms are rare.
@@ -26,7 +26,6 @@ from harness import finish, markdown, option_parser, run_restock
 
 from restock.replay import Store, measure_drift
 from restock.replay.store.definitions import definitions
-from restock.report import write_drift_page
 from restock.train.twin.recording.recorder import FIRST_NS, HARDWARE
 from restock.twin import Perturbation, RecordingPlan, record
 
@@ -177,7 +176,7 @@ def main() -> int:
     with Store(out / "store") as store:
         drift = measure_drift(store)
         table = power(store, np.random.default_rng(0))
-    write_drift_page(drift, out / "drift.html")
+    run_restock(["coverage", str(out / "store"), "--out", str(out / "coverage.html")])
     hardware = [row for row in drift.findings if row["part"] not in ("driving", "conditions")]
     named = {(row["robot"], row["part"], row["scope"], row["periods"]) for row in hardware}
     missed = []

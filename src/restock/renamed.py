@@ -104,5 +104,6 @@ VERBS = {  # what to type instead
 }
 
 OPTIONS = {  # of one command, or of all; what to type instead
+    "coverage drift --out": "the page of `restock coverage STORE --out FILE` has drift, too",
     "--version": "write the version after the store: STORE@12 or STORE@2026-11-01T08:00Z",
 }

@@ -51,9 +51,10 @@ def test_it_names_the_worn_wheel(store: Path, capsys: pytest.CaptureFixture[str]
 def test_the_page_says_the_same_and_trusts_no_name(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = tmp_path / "pages" / "drift.html"
-    assert cli.main(["coverage", "drift", str(store), "--out", str(page), "--json"]) == 0
+    page = tmp_path / "pages" / "coverage.html"
+    assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
+    assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
     assert {row["robot"] for row in document["findings"] if row["part"] == "wheels"} == {"amr-2"}
     assert {row["against"] for row in document["tests"]} == {"own reference", "other robots"}
     read = Text()
@@ -69,8 +70,10 @@ def test_a_fleet_with_nothing_to_compare_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = fleet_store(tmp_path / "store", [SyntheticRobot(None)], weeks=1, episodes=2)
-    page = tmp_path / "drift.html"
-    assert cli.main(["coverage", "drift", str(store), "--out", str(page), "--exit-code"]) == 0
+    page = tmp_path / "coverage.html"
+    assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
+    capsys.readouterr()
+    assert cli.main(["coverage", "drift", str(store), "--exit-code"]) == 0
     out = capsys.readouterr().out
     assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
@@ -79,7 +82,7 @@ def test_a_fleet_with_nothing_to_compare_says_so(
     for text in (page.read_text("utf-8"), out):
         assert said in text
         assert "at least 5 episodes in each" in text
-        assert "no change" not in text.lower()
+        assert "no change that matters" not in text.lower()
 
 
 def test_alike_robots_without_a_reference_are_not_called_unchanged(
@@ -111,8 +114,10 @@ def test_no_change_is_said_with_its_number_of_tests(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = fleet_store(tmp_path / "store", [SyntheticRobot("amr-1")], recordings=3)
-    page = tmp_path / "drift.html"
-    assert cli.main(["coverage", "drift", str(store), "--out", str(page), "--json"]) == 0
+    page = tmp_path / "coverage.html"
+    assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
+    capsys.readouterr()
+    assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     own = [row for row in document["tests"] if row["against"] == "own reference"]
     tests = sum(row["p"] is not None for row in own)

@@ -14,7 +14,6 @@ from restock.files import write_text
 from restock.replay.fleet.drift import Drift
 from restock.replay.store.store import Store
 from restock.report.fleet.coverage import coverage_facts, coverage_page
-from restock.report.fleet.drift import drift_page
 from restock.report.look.write import as_markdown as markdown
 from restock.report.look.write import write_page
 from restock.report.run.card import as_markdown, replay_card
@@ -52,11 +51,6 @@ def write_gap_page(
     """
     content = gap_page(read_gap(Path(folder)))
     return write_page(content, out if out is not None else Path(folder) / "index.html", figures)
-
-
-def write_drift_page(drift: Drift, out: Path | str) -> Path:
-    """Write the page of what `measure_drift` found; returns its path."""
-    return write_page(drift_page(drift), out)
 
 
 def write_coverage_page(

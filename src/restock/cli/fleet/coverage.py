@@ -278,7 +278,7 @@ class DriftCommand:
     docs/coverage.md.
 
         restock coverage drift store/
-        restock coverage drift store/ --out drift.html
+        restock coverage store/ --out coverage.html                 # a page with the weeks
         restock sql store/ "FROM drift WHERE robot = 'amr-2'"       # every comparison
     """
 
@@ -286,8 +286,6 @@ class DriftCommand:
     """The store."""
     every: str = "week"
     """The length of a period: day, week, month, year or decade."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write an HTML page that opens without a network. Replaces an existing file."""
     exit_code: bool = False
     """Exit 1 if a robot, a site or a condition has changed. Changes in how a robot was driven do
     not count."""
@@ -295,20 +293,14 @@ class DriftCommand:
     """Print one JSON document: {"findings", "notes", "tests", …}."""
 
     def run(self) -> int:
-        """Measure, print, and write the page."""
+        """Measure and print."""
         from restock.cli import output
-        from restock.files import expect_file_place
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.store.store import Store
 
-        expect_file_place(self.out, "--out")
         with Store(self.store) as store:
             output.say_unverified(store)
             drift = measure_drift(store, every=self.every)
-        if self.out is not None:
-            from restock.report import write_drift_page
-
-            output.say(f"wrote {write_drift_page(drift, self.out)}")
         if self.json:
             output.print_json(drift.document())
         else:

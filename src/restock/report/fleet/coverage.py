@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import altair as alt
@@ -14,8 +13,7 @@ from restock.replay.fleet.drift import Drift
 from restock.replay.fleet.shopping_list import readable
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
-from restock.report.fleet.drift import findings_section
-from restock.report.fleet.drift import headline as drift_headline
+from restock.report.fleet.drift import drift_sections
 from restock.report.look import charts, floor_map
 from restock.report.look.blocks import (
     Drawing,
@@ -72,7 +70,7 @@ def coverage_page(
         _weeks(found["weeks"], in_words, once),
         _robots(found["robots"]),
         _map(found, colours),
-        _drift(drift),
+        *_drift(drift),
     ]
     robots = {row["robot"] for row in found["robots"]}
     numbers = {
@@ -299,16 +297,10 @@ def _map(found: dict[str, Rows], colours: dict[str, str]) -> Section | None:
     )
 
 
-def _drift(drift: Drift | str) -> Section:
+def _drift(drift: Drift | str) -> list[Section | None]:
     if isinstance(drift, str):
-        return Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")
-    section = findings_section(drift)
-    return replace(
-        section,
-        id="drift",
-        title="Has a robot changed?",
-        callout=section.callout or drift_headline(drift) + ".",
-    )
+        return [Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")]
+    return drift_sections(drift)
 
 
 MAX_GAPS = 20  # in the table

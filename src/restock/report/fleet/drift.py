@@ -1,4 +1,4 @@
-"""The page of drift: what has changed about which robot, and since when."""
+"""The sections on drift: what has changed about which robot, and since when."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import altair as alt
 
-from restock.errors import counted, plural
+from restock.errors import counted
 from restock.replay.fleet.drift import OWN, Drift
 from restock.replay.store.definitions import UNITS
 from restock.replay.store.definitions import unit as unit_of
@@ -29,41 +29,15 @@ _SCOPE = {
 }
 
 
-def drift_page(drift: Drift) -> dict[str, Any]:
-    """Return everything that the page's template needs."""
-    robots = {row["robot"] for row in drift.periods}
-    periods = {row["period"] for row in drift.periods}
+def drift_sections(drift: Drift) -> list[Section | None]:
     own = drift.own
-    sections = [
-        findings_section(drift),
+    return [
+        _findings_section(drift),
         _overview_section(drift, own),
         _conditions_section(drift, own),
         _differences_section(drift),
         _comparisons_section(own),
     ]
-    return {
-        "kicker": "drift of a fleet",
-        "title": f"Drift of {drift.store}",
-        "headline": headline(drift),
-        "lead": f"{counted(len(robots), 'robot')} over {counted(len(periods), drift.every)}:"
-        f" each {drift.every} of a robot compared with its first "
-        f"{counted(drift.reference, drift.every)}, and with the other robots of its site.",
-        "cards": [
-            {"value": f"{number:,}", "label": label}
-            for number, label in (
-                (len(robots), "robots"),
-                (len(periods), f"{plural(len(periods), drift.every)} with driving"),
-                (drift.tested, "tests against a robot's own reference"),
-                (len(drift.findings), "changes: a signal of a robot"),
-                (
-                    sum(row["verdict"] == "too few" for row in own),
-                    "comparisons with too little data",
-                ),
-            )
-        ],
-        "sections": sections,
-        "source": f"{drift.store}, version {drift.version}",
-    }
 
 
 def headline(drift: Drift) -> str:
@@ -86,7 +60,9 @@ def headline(drift: Drift) -> str:
     return drift.without_findings()
 
 
-def findings_section(drift: Drift) -> Section:
+def _findings_section(drift: Drift) -> Section:
+    robots = {row["robot"] for row in drift.periods}
+    periods = {row["period"] for row in drift.periods}
     rows = [
         {
             "robot": row["robot"],
@@ -102,14 +78,17 @@ def findings_section(drift: Drift) -> Section:
     ]
     shown = [row for row in drift.findings if row["part"] != "conditions"][:MAX_FINDINGS]
     return Section(
-        "findings",
-        "What has changed",
-        intro="A change is reported if it is at least the least change that matters for its "
-        "signal, and if its p-value, corrected over all signals, robots and periods, is below "
-        ".05. The interval has 95 % confidence for the single signal. Scope: whether the "
-        "other robots of the site changed in the same way in the same period, for example "
-        "because of a new floor.",
-        callout="" if rows else headline(drift) + ".",
+        "drift",
+        "Has a robot changed?",
+        intro=f"{counted(len(robots), 'robot')} over {counted(len(periods), drift.every)}: each"
+        f" {drift.every} of a robot compared with its first"
+        f" {counted(drift.reference, drift.every)} ({counted(drift.tested, 'test')}), and with the"
+        " other robots of its site. A change is reported if it is at least the least change that"
+        " matters for its signal, and if its p-value, corrected over all signals, robots and"
+        " periods, is below .05. The interval has 95 % confidence for the single signal. Scope:"
+        " whether the other robots of the site changed in the same way in the same period, for"
+        " example because of a new floor.",
+        callout=headline(drift) + ".",
         figures=[_trend(drift, row) for row in shown],
         two=True,
         tables=[Table(rows), Table([{"notes": note} for note in drift.notes])],
