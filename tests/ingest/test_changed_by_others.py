@@ -143,7 +143,7 @@ def changed(store: Path, way: str) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
-def test_rows_that_another_tool_changed_are_read_replaced_and_joined(store, way):
+def test_rows_changed_by_another_tool_are_read_and_joined(store, way):
     expected = changed(store, way)
     kinds = {
         str(kind)

@@ -95,17 +95,6 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
     assert rows["/cmd_vel"]["offset_ns"] is None
 
 
-def test_info_compares_clocks_when_asked(bag, capsys):
-    assert main(["info", str(bag), "--json"]) == 0
-    plain = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
-    assert "clock" not in plain["/odom"]
-    assert main(["info", str(bag), "--clocks", "--json"]) == 0
-    clock = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]["/odom"]["clock"]
-    assert (clock["zero_stamps"], clock["duplicates"], clock["backsteps"]) == (1, 1, 2)
-    assert main(["info", str(bag), "--clocks"]) == 0
-    assert "zero" in capsys.readouterr().out  # long cells are wrapped
-
-
 def test_messages_logged_out_of_order_are_counted(tmp_path, capsys):
     from support.bag_samples import write_mcap
 

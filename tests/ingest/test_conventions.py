@@ -101,32 +101,6 @@ def test_odometry_without_speeds_makes_no_rows(tmp_path: Path) -> None:
     assert set(steps.problem) == {"wheels: no estimate"}
 
 
-def test_a_fix_without_status_ok_is_none(tmp_path: Path) -> None:
-    topics = drive()
-    tenth = np.arange(0, SECONDS, 0.1)
-    fix = {
-        "latitude": 48.0 + tenth * 0.5 / 111_000,
-        "longitude": np.full(len(tenth), 11.0),
-        "status.status": np.where(tenth < 3, 0, -1),
-    }
-    topics["/fix"] = ("sensor_msgs/msg/NavSatFix", columns(tenth, fix))
-    text = WAREHOUSE.replace('topic = "/amcl_pose"', 'topic = "/fix"')
-    text = text.replace(
-        'type = "geometry_msgs/msg/PoseWithCovarianceStamped"', 'type = "sensor_msgs/msg/NavSatFix"'
-    )
-    start = text.index("fields", text.index("[inputs.pose]"))
-    end = text.index("\n", start)
-    text = (
-        text[:start]
-        + 'fields = { latitude_deg = "latitude", longitude_deg = "longitude" }'
-        + text[end:]
-    )
-    steps = steps_in(topics, tmp_path, parse_profile(text, where="p"))
-    half = len(steps) // 2
-    assert set(steps.problem[half + 1 :]) == {"pose: no fix"}
-    assert "pose: no fix" not in steps.problem[:half]
-
-
 def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
     topics = drive(angular_velocity=slice(None))
     ticks = np.arange(0, SECONDS, 0.1)

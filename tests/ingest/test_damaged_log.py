@@ -100,7 +100,7 @@ def test_a_damaged_checkpoint_is_named_and_can_do_without(whole, tmp_path, how):
     assert len(shown(tmp_path / "s")) == LAST
 
 
-def test_a_commit_that_a_checkpoint_has_may_be_damaged_but_for_older_versions(whole, tmp_path):
+def test_a_commit_within_a_checkpoint_may_be_damaged(whole, tmp_path):
     damaged(whole, tmp_path / "s", f"transitions/_delta_log/{1:020}.json", "empty")
     assert len(shown(tmp_path / "s")) == LAST
     with pytest.raises(StoreError, match=rf"_delta_log/{1:020}.json is empty"):

@@ -13,7 +13,6 @@ from support.foxglove_robot import (
     FIELD_RAD,
     SPEED_MPS,
     START_NS,
-    TYPES,
     WALL_M,
     YAW_RATE_RADPS,
     Message,
@@ -120,24 +119,6 @@ def test_goals_and_plans_are_not_taken_for_poses(tmp_path, capsys):
     inputs = parse_profile(toml, where="p").inputs
     topics = inputs.goal.topic, inputs.plan.topic, inputs.pose.topic
     assert topics == ("/goal_pose", "/plan", "/pose")
-
-
-def test_a_ros_type_name_with_other_fields_is_not_taken(tmp_path, capsys):
-    TYPES["geometry_msgs/msg/Twist"] = {"speed": "number", "turn": "number"}
-    try:
-        messages = [
-            (time_s, topic, "geometry_msgs/msg/Twist", {"speed": 0.5, "turn": 0.1})
-            if topic == "/cmd_vel"
-            else (time_s, topic, kind, values)
-            for time_s, topic, kind, values in drive(5.0)
-        ]
-        path = write_robot(tmp_path / "run.mcap", "json", messages)
-    finally:
-        del TYPES["geometry_msgs/msg/Twist"]
-    toml, problems = proposed(path, capsys, 3)
-    assert len(problems) == 1
-    assert "no topic for command" in problems[0]
-    assert "name it here" in toml
 
 
 @pytest.mark.parametrize(("encoding", "together"), [("json", True), ("protobuf", False)])

@@ -331,6 +331,7 @@ def test_what_is_no_topic_of_transforms_is_named(topic, said, tmp_path, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_on_the_sample_log_transforms_and_localisation_agree(tmp_path, capsys):
     """Rows, labels and scores from /tf are those from /amcl_pose."""
     profile = tmp_path / "p.toml"

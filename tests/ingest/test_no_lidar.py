@@ -18,10 +18,8 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.pipeline import ingest
 from restock.ingest.prepared import IngestResult
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import shipped
 from restock.ingest.task.robot import NONE, SPEED, Limits, limit
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
 from restock.replay.mixture.mixture import parse_mixture
@@ -201,18 +199,6 @@ def test_a_quota_on_an_unknown_condition_says_why_it_is_empty(blind):
         refusing = parse_mixture(MIXTURE.format(more='shortfall = "refuse"'), where="mix.toml")
         with pytest.raises(MixtureError, match=r"near_collision wants 40\.0%, and is unknown in"):
             plan_panel(store.connection, refusing, known)
-
-
-def test_labels_made_again_stay_unknown(drives, tmp_path):
-    writer = StoreWriter(tmp_path / "store")
-    ingest(drives / "blind", BLIND, store=writer)
-    changed = [shipped()["near_collision"], shipped()["wheel_slip"]]
-    (outcome,), version = relabel_store(writer, lambda profile: changed)
-    assert set(outcome.named) <= {"wheel_slip", "nominal"}
-    with Store(tmp_path / "store", version=version) as store:
-        assert store.sql("SELECT condition FROM unknown_conditions").fetchall() == [
-            ("near_collision",)
-        ]
 
 
 def test_the_limiter_without_a_lidar_limits_speed_alone():

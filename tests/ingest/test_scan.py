@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.robot import Limits, limit
 from restock.ingest.task.scan import Body, MovedMap, SectorMap, outline_reach
 
 BODY = Body(length_m=0.7, width_m=0.5)
@@ -67,19 +65,6 @@ def test_too_close_to_be_measured_is_no_clearance(at_m: tuple[float, float] | No
     assert (found[1, left] == 0).all()
     assert set(left) <= set(range(22, 30))
     assert len(left)
-
-
-def test_the_limiter_does_not_drive_at_what_is_too_close():
-    task = load_profile("warehouse_amr").task
-    limits = Limits.of(task)
-    ranges = np.full((3, 360), np.inf)
-    ranges[1, 170:190] = -np.inf  # ahead
-    ranges[2, 170:190] = task.range_min_m  # the nearest that it can measure
-    seen = SectorMap.build(CIRCLE, task.sectors, task.body)
-    clearance = seen.clearance(ranges, task.range_min_m, task.range_max_m)
-    ahead, still = np.tile([0.3, 0.0], (3, 1)), np.zeros((3, 2))
-    assert limit(limits, ahead, clearance, still).command[:, 0].tolist() == [0.3, 0.0, 0.0]
-    assert (limit(limits, -ahead, clearance, still).command[:, 0] == -0.3).all()  # away from it
 
 
 def test_a_sector_without_beams_is_free():

@@ -23,7 +23,6 @@ from restock.ingest.steps.episodes import steps_of
 from restock.replay.store.store import Store
 
 PACES = [0.5, 0.97, 1.0]
-WARM_UP_S = 1.0
 
 
 def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None):
@@ -181,23 +180,6 @@ def test_what_cannot_be_mapped_is_refused_with_the_remedy() -> None:
     assert e.value.remedy == 'set [clock] alignment = "log_time" in the profile'
     del topics["/cmd"]  # nothing is without a stamp: there is nothing to map
     assert len(align(topics, Clock())[0][0].topics["/odom"].row) == 120
-
-
-def test_messages_off_the_clock_are_lost_and_said_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drive = Drive(12.0)
-    topics = drive.topics()
-    topics["/odom"].fields["header.stamp"][40] += 30 * NS
-
-    class Odd(Drive):
-        def topics(self) -> dict[str, TopicColumns]:
-            return topics
-
-    bag = write_bag(Odd(12.0), tmp_path / "bag")
-    assert cli.main(["ingest", str(bag), "--store", str(tmp_path / "s"), "--json"]) == 3
-    (row,) = json.loads(capsys.readouterr().out)["recordings"]
-    assert "/odom: left out, as their stamps do not fit the clock (1 message)" in row["losses"]
 
 
 # The three recordings of simulations slower than real time, recomputed: rosbags and plain loops.

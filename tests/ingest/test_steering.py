@@ -109,12 +109,6 @@ def test_drives_of_one_robot_are_judged_together() -> None:
     assert DriveEvidence.joined([one, one, turned]).pivots
 
 
-def test_a_robot_that_does_not_move_at_all_shows_nothing() -> None:
-    held_up = DriveEvidence(driven_m=0.0, requested_rad=9.0, spells=5)
-    assert not held_up.steers
-    assert not held_up.pivots
-
-
 def bag(folder: Path, *, pivots: bool) -> Path:
     """20 s: ahead, and told twice to turn on the spot."""
     time_s = np.arange(0, 20, 0.05)
@@ -158,13 +152,6 @@ def test_a_proposal_names_a_robot_that_steers_with_its_evidence(
     assert profile.robot.drive == "ackermann"
     assert profile.robot.origin_of("drive") == "logs"
     assert all(speed or not turn for speed, turn in profile.task.actions)
-
-
-def test_a_proposal_says_that_a_robot_turned_on_the_spot(tmp_path: Path) -> None:
-    file = tmp_path / "base.toml"
-    assert main(["profile", "new", str(bag(tmp_path / "a", pivots=True)), "--out", str(file)]) == 0
-    assert "rad in all\ndrive =" in file.read_text()
-    assert load_profile(file).robot.drive == "differential"  # type: ignore[union-attr]
 
 
 REAL = {
