@@ -86,18 +86,6 @@ def test_any_command_is_driven_and_seen_and_rewarded_as_its_nearest_action() -> 
         previous = np.where(going, action, 0)
 
 
-def test_commands_beyond_the_space_are_clipped() -> None:
-    seen = []
-    for command in ([9.0, -9.0], [1.0, -1.2]):
-        made = WarehouseVectorEnv(1, action="continuous")
-        made.reset(seed=5)
-        for _ in range(4):
-            observation, *_, info = made.step(np.array([command], np.float32))
-        assert info["signals"]["command_speed_mps"][0] == 1.0
-        seen.append(observation)
-    np.testing.assert_array_equal(*seen)
-
-
 def test_a_command_that_is_no_number_is_refused() -> None:
     made = WarehouseVectorEnv(2, action="continuous")
     made.reset(seed=0)
@@ -113,32 +101,3 @@ def test_an_index_outside_the_table_is_refused(index: float) -> None:
     with pytest.raises(ConfigError, match="environment 1 of the twin: an action must be an index"):
         made.step(np.array([0, index]))
     made.step(np.array([0.0, 9.0]))
-
-
-@pytest.mark.parametrize(
-    ("action", "given"), [("discrete", [1, 2, 3]), ("discrete", ["a", "b"]), ("continuous", [0.5])]
-)
-def test_another_number_of_actions_is_refused_with_the_shape(action: str, given: list) -> None:
-    made = WarehouseVectorEnv(2, action=action)
-    made.reset(seed=1)
-    with pytest.raises(ConfigError, match=r"actions must be numbers of shape \(2,"):
-        made.step(np.array(given))
-
-
-def test_an_unknown_face_is_refused() -> None:
-    with pytest.raises(ConfigError, match="unknown action space 'velocity'"):
-        WarehouseVectorEnv(1, action="velocity")
-
-
-def test_state_continues_bit_for_bit_in_the_continuous_action_space() -> None:
-    def roll(env: WarehouseVectorEnv) -> np.ndarray:
-        env.action_space.seed(7)
-        return np.array([env.step(env.action_space.sample())[0] for _ in range(25)])
-
-    made = WarehouseVectorEnv(3, action="continuous")
-    made.reset(seed=2)
-    roll(made)
-    state = made.state_dict()
-    expected = roll(made)
-    made.load_state_dict(state)
-    np.testing.assert_array_equal(roll(made), expected)

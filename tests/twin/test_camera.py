@@ -81,11 +81,6 @@ def test_nothing_of_gl_is_loaded_for_the_drawn_map() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_an_unknown_camera_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"unknown camera 'drone'.*\n?.*chase, overhead"):
-        WarehouseVectorEnv(1, camera="drone")  # type: ignore[arg-type]
-
-
 def test_without_egl_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)  # as if it could not be imported
     with pytest.raises(ConfigError, match="EGL is unavailable") as raised:

@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import FORKLIFT_HALF_M, PARKED_M, PEOPLE, PERSON_RADIUS_M
-from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.scenery import HIDDEN, WALKING, Traffic
 
 ROBOT_HALF_M = (0.35, 0.25)
@@ -72,15 +70,3 @@ def test_the_least_of_an_episode_is_kept_and_who_is_hidden_does_not_count() -> N
     traffic.closest_m[0] = np.inf
     traffic.note_closest(np.zeros((1, 2)), lambda ids: np.zeros(len(ids)))
     assert np.isinf(traffic.closest_m[0])
-
-
-def test_it_is_measured_in_episodes_that_were_asked_for() -> None:
-    env = WarehouseVectorEnv(2, conditions={"near_collision": 1.0})
-    env.set_episodes([EpisodeSpec("near_collision", 3), EpisodeSpec("nominal", 3)])
-    env.reset(seed=0)
-    near, nobody = env.step(np.array([2, 2]))[4]["closest_person_m"]
-    assert 0 < near < 20
-    assert np.isinf(nobody)
-    env = WarehouseVectorEnv(1, conditions={"near_collision": 1.0})
-    env.reset(seed=0)
-    assert np.isposinf(env.step(np.array([2]))[4]["closest_person_m"]).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from support.paths import ROOT, SHARED
+from support.paths import SHARED
 
 from restock import cli
 from restock.errors import ConfigError, ExitCode, StoreError
@@ -21,7 +20,6 @@ from restock.replay.store.store import Store
 from restock.train.twin.calibration.fit import FitConfig, _least_squares, fit
 from restock.train.twin.calibration.fit_solver import (
     DEFAULT,
-    PARAMETERS,
     Coordinates,
     ReplayResiduals,
     position_gap_m,
@@ -44,7 +42,6 @@ from restock.train.twin.calibration.open_loop import (
     split_at,
 )
 from restock.train.twin.physics.perturbation import (
-    RANGES,
     Perturbation,
     load_perturbation,
     load_schedule,
@@ -127,19 +124,6 @@ def test_a_late_pose_or_tick_moves_segments_on_and_does_not_lose_them(known: Pat
     assert moved.left_out["ticks not a control period apart"] == usual.row[0] + 4 - usual.row[0]
 
 
-def test_segments_are_the_rows_of_the_store(known: Path) -> None:
-    with Store(known) as store:
-        found = log_segments(logged_steps(store), 1.0, stride_s=3.0)
-        first = found.transition_id[-1]
-        rows = store.sql(
-            "SELECT pose_x_m, command_speed_mps, primary_condition FROM transitions"
-            f" WHERE transition_id BETWEEN {first} AND {first + 5} ORDER BY transition_id"
-        ).fetchall()
-    assert found.signals["pose_x_m"][-1] == pytest.approx([row[0] for row in rows])
-    assert found.command[-1, found.warmup_steps :, 0] == pytest.approx([r[1] for r in rows[:5]])
-    assert found.condition[-1].tolist() == [row[2] for row in rows[:5]]
-
-
 def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path) -> None:
     with Store(noiseless) as store:
         found = log_segments(logged_steps(store), 3.0)
@@ -150,13 +134,6 @@ def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path
     assert np.median(other) > 0.05
     speed = replayed.signals["wheel_speed_mps"][0] - free.signals["wheel_speed_mps"]
     assert np.abs(speed).max() < 0.01
-
-
-def test_a_replay_does_not_depend_on_what_else_is_replayed(log: LoggedSegments) -> None:
-    alone = replay_segments(log.take(np.array([1])), [KNOWN])
-    among = replay_segments(log, [Perturbation(), KNOWN], nthread=2)
-    for name, values in alone.signals.items():
-        assert np.array_equal(values[0, 0], among.signals[name][1, 1])
 
 
 def test_between_two_latencies_a_residual_lies_between(log: LoggedSegments) -> None:
@@ -271,16 +248,6 @@ def test_what_is_held_out_is_never_fitted(log: LoggedSegments) -> None:
     assert stamps[before].max() <= stamps[after].min()
 
 
-def test_points_and_perturbations_are_the_same_thing() -> None:
-    task = load_profile("warehouse_amr").task
-    coordinates = Coordinates(tuple(PARAMETERS), Perturbation(), task)
-    z = np.linspace(0.0, 1.0, len(coordinates))
-    assert coordinates.point(coordinates.perturbation(z)) == pytest.approx(z, abs=1e-6)
-    ends = coordinates.values(np.array([np.zeros(len(z)), np.ones(len(z))]))
-    for name, low, high in zip(coordinates.names, *ends, strict=True):
-        assert (low, high) == pytest.approx(RANGES[name])
-
-
 def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, error in (
         (("--parameters", "gain,grip"), "'grip' cannot be fitted"),
@@ -301,14 +268,6 @@ def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixtu
             fit(store, FitConfig(parameters=("gain",), horizon_s=60.0))
         with pytest.raises(ConfigError, match="must be a multiple of the control period"):
             fit(store, FitConfig(parameters=("gain",), horizon_s=0.35))
-
-
-def test_the_command_prints_json(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2"]
-    assert cli.main([*line, "--segments", "8", "--json"]) == ExitCode.OK
-    said = json.loads(capsys.readouterr().out)
-    assert [item["name"] for item in said["fits"][0]["estimates"]] == ["gain"]
-    assert said["out"] is None
 
 
 @pytest.mark.skipif(not BAGS.is_dir(), reason="needs ../shared/bags")
@@ -347,19 +306,3 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
             true_value = getattr(true, item.name)
             assert item.value == pytest.approx(true_value, abs=within[item.name]), item
     assert found.held_out[-1].after_m < 0.25 * found.held_out[-1].before_m
-
-
-@pytest.mark.slow
-def test_friction_that_a_dry_log_does_not_identify_is_not_fitted_at_an_end_of_its_range(
-    tmp_path: Path,
-) -> None:
-    """Leave friction unfitted: the search once stopped at twice the floor's, as if fitted."""
-    logs = ROOT / "sample_logs" / "amr_monday.mcap"
-    ingest(logs, load_profile("warehouse_amr"), store=StoreWriter(tmp_path / "store"))
-    with Store(tmp_path / "store") as store:
-        found = fit(store)
-    (friction,) = (item for item in found.estimates if item.name == "friction_scale")
-    assert not friction.fitted
-    assert found.perturbation.friction_scale == 1.0
-    (after,) = (gap for gap in found.held_out if gap.horizon_s == 6.0)
-    assert after.after_m < 0.6 * after.before_m

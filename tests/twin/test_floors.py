@@ -21,7 +21,7 @@ from scipy.sparse import csgraph
 import restock  # noqa: F401 - registers the environment
 from restock.cli import main
 from restock.cli.learning.train import describe_run
-from restock.errors import ConfigError, RunError
+from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.navigation import BlockFinder
@@ -72,11 +72,6 @@ def test_on_a_generated_floor_every_goal_is_reached_from_every_aisle(seed: int, 
         assert segment.width_m >= RECIPES[kind].aisle_m[0] - 1e-6
 
 
-@given(seed=st.integers(0, 2**53 - 1))
-def test_a_seed_belongs_to_one_split(seed: int) -> None:
-    assert [split for split in SPLITS if split == split_of(seed)] == [split_of(seed)]
-
-
 def test_the_splits_share_no_floor() -> None:
     floors = {split: {f.hash for f in open_floors(f"generated:{split}:40")} for split in SPLITS}
     assert all(len(hashes) == 40 for hashes in floors.values())
@@ -109,17 +104,6 @@ def test_a_floor_survives_toml_and_an_occupancy_map(
     for goal in floor.goals[:: max(len(floor.goals) // 4, 1)]:
         place = (float(goal[0]), float(goal[1]))
         assert abs(mapped.distance_m(*start, place) - ruled.distance_m(*start, place)) < 0.3
-
-
-def test_aisles_of_both_directions_are_found_on_a_map(tmp_path: Path) -> None:
-    for seed in (1, 3):  # along x, along y
-        floor = replace(generate(seed), docks=())
-        write_map(floor, tmp_path / "map.yaml")
-        segments = read_map(tmp_path / "map.yaml").segments
-        assert {segment.along for segment in segments} == {floor.segments[0].along}
-        middles = np.array([segment.area.center for segment in segments])
-        inside = floor.segment_of(middles[:, 0], middles[:, 1])
-        assert sorted(inside.tolist()) == list(range(len(floor.segments)))
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
@@ -196,17 +180,6 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
     (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
     with pytest.raises(ConfigError, match=message):
         read_map(tmp_path / "map.yaml")
-
-
-def test_a_map_with_black_and_white_exchanged_is_told_by_its_remedy(tmp_path: Path) -> None:
-    """Suggest exchanged colours if only the racks, 2 x .7 m, are free."""
-    pixels = np.zeros((80, 100), np.uint8)
-    pixels[30:44, 20:60] = 254
-    write_pgm(tmp_path / "map.pgm", pixels)
-    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
-    with pytest.raises(ConfigError, match=r"is 2\.0 x 0\.7 m: not a floor") as refused:
-        read_map(tmp_path / "map.yaml")
-    assert "negate" in str(refused.value.remedy)
 
 
 @pytest.mark.parametrize(
@@ -361,24 +334,6 @@ def test_an_episode_is_the_same_alone_and_among_other_floors_whatever_the_thread
 
 def replace_layout(spec: EpisodeSpec, layout: str) -> EpisodeSpec:
     return EpisodeSpec(spec.condition, spec.seed, layout=layout)
-
-
-def test_state_continues_on_several_floors_and_is_refused_on_others() -> None:
-    env = WarehouseVectorEnv(6, layouts="generated:train:4", seed=2)
-    env.reset(seed=2)
-    rng = np.random.default_rng(1)
-    actions = rng.integers(10, size=(30, 6))
-    for action in actions:
-        env.step(action)
-    state = env.state_dict()
-    expected = [env.step(action)[0] for action in actions]
-    fresh = WarehouseVectorEnv(6, layouts="generated:train:4", seed=9)
-    fresh.reset()
-    fresh.load_state_dict(state)
-    for action, seen in zip(actions, expected, strict=True):
-        np.testing.assert_array_equal(fresh.step(action)[0], seen)
-    with pytest.raises(RunError, match="other floors"):
-        WarehouseVectorEnv(6, layouts="generated:test:4").load_state_dict(state)
 
 
 def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:

@@ -40,7 +40,7 @@ from restock.train.twin.calibration.logged_steps import (
     sector_clearance,
 )
 from restock.train.twin.calibration.open_loop import empty_floor
-from restock.train.twin.calibration.path_gap import FLOOR, measured_noise
+from restock.train.twin.calibration.path_gap import FLOOR
 from restock.train.twin.calibration.twin_gap import (
     TRUSTED,
     UNDECIDED,
@@ -188,13 +188,6 @@ def test_what_is_rebuilt_from_a_store_is_what_was_logged(stored: Path) -> None:
     np.testing.assert_allclose(plans.progress_m(steps, rows, steps.after), steps.progress_m)
 
 
-def test_localisation_noise_is_measured_in_the_log(stored: Path) -> None:
-    with Store(stored) as store:
-        noise = measured_noise(logged_steps(store), TRUE)
-    assert 0.5 * TRUE.localisation_noise_m < noise.position_m < 2 * TRUE.localisation_noise_m
-    assert 0.5 < noise.heading_rad / TRUE.localisation_yaw_noise_rad < 2
-
-
 def test_logged_rewards_are_the_sum_of_their_terms(stored: Path) -> None:
     with Store(stored) as store:
         steps = logged_steps(store)
@@ -229,14 +222,6 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Pat
         write_gap(gap, tmp_path / "other")
     with pytest.raises(RunError, match="no gap of the twin has been measured"):
         read_gap(tmp_path / "other")
-
-
-@pytest.mark.long
-def test_the_same_seed_measures_the_same(gap: TwinGap, stored: Path) -> None:
-    with Store(stored) as store:
-        again = measure_gap(store, TRUE, replace(CONFIG, nthread=2))
-    assert again.paths == gap.paths
-    assert again.rewards == gap.rewards
 
 
 def run(*args: object) -> int:

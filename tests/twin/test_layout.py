@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.train.twin.floors.layout import default_warehouse, strip_warehouse
+from restock.train.twin.floors.layout import default_warehouse
 
 
 def test_the_profile_names_the_same_zones_as_the_warehouse() -> None:
@@ -29,25 +27,9 @@ def test_racks_fill_exactly_what_aisles_and_cross_aisles_leave() -> None:
         assert in_rack == (not in_aisle and not in_cross)
 
 
-def test_every_goal_has_room_for_the_robot() -> None:
-    floor = default_warehouse()
-    for x, y in floor.goals:
-        assert 0.5 < x < floor.width_m - 0.5
-        assert 0.5 < y < floor.depth_m - 0.5
-        assert not any(rack.contains(x, y, -0.5) for rack in floor.racks)
-
-
 def test_a_point_belongs_to_its_aisle_segment() -> None:
     floor = default_warehouse()
     middles = np.array([segment.area.center for segment in floor.segments])
     segment = floor.segment_of(middles[:, 0], middles[:, 1])
     assert segment.tolist() == list(range(len(floor.segments)))
     assert floor.segment_of(np.array([1.1]), np.array([5.0]))[0] == -1  # in a cross-aisle
-
-
-@pytest.mark.parametrize(
-    "aisles", [((0.0, 2.0),), ((2.0, 3.0), (0.0, 1.0)), ((0.0, 2.0), (8.5, 10.5))]
-)
-def test_impossible_aisles_are_refused(aisles: tuple[tuple[float, float], ...]) -> None:
-    with pytest.raises(ConfigError, match="warehouse layout"):
-        strip_warehouse(12.0, 10.0, aisles, ((0.0, 2.0), (10.0, 12.0)))

@@ -20,7 +20,6 @@ from restock.ingest.task.robot import Lidar as LidarLimits
 from restock.ingest.task.robot import Robot
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import pallet_half_m
-from restock.train.twin.physics.model import passed_over
 
 needs_native = pytest.mark.skipif(not native.IS_THERE, reason=native.state())
 TASK = load_profile("warehouse_amr").task
@@ -92,19 +91,6 @@ def test_people_pallets_and_forklifts_are_seen(
 
 
 @needs_native
-def test_a_robot_that_is_nowhere_sees_nothing_and_ends(
-    environments: list[WarehouseVectorEnv], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    simulation = environments[0].simulation
-    simulation.place_robot(3, math.nan, 1.0, 0.0)
-    monkeypatch.setenv(native.SWITCH, "1")
-    ranges = simulation.cast(np.arange(8))
-    assert np.isinf(ranges[3]).all()
-    assert np.isfinite(ranges[[0, 1, 2, 4, 5, 6, 7]]).all()
-    simulation.place_robot(3, 1.0, 1.0, 0.0)
-
-
-@needs_native
 def test_what_does_not_fit_is_refused() -> None:
     place, one, two = np.zeros(2), np.zeros(1), np.zeros(2, np.int64)
     first = np.zeros(1, np.int64)
@@ -161,12 +147,6 @@ def test_a_lidar_on_a_mast_sees_racks_and_walls(
     for ranges in both(high, monkeypatch):
         assert np.isfinite(ranges).all()
         np.testing.assert_allclose(ranges, low.simulation.cast(np.arange(8)))
-
-
-def test_what_a_lidar_passes_over_is_said_with_its_height() -> None:
-    assert passed_over(0.5) == []
-    assert passed_over(1.0) == ["pallets (0.6 m)"]
-    assert passed_over(1.9) == ["pallets (0.6 m)", "forklifts (1.2 m)", "people (1.7 m)"]
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,11 @@ from restock.train.judge.comparability import kind_of
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionOrders
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.layout import default_warehouse, strip_warehouse
+from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.recording.fleet import MAX_DRIVEN, OrderedMissions, meets
+from restock.train.twin.recording.fleet import MAX_DRIVEN, OrderedMissions
 from restock.train.twin.recording.recorder import RecordingPlan
 
 FLOOR = default_warehouse()
@@ -69,17 +69,6 @@ def test_what_the_twin_cannot_hold_is_refused_by_name(order: MissionOrder, messa
     assert "missions[1]" in str(error.value)
 
 
-def test_a_floor_without_room_for_a_kind_is_refused_by_name() -> None:
-    # Aisles so short that no way through them could be blocked.
-    tiny = strip_warehouse(
-        3.2, 3.0, ((0.0, 1.2), (1.8, 3.0)), ((0.0, 1.2), (2.0, 3.2)), name="tiny"
-    )
-    with pytest.raises(ConfigError, match="tiny has no room for episodes of blocked_aisle"):
-        MissionOrders(
-            [MissionOrder(kind="blocked_aisle", missions=1)], [tiny], planners([tiny]), where="x"
-        )
-
-
 def test_rounds_drive_on_until_enough_met_their_kind_and_never_without_end() -> None:
     missions = ordered(SLIP, MissionOrder(kind="near_collision", missions=2))
     driven = []
@@ -93,22 +82,6 @@ def test_rounds_drive_on_until_enough_met_their_kind_and_never_without_end() -> 
     assert missions.observed[0] == 4 or kinds.count("wheel_slip") == MAX_DRIVEN * 4
     assert len({mission.spec.seed for mission in driven}) == len(driven)
     assert not missions.owed()
-
-
-def test_another_list_or_seed_is_other_missions() -> None:
-    def seeds(missions: OrderedMissions) -> set[int]:
-        return {mission.spec.seed for mission in next(missions.rounds())}
-
-    first = seeds(ordered(SLIP))
-    assert first == seeds(ordered(SLIP))
-    assert not first & seeds(ordered(SLIP, seed=1))
-    assert not first & seeds(ordered(MissionOrder(kind="wheel_slip", missions=5)))
-
-
-def test_what_a_mission_met_is_in_its_truth() -> None:
-    assert meets("wheel_slip", ["nominal", "near_collision,wheel_slip"])
-    assert not meets("wheel_slip", ["nominal", "near_collision"])
-    assert meets("nominal", ["near_collision"])
 
 
 def test_missions_of_a_robot_are_those_of_its_tag() -> None:
@@ -225,21 +198,3 @@ def test_a_run_keeps_its_missions_and_comparisons_see_them(tmp_path: Path) -> No
     assert isinstance(twin, WarehouseVectorEnv)
     kinds = {twin.queue.next(0)[0].condition for _ in range(40)}
     assert "wheel_slip" in kinds
-
-
-def test_training_refuses_what_its_floors_cannot_hold_before_anything_is_written(
-    tmp_path: Path,
-) -> None:
-    for text, message in (
-        ('kind = "wheel_slip"\nmissions = 1\nlayout = "hall"', "floor 'hall'"),
-        ("hours = 3.0", "hours of logging"),
-    ):
-        (tmp_path / "next.toml").write_text(f"[[missions]]\n{text}\n")
-        with pytest.raises(ConfigError, match=message) as error:
-            prepare_new(
-                tmp_path / "run", None, None, [f"env.missions={str(tmp_path / 'next.toml')!r}"]
-            )
-        assert "env.missions" in str(error.value)
-    with pytest.raises(ConfigError, match="restock coverage gaps"):
-        prepare_new(tmp_path / "run", None, None, ["env.missions='none.toml'"])
-    assert not (tmp_path / "run").exists()

@@ -112,16 +112,6 @@ def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: boo
     assert one.sector_clearance_m.shape[-1] == (steps.task.sectors if mapped else 0)
 
 
-def test_an_empty_floor_has_no_middle_and_no_end(steps: LoggedSteps) -> None:
-    """Move robots to where there is room, and report them where they were put."""
-    rows = log_segments(steps, 1.2).row[:2]
-    near = start_of(steps, rows, 5)
-    shift = np.array([1e4, -2e4, 0.0])
-    far = OpenLoopStart(near.pose + shift, near.motion, near.command, near.past)
-    here, there = (drive_open_loop(steps.task, start, [LATE]) for start in (near, far))
-    np.testing.assert_allclose(there.pose - shift, here.pose, atol=1e-9)
-
-
 def test_a_replay_is_a_drive_whose_warm_up_is_laid_onto_the_log(steps: LoggedSteps) -> None:
     cut = log_segments(steps, 1.2)
     cut = cut.take(np.arange(min(len(cut), 8)))

@@ -19,7 +19,7 @@ from restock.ingest.profile.profile import load_profile, profile_toml, read_prof
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.model import build_robot_alone, robot_model
+from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.perturbation import Perturbation
 
 PAGE = (ROOT / "docs" / "robot.md").read_text()
@@ -36,23 +36,6 @@ def test_the_model_of_the_page_drives_what_it_is_commanded() -> None:
     np.testing.assert_allclose(odometry, commands, rtol=0.03, atol=0.01)
     assert sim.robot.mass_kg == pytest.approx(24.0)
     assert (sim.robot.wheel_radius_m, sim.robot.track_m) == (0.1, 0.4)
-
-
-@pytest.mark.filterwarnings("error")
-def test_options_and_keyframes_of_its_file_are_left_out_without_a_word(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    options = (
-        '<option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/><size njmax="99"/>'
-    )
-    model = MODEL.replace("<worldbody>", options + "<worldbody>")
-    keyframe = '<keyframe><key qpos="0 0 .1 1 0 0 0 0 0"/></keyframe></mujoco>'
-    robot = robot_model(Robot(mjcf=model.replace("</mujoco>", keyframe)), OUTLINE)
-    built = build_robot_alone(robot)
-    plain = build_robot_alone(robot_model(Robot(mjcf=MODEL), OUTLINE))
-    assert (built.opt.integrator, built.opt.gravity[2]) == (plain.opt.integrator, -9.81)
-    assert built.nkey == 0
-    assert capfd.readouterr().err == ""
 
 
 def test_conditions_and_perturbations_apply_to_it() -> None:
@@ -148,13 +131,6 @@ def test_the_verb_says_what_is_built_and_driven(
     assert printed["robot"]["mass_kg"] == pytest.approx(24.0)
     fast = next(row for row in printed["driven"] if row["speed_mps"] == 1.0)
     assert fast["driven_mps"] == pytest.approx(1.0, abs=0.03)
-
-
-def test_the_verb_refuses_a_control_period_that_the_twin_cannot_drive(tmp_path: Path) -> None:
-    text = profile_toml(AMR).replace("control_period_s = 0.2", "control_period_s = 0.033")
-    (tmp_path / "mine.toml").write_text(text)
-    with pytest.raises(ConfigError, match=r"control_period_s = 0\.033 is not some physics"):
-        RobotCommand(str(tmp_path / "mine.toml")).run()
 
 
 def test_a_warning_of_mujoco_writes_no_log_file(

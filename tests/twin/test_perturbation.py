@@ -8,21 +8,14 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 import pytest
 from support.driven_robot import Drive, columns
 from support.paths import ROOT
-from support.stores import one
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import steps_of
-from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import Perturbed, parse_perturbation
-from restock.replay.store.audit import load_audits, run_audits
-from restock.replay.store.store import Store
-from restock.train.dqn.config import parse_config
-from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import (
@@ -33,15 +26,9 @@ from restock.train.twin.physics.perturbation import (
 )
 
 PAGE = ROOT / "docs" / "twin.md"
-COLUMNS = ["perturbation", "perturbation_values"]
 
 
 # -- what they say ----------------------------------------------------------------------------
-
-
-def test_only_what_is_not_nominal_is_kept() -> None:
-    assert Perturbation().changed() == {}
-    assert Perturbation(name="wet", friction_scale=0.5).changed() == {"friction_scale": 0.5}
 
 
 def test_every_field_has_a_range_that_holds_its_default_and_a_line_in_the_docs() -> None:
@@ -74,14 +61,6 @@ def test_a_perturbation_is_a_name_a_file_or_a_table(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             find_perturbation(wrong, where="here")
-
-
-def test_a_training_config_takes_one() -> None:
-    assert parse_config({}, where="t").env.perturbation == "nominal"
-    table = {"name": "wet", "friction_scale": 0.5}
-    assert parse_config({"env": {"perturbation": table}}, where="t").env.perturbation == table
-    with pytest.raises(ConfigError, match="gainn"):
-        parse_config({"env": {"perturbation": {"gainn": 1}}}, where="t")
 
 
 # -- in the twin ------------------------------------------------------------------------------
@@ -154,18 +133,6 @@ def test_info_says_what_is_in_force_in_each_environment() -> None:
     assert values[0] != values[1]
 
 
-def test_fresh_episodes_are_forgotten_with_their_rows() -> None:
-    fresh = FreshPerturbations()
-    for key in range(9):
-        fresh.note(np.array([key]), ["wet"], [json.dumps({"gain": 0.9})])
-    assert fresh.names(np.array([3, 99])) == ["wet", None]
-    assert fresh.values(np.array([3, 99])) == [[("gain", 0.9)], None]
-    again = FreshPerturbations()
-    again.load_state_dict(json.loads(json.dumps(fresh.state_dict())))
-    again.forget(np.array([8, 8]))
-    assert again.names(np.array([3, 8])) == [None, "wet"]
-
-
 # -- in recordings and stores -----------------------------------------------------------------
 
 
@@ -204,33 +171,3 @@ def test_a_recording_holds_what_was_said_from_then_on() -> None:
     assert values[len(steps) - 1].as_py() == []
     hardware = steps_of(profile, Drive(duration_s=4.0).topics())
     assert set(hardware.perturbed.columns(np.arange(5))[0].to_pylist()) == {None}
-
-
-def test_the_audit_names_thin_cells_of_a_perturbation(tmp_path: Path) -> None:
-    manifest, rows = one(1)
-    StoreWriter(tmp_path / "s").write(manifest, rows)
-    thin = [audit for audit in load_audits() if audit.name == "thin_perturbation"]
-    with Store(tmp_path / "s") as store:
-        (audit,) = run_audits(store.connection, thin, {"thin_perturbation": {"min_rows": 100}})
-    counts = dict.fromkeys(("recovery", "wheel_slip", "blocked_aisle", "near_collision"), 0)
-    for name, held in zip(
-        rows["perturbation"].to_pylist(), rows["conditions"].to_pylist(), strict=True
-    ):
-        for condition in (held or ["nominal"]) if name == "wet" else ():
-            counts[condition] = counts.get(condition, 0) + 1
-    expected = {name: count for name, count in counts.items() if count < 100}
-    assert {row["condition"]: row["rows"] for row in audit.sample} == expected
-    assert {row["perturbation"] for row in audit.sample} == {"wet"}
-    assert audit.status == "info"
-
-
-def test_values_are_a_map_that_sql_can_index(tmp_path: Path) -> None:
-    StoreWriter(tmp_path / "s").write(*one(1))
-    with Store(tmp_path / "s") as store:
-        (scale,) = store.sql(
-            "SELECT DISTINCT perturbation_values['friction_scale'] FROM transitions"
-            " WHERE perturbation = 'wet'"
-        ).fetchall()
-        table = store.sql("SELECT perturbation_values FROM transitions").to_arrow_table()
-    assert scale == (0.5,)
-    assert pa.types.is_map(table.schema.field(0).type)

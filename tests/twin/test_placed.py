@@ -14,7 +14,6 @@ from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.placed import (
     Drive,
     drive_of,
-    from_walls_m,
     on_free_ground,
     placed_on,
 )
@@ -57,11 +56,3 @@ def test_a_frame_that_is_off_or_turned_is_another(drive: Drive) -> None:
     assert not placed_on(replace(FLOOR, map_origin=(x + 1.5, y, yaw)), drive)
     assert not placed_on(replace(FLOOR, map_origin=(x, y, yaw + 0.4)), drive)
     assert not placed_on(FLOOR, Drive(np.empty((0, 2)), np.empty((0, 2))))
-
-
-def test_distances_are_from_racks_and_edges() -> None:
-    rack = FLOOR.racks[0]
-    beside = np.array([[rack.x_min - 0.2, rack.y_min - 0.0], [0.1, FLOOR.depth_m / 2], [-0.3, 0.5]])
-    found = from_walls_m(FLOOR, beside)
-    assert found[1:] == pytest.approx([0.1, 0.3])
-    assert found[0] <= 0.2 + 1e-9

@@ -28,12 +28,6 @@ def test_plans_keep_clear_of_racks_and_end_at_the_goal() -> None:
             assert not any(rack.contains(x, y, -0.25) for rack in FLOOR.racks)
 
 
-def test_the_points_of_a_plan_are_evenly_spaced() -> None:
-    plan = PLANNER.plan(3.0, 0.9, (8.5, 6.4))
-    step = np.hypot(*np.diff(plan, axis=0).T)
-    assert step.max() < 1.3 * step.min()
-
-
 def test_a_plan_is_not_much_longer_than_the_way_must_be() -> None:
     # Aisle 1 west to aisle 3 east through the middle cross-aisle: 2.95 + 5.47 + 2.55 by right
     # angles; cutting corners may save some of it, nothing may add to it.
@@ -55,21 +49,6 @@ def test_where_all_ways_seem_closed_the_latest_closure_is_opened_again() -> None
     # Both ends of the goal's aisle segment: there is no way in.
     plan = PLANNER.plan(3.0, 3.6, (8.45, 0.9), [(1, 0), (1, 8)])
     np.testing.assert_allclose(plan[-1], (8.45, 0.9))
-
-
-def test_a_place_inside_a_rack_plans_from_the_nearest_free_cell() -> None:
-    rack = FLOOR.racks[0]
-    plan = PLANNER.plan(rack.center[0], rack.y_max - 0.1, (8.45, 6.37))
-    assert np.hypot(plan[0, 0] - rack.center[0], plan[0, 1] - rack.y_max) < 0.8
-
-
-def test_the_same_spec_draws_the_same_episode() -> None:
-    for kind in ("nominal", "wheel_slip", "blocked_aisle", "near_collision"):
-        one, two = (draw_episode(EpisodeSpec(kind, 7), FLOOR, Planner(FLOOR)) for _ in range(2))
-        assert one.start == two.start
-        np.testing.assert_array_equal(one.plan_m, two.plan_m)
-        np.testing.assert_array_equal(one.pallets, two.pallets)
-        np.testing.assert_array_equal(one.patches, two.patches)
 
 
 @pytest.mark.parametrize("block", ["partial", "full"])

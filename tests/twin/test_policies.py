@@ -16,9 +16,7 @@ from restock.train.twin.env.drivers import (
     Operator,
     PlannerFollower,
     RandomPolicy,
-    harsh_actions,
 )
-from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -72,39 +70,6 @@ def test_the_operator_gets_past_pallets(layouts: str) -> None:
     assert min(passed.values()) >= 0.9
 
 
-def test_an_operator_goes_on_as_it_was_from_its_state() -> None:
-    """Rebuild the lattices, which the state does not hold, identically in another process."""
-    env = WarehouseVectorEnv(4, conditions={"blocked_aisle": 1.0}, layouts="generated:test")
-    observation, _ = env.reset(seed=4)
-    first = Operator(seed=6)
-    for _ in range(25):
-        observation, *_ = env.step(first.act(env, observation)[0])
-    second = Operator(seed=1)
-    second.load_state_dict(first.state_dict())
-    assert first._lattices
-    assert not second._lattices
-    for _ in range(25):
-        action = first.act(env, observation)[0]
-        np.testing.assert_array_equal(action, second.act(env, observation)[0])
-        observation, *_ = env.step(action)
-
-
-def test_the_operator_of_a_fast_robot_comes_over_slippery_floor() -> None:
-    """Take the gentlest action if none is as gentle as the operator would like."""
-    task = load_profile("warehouse_amr").task
-    fast = [(0, 0), (0.5, 0), (1, 0), (0.8, 0.6), (0.8, -0.6), (0, 1.2), (0, -1.2), (-0.4, 0)]
-    actions = tuple((float(v), float(w)) for v, w in fast)
-    assert harsh_actions(np.array(actions)).tolist() == [False, False, *[True] * 5, False]
-    usual = harsh_actions(np.array(task.actions))
-    assert usual.tolist() == [abs(v) > 0.45 or abs(w) > 1.0 for v, w in task.actions]
-    task = msgspec.structs.replace(task, actions=actions)
-    assert success(Operator(), "wheel_slip", 6, task=task)["none"] >= 0.5
-
-
-def test_random_driving_hardly_ever_arrives() -> None:
-    assert success(RandomPolicy(), "nominal")["none"] <= 0.1
-
-
 @pytest.mark.long
 def test_the_operator_takes_over_from_a_stuck_planner_and_hands_back() -> None:
     policy = Handover(PlannerFollower(), Operator())
@@ -138,21 +103,6 @@ def test_stated_probabilities_match_what_is_done(make: type[PlannerFollower]) ->
         if make is not Operator:  # whose tries when standing still are its own draws
             np.testing.assert_allclose(probability, expected)
         assert (policy.acting == policy.name).all()
-
-
-def test_a_policy_is_reproducible_from_its_seed() -> None:
-    runs = []
-    for _ in range(2):
-        env = WarehouseVectorEnv(6)
-        observation, _ = env.reset(seed=2)
-        policy = Handover(PlannerFollower(seed=5), Operator(seed=6))
-        actions = []
-        for _ in range(60):
-            action, _ = policy.act(env, observation)
-            observation, *_ = env.step(action)
-            actions.append(action)
-        runs.append(np.array(actions))
-    np.testing.assert_array_equal(runs[0], runs[1])
 
 
 def test_a_lattice_guides_the_operator_where_it_was_stuck_until_the_episode_ends() -> None:
@@ -235,13 +185,3 @@ def test_the_operator_of_a_small_slow_robot_drives_through_a_gap_that_is_wide_fo
         observation, _, terminated, _, info = env.step(operator.act(env, observation)[0])
         arrived |= terminated & info["success"]
     assert arrived.all()
-
-
-def test_the_planner_keeps_distances_by_the_robots_size_and_speeds() -> None:
-    stand_in = PathFollower(load_profile("warehouse_amr").task)
-    assert (stand_in.stop_m, stand_in.slow_m, stand_in.pivot_m) == (0.3, 0.8, 0.14)
-    small = PathFollower(small_slow_robot())
-    assert 0.06 < small.stop_m < 0.15
-    assert small.slow_m < 0.4
-    assert small.pivot_m < 0.06
-    assert small.table[small._index(0.4, 0.0)].tolist() == [0.11, 0.0]  # slow, for it

@@ -181,20 +181,3 @@ def test_odometry_follows_the_wheels_and_tf_leads_to_the_map(
     )
     seen = drive.signals["pose_x_m"][-1], drive.signals["pose_y_m"][-1]
     assert in_map == pytest.approx(seen, abs=1e-5)
-
-
-def test_the_same_dice_give_the_same_messages(drive: Drive, messages: list[Message]) -> None:
-    assert _robot().publish(drive, START_NS) == messages
-
-
-def test_odometry_goes_on_from_one_mission_to_the_next(drive: Drive) -> None:
-    robot = _robot()
-    first = _decoded(robot.publish(drive, START_NS))
-    second = _decoded(robot.publish(drive, START_NS + 10**10))
-    before, after = first["/odom"][-1][1].pose.pose, second["/odom"][0][1].pose.pose
-    assert (after.position.x, after.position.y) == pytest.approx(
-        (before.position.x, before.position.y), abs=1e-6
-    )
-    assert second["/joint_states"][0][1].position[0] == pytest.approx(
-        first["/joint_states"][-1][1].position[0], abs=2e-3
-    )

@@ -15,18 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from support.kept_run import kept_run
 from support.long import one_in
-from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.cli.twin.record import load_policy
 from restock.errors import ConfigError, ExitCode
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.env.drivers import Operator, PlannerFollower
 from restock.train.twin.missions import NATURAL
 from restock.train.twin.recording.fleet import BLOCK, FLEET, parse_shares, schedule
 from restock.train.twin.recording.recorder import (
@@ -63,14 +59,6 @@ def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
     assert tables[0].equals(tables[1])
 
 
-@pytest.mark.parametrize("policy", ["planner", "operator"])
-def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: str) -> None:
-    summary = record(tmp_path / "log.mcap", RecordingPlan(missions=1, seed=3, policy=policy))
-    version = {"planner": PlannerFollower, "operator": Operator}[policy].version
-    assert set(summary.policies) == {f"{policy} {version}"}
-    assert summary.succeeded["nominal"] == summary.missions["nominal"] == 1
-
-
 @pytest.mark.parametrize("name", one_in(2, ["a.mcap", "a"]))
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
     args = ["twin", "record", "--missions", "1", "--seed", "3", "--rates", "odom=10,imu=10,scan=5"]
@@ -101,14 +89,6 @@ def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert sorted(file.name for file in out.iterdir()) == ["bag.db3", "metadata.yaml"]
     with AnyReader([out]) as reader:
         assert reader.message_count == printed["messages"]
-
-
-def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "log.mcap"
-    assert cli.main(["twin", "record", "--out", str(out), "--dry-run", "--json"]) == ExitCode.OK
-    printed = json.loads(capsys.readouterr().out)
-    assert (printed["minutes"], printed["format"], printed["conditions"]) == (5.0, "mcap", NATURAL)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -152,14 +132,6 @@ def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
     assert cli.main(["twin", "record", "--out", dated, "--dry-run"]) == ExitCode.OK
 
 
-def test_no_recording_is_written_into_a_store(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    store = write_store(tmp_path / "store", [recording_transitions(1)])
-    assert cli.main(["twin", "record", "--out", str(store / "drive.mcap")]) == ExitCode.USAGE
-    assert f"is within the store {store}" in " ".join(capsys.readouterr().err.split())
-
-
 def test_a_recording_is_never_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -194,20 +166,6 @@ def test_missions_come_at_their_shares_and_rare_ones_come_early() -> None:
     assert len({mission.spec.seed for mission in missions}) == len(missions)
 
 
-def test_what_is_rarer_than_a_block_comes_at_its_share_too() -> None:
-    shares = {
-        "nominal": 0.988,
-        "wheel_slip": 0.004,
-        "blocked_aisle": 0.004,
-        "near_collision": 0.004,
-    }
-    missions = islice(schedule(9, shares, "operator", HARDWARE), 1000)
-    kinds = Counter(mission.spec.condition for mission in missions)
-    assert {k: kinds[k] for k in shares} == {
-        k: pytest.approx(1000 * shares[k], abs=1) for k in shares
-    }
-
-
 def test_flags_from_python() -> None:
     assert parse_shares("nominal=.5, wheel_slip=.5") == {"nominal": 0.5, "wheel_slip": 0.5}
     assert parse_rates("odom=20,scan=5").odom == 20
@@ -222,19 +180,6 @@ def test_flags_from_python() -> None:
         RecordingPlan(missions=1, tags={"": "x"})
     with pytest.raises(ConfigError, match="give either minutes or missions"):
         RecordingPlan()
-
-
-def test_missions_on_other_floors_come_with_their_maps(tmp_path: Path) -> None:
-    plan = RecordingPlan(missions=2, seed=3, policy="planner", layouts="generated:train:2")
-    done = record(tmp_path / "log.mcap", plan)
-    with AnyReader([tmp_path / "log.mcap"]) as reader:
-        sizes = [
-            (grid.info.width, grid.info.height)
-            for connection, _, data in reader.messages()
-            if connection.topic == "/map"
-            for grid in [reader.deserialize(data, connection.msgtype)]
-        ]
-    assert len(sizes) == len(set(sizes)) == done.topics["/map"] == 2
 
 
 class _Creeper:
@@ -255,18 +200,3 @@ def test_a_policy_of_your_own_drives_under_its_own_name(tmp_path: Path) -> None:
     unsure.chance = 0.5
     with pytest.raises(ConfigError, match="is stochastic itself"):
         record(tmp_path / "b.mcap", RecordingPlan(missions=1, epsilon=0.1), policy=unsure)
-
-
-def test_an_exported_policy_has_the_tag_of_its_run(tmp_path: Path) -> None:
-    pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    from restock.train.evaluation.onnx_policy import export_onnx
-
-    run = kept_run(tmp_path / "learner")
-    export_onnx(run, tmp_path / "p.onnx")
-    tags = {
-        (policy.name, policy.version)
-        for name in (f"run:{run}", f"onnx:{tmp_path / 'p.onnx'}")
-        if (policy := load_policy(name)) is not None
-    }
-    assert tags == {("dqn", "learner@7")}

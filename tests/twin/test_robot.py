@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -24,7 +23,7 @@ from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.layout import AisleSegment, Rect, Warehouse, default_warehouse
+from restock.train.twin.floors.layout import Warehouse, default_warehouse
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import floor_gap, rectangle
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode, with_room
@@ -264,28 +263,3 @@ def room_m(episode: Episode, floor: Warehouse, outline_m: NDArray[np.float64]) -
         y + ahead * np.sin(yaw) + aside * np.cos(yaw),
     )
     return float(floor_gap(floor, *points).min())
-
-
-def test_the_twin_starts_a_long_robot_where_it_has_room() -> None:
-    task = msgspec.structs.replace(AMR.task, body=Body(1.2, 0.8))
-    env = WarehouseVectorEnv(12, task=task)
-    env.set_episodes([EpisodeSpec("nominal", seed) for seed in range(12)])
-    env.reset()
-    *_, info = env.step(np.zeros(12, np.int64))
-    assert not info["bumps"].any()
-
-
-def test_in_a_narrow_aisle_a_wide_robot_starts_in_the_middle() -> None:
-    aisle = Rect(2.0, 0.0, 6.0, 1.2)
-    racks = (Rect(2.0, 1.2, 6.0, 2.0),)
-    floor = replace(
-        default_warehouse(),
-        racks=racks,
-        segments=(AisleSegment("aisle", 0, aisle, "x"),),
-    )
-    start = (4.0, 0.45, 1.0)
-    way = np.linspace((4.0, 0.45), (1.0, 0.6), 48)
-    episode = Episode(EpisodeSpec("nominal", 0), start, (1.0, 0.6), way)
-    x, y, yaw = with_room(episode, floor, rectangle(1.0, 1.0, points=21)).start
-    assert (x, y) == (4.0, 0.6)
-    assert abs(math.sin(yaw)) < 0.1

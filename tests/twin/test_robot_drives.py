@@ -73,25 +73,6 @@ def test_its_wheels_turn_no_faster_than_they_steer_and_stay_under_a_stop() -> No
     assert turn[-1] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_logged_turn_is_gone_on_with() -> None:
-    """Put into the middle of a turn, it steers as that takes."""
-    task = Task(body=OUTLINE, actions=((0.0, 0.0), (0.8, 0.6)))
-    motion = {
-        "wheel_speed_mps": np.full(1, 0.8),
-        "wheel_yaw_rate_radps": np.full(1, 0.6),
-        "gyro_yaw_rate_radps": np.full(1, 0.6),
-        "localised_speed_mps": np.full(1, 0.8),
-        "localised_lateral_mps": np.zeros(1),
-    }
-    start = OpenLoopStart(np.zeros((1, 3)), motion, np.full((1, 5, 2), (0.8, 0.6)))
-    result = drive_open_loop(task, start, [Perturbation()], robot=robot_model(CAR, OUTLINE))
-    x, y, yaw = result.pose[0, 0, -1]
-    assert yaw == pytest.approx(0.6, abs=0.02)
-    circle = 0.8 / 0.6
-    expected = [circle * math.sin(0.6), circle * (1 - math.cos(0.6))]
-    assert [x, y] == pytest.approx(expected, abs=0.03)
-
-
 @pytest.mark.parametrize(
     ("action", "message"),
     [
@@ -130,22 +111,6 @@ def test_the_planner_drives_it_to_its_goals() -> None:
     assert env.diverged == 0
 
 
-def test_its_state_is_kept_with_the_steering() -> None:
-    task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=CAR_ACTIONS)
-    made = [
-        WarehouseVectorEnv(3, task=task, robot=CAR, seed=1, conditions={"nominal": 1.0})
-        for _ in range(2)
-    ]
-    made[0].reset(seed=1)
-    for _ in range(7):
-        made[0].step(np.array([3, 5, 9]))
-    made[1].reset(seed=2)
-    made[1].load_state_dict(made[0].state_dict())
-    for _ in range(3):
-        states = [env.step(np.array([0, 1, 4]))[0] for env in made]
-    np.testing.assert_array_equal(states[0], states[1])
-
-
 MECANUM = Robot(
     drive="omnidirectional", wheel_radius_m=0.075, track_m=0.4, wheelbase_m=0.4, mass_kg=30.0
 )
@@ -174,21 +139,6 @@ def test_rollers_carry_it_sideways_when_the_wheels_turn_against_each_other() -> 
         mujoco.mj_step(model, data)
     ahead, left, turn = data.qvel[0], data.qvel[1], data.qvel[5]
     assert [ahead, left, turn] == pytest.approx([0.0, 0.4, 0.0], abs=0.015)
-
-
-def test_mecanum_wheels_slip_on_ice_by_the_truth() -> None:
-    body = Body(0.6, 0.5)
-    actions = ((0.0, 0.0), (1.0, 0.0), (0.5, 0.9), (-0.5, -0.9))
-    task = msgspec.structs.replace(AMR.task, body=body, actions=actions)
-    kinds = {"wheel_slip": 1.0}
-    env = WarehouseVectorEnv(8, task=task, robot=MECANUM, seed=3, conditions=kinds)
-    env.reset(seed=3)
-    slipped = 0
-    for step in range(20):
-        *_, info = env.step(np.full(8, 1 + step % 3))
-        slipped += sum("wheel_slip" in text for text in info["true_condition"])
-    assert slipped > 5
-    assert env.diverged == 0
 
 
 def test_perturbations_apply_to_every_drive() -> None:

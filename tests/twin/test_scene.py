@@ -40,12 +40,6 @@ def _shown(data: bytes) -> list[tuple[str, int]]:
     return [(marker.ns, marker.id) for marker in _markers(data)[1:]]
 
 
-def test_parameters_are_said_where_they_differ() -> None:
-    assert json.loads(perturbation_text(Perturbation())) == {"name": "nominal", "values": {}}
-    content = json.loads(perturbation_text(Perturbation(name="wet", friction_scale=0.3)))
-    assert content == {"name": "wet", "values": {"friction_scale": 0.3}}
-
-
 def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> None:
     scene = Scene(
         pallets=np.array([[2.0, 3.0, np.pi / 2], [*PARKED_M[:2], 0.0]]),

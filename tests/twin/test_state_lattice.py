@@ -37,14 +37,6 @@ def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GO
     return lattice_around(FLOOR, graph, box[:, :2], half, goal, 0.4, motion, window)
 
 
-def test_outlines_are_about_the_axle() -> None:
-    outline = rectangle(0.8, 0.4, axle_x_m=0.1, points=3)
-    assert len(outline) == len(np.unique(outline, axis=0)) == 8
-    assert outline[:, 0].min() == pytest.approx(-0.5)
-    assert outline[:, 0].max() == pytest.approx(0.3)
-    assert np.abs(outline[:, 1]).max() == pytest.approx(0.2)
-
-
 def test_a_wide_gap_is_driven_through_and_a_narrow_one_gone_around() -> None:
     start = (AISLE.x_min + 0.2, AISLE.center[1], 0.0)
     through, around = with_gap(0.9).plan(*start), with_gap(0.45).plan(*start)
@@ -66,35 +58,12 @@ def test_a_gap_that_fits_the_width_alone_must_be_entered_straight() -> None:
     assert lattice.time_s(np.array([*in_gap, np.pi])) > straight  # it would have to back out
 
 
-def test_the_time_shrinks_along_the_plan() -> None:
-    lattice = with_gap(0.9)
-    plan = lattice.plan(AISLE.x_min + 0.2, AISLE.center[1], 0.0)
-    assert plan is not None
-    step = np.diff(plan, axis=0)
-    yaw = np.arctan2(step[:, 1], step[:, 0])
-    poses = np.column_stack([plan[:-1], yaw])[8:-8:4]
-    inside = [lattice.window.covers(x, y) for x, y, _ in poses]
-    times = lattice.time_s(poses[inside])
-    assert len(times) > 4
-    assert (np.diff(times) < 0.05).all()  # the plan is smoothed, the tree is not
-    assert times[-1] < times[0] - 2.0
-
-
 def test_at_the_goal_no_time_is_left_and_a_slower_robot_takes_longer() -> None:
     inside = (AISLE.x_max - 0.3, AISLE.center[1])
     assert with_gap(0.9, goal=inside).time_s(np.array([*inside, 1.0])) < 0.3
     slow = Motion(BODY.outline_m, ahead_mps=0.25, back_mps=0.1, turn_radps=0.3)
     pose = np.array([AISLE.x_min + 0.2, AISLE.center[1], 0.0])
     assert with_gap(0.9, slow).time_s(pose) == pytest.approx(4 * with_gap(0.9).time_s(pose))
-
-
-def test_headings_are_the_same_all_the_way_round() -> None:
-    lattice = with_gap(0.9)
-    yaw = np.linspace(-np.pi, np.pi, 33)
-    poses = np.column_stack([np.full_like(yaw, AISLE.x_min + 0.6), np.full_like(yaw, 0.9), yaw])
-    turned = poses + np.array([0.0, 0.0, 2 * np.pi])
-    np.testing.assert_allclose(lattice.time_s(poses), lattice.time_s(turned), atol=1e-9)
-    assert np.isfinite(lattice.times_s).all()
 
 
 @pytest.mark.long

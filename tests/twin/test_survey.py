@@ -28,14 +28,13 @@ from restock.toml import Checked, read_toml, typed
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_files import read_floor
-from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame
-from restock.train.twin.physics.episode import EpisodeSpec, describe_floor
+from restock.train.twin.floors.occupancy_grid import OccupancyGrid, out_of_frame
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.survey.picture import (
     LONG_SIDE,
     MARGIN,
     PLACE,
     WAY,
-    moved_apart,
     write_picture,
 )
 from restock.train.twin.survey.survey import survey
@@ -194,17 +193,6 @@ def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
     assert right.agreement > 0.95 > wrong.agreement
 
 
-def test_scans_that_do_not_fit_together_leave_the_corridor(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    poses = lap()[::2]
-    bag = write_bag(tmp_path / "bag", poses=poses, scanned=hall())
-    astray = poses + rng.normal(0.0, 0.4, poses.shape)
-    lost = write_bag(tmp_path / "lost", poses=astray, scanned=hall(), scanned_from=poses)
-    assert survey(bag).by == "scans"
-    made = survey(lost)
-    assert made.by == "corridor"
-
-
 def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -317,12 +305,6 @@ def test_without_a_map_the_floor_is_the_corridor_that_was_driven(tmp_path: Path)
     assert len(made.floor.segments) == 4
 
 
-def test_a_bag_that_says_nothing_of_a_place_is_refused(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "bag", poses=np.full((5, 3), np.nan))
-    with pytest.raises(RecordingError, match="neither a map nor the robot's pose"):
-        survey(bag)
-
-
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
 def test_zones_of_a_profile_are_those_of_the_floor_in_the_maps_frame(
     tmp_path: Path, yaw: float
@@ -429,25 +411,3 @@ def test_recordings_in_other_frames_are_named_and_get_a_floor_of_their_own(
 
 class _Zones(Checked, frozen=True):
     zone: list[Zone]
-
-
-def test_a_robot_that_hardly_moved_starts_where_it_was_and_goes_where_it_could() -> None:
-    """Send missions into the room that it saw if its own places are too close together."""
-    cells = np.full((120, 80), 100, np.int8)
-    cells[2:-2, 2:-2] = 0
-    around = np.array([(3.65, 2.65), (3.75, 2.65), (3.75, 2.75)])  # in three squares
-    made = floor_of_grid(
-        OccupancyGrid(cells, 0.1), name="hall", where="a test", room_m=0.15, turn_m=0.2,
-        visited_m=around,
-    )  # fmt: skip
-    floor = made.floor
-    assert any("missions start there and also go to" in note for note in made.notes)
-    assert len(floor.goals_m) > 20
-    assert all(np.hypot(*(around - start).T).min() < 0.3 for start in floor.starts_m)
-    assert "nominal" in describe_floor(floor)["episodes"]
-
-
-def test_names_of_zones_that_overlap_are_drawn_below_each_other() -> None:
-    boxes = [(0.0, 0.0, 80.0, 13.0), (10.0, 2.0, 90.0, 15.0), (5.0, 1.0, 85.0, 14.0)]
-    apart = (200.0, 0.0, 280.0, 13.0)
-    assert moved_apart([*boxes, apart]) == [0.0, 11.0, 25.0, 0.0]

@@ -10,7 +10,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import restock  # noqa: F401 - registers the environment
@@ -20,13 +19,12 @@ from restock.ingest.task.task import observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
 from restock.train.twin.env.drivers import PlannerFollower
-from restock.train.twin.env.vector_env import WarehouseEnv, WarehouseVectorEnv
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,
     Perturbation,
-    load_perturbation,
     load_schedule,
 )
 
@@ -48,22 +46,6 @@ def env() -> Iterator[WarehouseVectorEnv]:
     made = WarehouseVectorEnv(8, seed=1)
     yield made
     made.close()
-
-
-def test_the_single_environment_passes_gymnasiums_checker() -> None:
-    made = gymnasium.make("restock/Warehouse-v0", render_mode="rgb_array")
-    check_env(made.unwrapped)
-
-
-def test_make_vec_gives_the_native_vector_environment() -> None:
-    made = gymnasium.make_vec("restock/Warehouse-v0", num_envs=3, nthread=2)
-    assert isinstance(made.unwrapped, WarehouseVectorEnv)
-    assert made.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    observation, _ = made.reset(seed=3)
-    assert made.observation_space.contains(observation)
-    observation, earned, terminated, truncated, _ = made.step(made.action_space.sample())
-    assert made.observation_space.contains(observation)
-    assert earned.shape == terminated.shape == truncated.shape == (3,)
 
 
 def test_single_and_vector_environment_are_the_same_environment() -> None:
@@ -335,34 +317,6 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
         load_schedule(path)
 
 
-def test_the_name_of_a_perturbation_is_whole_however_long() -> None:
-    names = [f"as fitted to the robots of the northern site, {which}" for which in ("old", "new")]
-    env = WarehouseVectorEnv(2)
-    env.set_episodes(
-        [EpisodeSpec("nominal", 1, Perturbation(name=name, payload_kg=5)) for name in names]
-    )
-    info = env.reset()[1]
-    assert info["perturbation"].tolist() == names
-    other = WarehouseVectorEnv(2)
-    other.load_state_dict(env.state_dict())
-    assert other.step(np.zeros(2, np.int64))[4]["perturbation"].tolist() == names
-
-
-def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: Any) -> None:
-    path = tmp_path / "wet.toml"
-    path.write_text('name = "wet"\nfriction_scale = 0.5\n')
-    assert load_perturbation(path).friction_scale == 0.5
-    path.write_text("friction_scale = 50\n")
-    with pytest.raises(ConfigError, match=r"friction_scale must be in \[0.05, 2\], got 50"):
-        load_perturbation(path)
-    path.write_text("fiction = 1\n")
-    with pytest.raises(ConfigError, match="fiction"):
-        load_perturbation(path)
-    path.write_text("[ranges]\npayload_kg = [0, 50]\n")  # as `twin fit --per-recording` writes it
-    with pytest.raises(ConfigError, match=r"is a schedule.*\n.*one perturbation"):
-        load_perturbation(path)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -385,23 +339,6 @@ def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -
         WarehouseVectorEnv(**arguments)
 
 
-def test_a_step_needs_a_reset_and_a_mask_an_entry_for_every_environment() -> None:
-    made = WarehouseVectorEnv(2, autoreset_mode="Disabled")
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        made.step(np.zeros(2, np.int64))
-    made.reset(seed=1)
-    with pytest.raises(ConfigError, match=r"reset_mask must be of shape \(2,\), got \(1,\)"):
-        made.reset(options={"reset_mask": np.array([True])})
-
-
-def test_the_seed_of_a_single_environment_is_that_of_its_first_reset() -> None:
-    """Keep the given seed, which a random one once replaced."""
-    first, again = (WarehouseEnv(seed=5).reset()[1]["episode_seed"] for _ in range(2))
-    assert first == again == WarehouseVectorEnv(1, seed=5).reset()[1]["episode_seed"][0]
-    unseeded = {int(WarehouseEnv().reset()[1]["episode_seed"]) for _ in range(2)}
-    assert len(unseeded) == 2
-
-
 def test_perturbations_and_floors_may_be_given_by_name() -> None:
     made = gymnasium.make(
         "restock/Warehouse-v0", perturbation="friction", layouts=["generated:3"], seed=None
@@ -410,12 +347,6 @@ def test_perturbations_and_floors_may_be_given_by_name() -> None:
     assert (info["perturbation"], info["layout"]) == ("friction", "generated:3")
     heavy = WarehouseVectorEnv(1, perturbation={"payload_kg": 40.0})
     assert heavy.perturbation == Perturbation(payload_kg=40.0)
-
-
-@pytest.mark.parametrize(("kind", "seed"), [("fog", 1), ("nominal", -1), ("nominal", 2**63)])
-def test_an_episode_of_no_kind_or_seed_is_refused(kind: str, seed: int) -> None:
-    with pytest.raises(ConfigError):
-        EpisodeSpec(kind, seed)
 
 
 def test_the_map_is_drawn_with_its_robot() -> None:

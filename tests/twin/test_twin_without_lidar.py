@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import unseen
 from restock.ingest.task.signals import LIDAR_SIGNALS
@@ -51,15 +50,6 @@ def test_it_is_the_same_drive_without_the_entries_of_the_lidar():
     assert env.signals["sector_clearance_m"].shape == (2, 0)
 
 
-def test_the_truth_of_a_near_collision_is_the_simulators_all_the_same():
-    env = WarehouseVectorEnv(2, task=BLIND, seed=3)
-    env.reset(seed=3)
-    true = env.sensing.true_clearance_m
-    assert np.isfinite(true).all()
-    assert (true > 0).all()
-    env.close()
-
-
 def test_the_planner_follows_its_plan_and_stops_for_nothing():
     env = WarehouseVectorEnv(2, task=BLIND, seed=3)
     observation, _ = env.reset(seed=3)
@@ -78,9 +68,3 @@ def test_the_twin_labels_what_logs_can_be_labelled_by_and_says_the_rest():
     assert lost == unseen(PROFILE.conditions) != {}
     assert [one.name for one in evaluated] == ["wheel_slip"]
     assert conditions_in_twin(PROFILE.conditions, PROFILE.signals) == (PROFILE.conditions, {})
-
-
-@pytest.mark.parametrize("sectors", [2, 5])
-def test_sectors_are_none_or_at_least_four(sectors):
-    with pytest.raises((ConfigError, ValueError), match="even and 4 or more, or 0"):
-        msgspec.structs.replace(SEES, sectors=sectors)
