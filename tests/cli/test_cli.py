@@ -12,8 +12,7 @@ import pytest
 from support.paths import ROOT
 
 from restock import cli, native
-from restock.cli.output import print_table
-from restock.errors import ExitCode, RecordingError
+from restock.errors import ExitCode
 from restock.renamed import OPTIONS
 from restock.renamed import VERBS as RENAMED
 
@@ -23,13 +22,6 @@ COMMANDS = [*cli.VERBS, *(f"{verb} {job}" for verb in cli.JOBS for job in cli.JO
 def restock(*args: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "restock", *args]
     return subprocess.run(command, capture_output=True, text=True, **kwargs)  # type: ignore[call-overload]
-
-
-def test_help_lists_every_verb_and_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--help"]) == 0
-    out = capsys.readouterr().out
-    assert all(f"  {verb}" in out for verb in cli.VERBS)
-    assert "130 interrupted" in out
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -81,48 +73,12 @@ def test_an_unknown_verb_suggests_the_near_one(capsys: pytest.CaptureFixture[str
     assert "restock ingest" in captured.err
 
 
-def test_a_wrong_flag_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["info", "--jsn", "x.mcap"]) == ExitCode.USAGE
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert "--jsn" in captured.err
-    assert "Traceback" not in captured.err
-
-
-@pytest.mark.parametrize(
-    "words", [("gap", "S", "--episodes", "3"), ("fit",), ("layout", "--foot")], ids=" ".join
-)
-def test_a_complaint_about_a_job_names_the_help_of_the_job(
-    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["twin", *words]) == ExitCode.USAGE
-    helps = re.findall(r"restock [a-z ]*--help", capsys.readouterr().err)
-    assert set(helps) == {f"restock twin {words[0]} --help"}
-
-
-def test_an_optional_choice_does_not_take_none(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert cli.main(["train", "--device", "None"]) == ExitCode.USAGE
-    assert "one of ('cpu', 'cuda')" in " ".join(capsys.readouterr().err.replace("│", " ").split())
-
-
-def test_no_arguments_is_a_usage_error() -> None:
-    assert cli.main([]) == ExitCode.USAGE
-
-
 def test_an_interrupt_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(args: list[str]) -> int:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "_dispatch", interrupted)
     assert cli.main(["info"]) == ExitCode.INTERRUPTED
-
-
-def test_an_error_says_what_where_and_what_to_do() -> None:
-    error = RecordingError("is empty", where="a.mcap", remedy="record it again")
-    assert str(error) == "a.mcap: is empty\n  record it again"
-    assert error.exit_code == ExitCode.USAGE
 
 
 def test_the_version_is_printed() -> None:
@@ -158,23 +114,6 @@ def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str)
         )
     assert done.stderr == ""
     assert done.returncode == 0
-
-
-def test_starting_up_loads_none_of_the_heavy_libraries() -> None:
-    probe = (
-        "import sys, restock.cli; restock.cli.main(['--help']);"
-        "print(sorted({'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
-    assert done.stdout.strip().endswith("[]")
-
-
-def test_a_title_wider_than_its_table_stays_on_one_line(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    title = "success [bold] against the baseline, " + "paired by episode, " * 20
-    print_table([{"a": 1}], title=title)
-    assert capsys.readouterr().out.splitlines()[0] == title.rstrip()
 
 
 def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(sample_rows, monkeypatch, capsys):

@@ -7,25 +7,19 @@ from __future__ import annotations
 
 import json
 import os
-import runpy
 import shutil
 from pathlib import Path
 
-import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.long import one_in
 from support.panels import panel_of
-from support.stores import one, recording_transitions, write_store
+from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.errors import RunError, StoreError
-from restock.files import read_json, read_table, write_table
+from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.writer import StoreWriter
-from restock.train.judge.diagnose import diagnose
-from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
 TINY = [
@@ -158,30 +152,6 @@ def test_what_a_verb_needs_is_named_by_its_file(
         assert code == 2 or (verb, how) == ("report", "missing")
 
 
-def test_a_file_that_is_not_needed_stops_no_verb(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(root / "run", run)
-    for name in ("ages.parquet", "audit.parquet", "policies.parquet"):
-        damage(run / name, "cut")
-    for verb in ("eval", "baseline", "compare"):
-        assert check(run_verbs(run, root, tmp_path)[verb], run, capsys) < 2
-
-
-def test_config_json_that_lacks_a_key_is_said(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(root / "run", run)
-    document = json.loads((run / "config.json").read_text())
-    for rest in ({"format": document["format"]}, ["a list"]):
-        (run / "config.json").write_text(json.dumps(rest))
-        for verb in ("eval", "diagnose", "train", "export"):
-            argv = run_verbs(run, root, tmp_path)[verb]
-            assert check(argv, run / "config.json", capsys) == 2
-
-
 @pytest.mark.parametrize(
     ("key", "value", "before"),
     [("optimizer.learning_rate", 0.5, "0.001"), ("network.hidden", [9], "[8]"), ("seed", 3, "0")],
@@ -197,28 +167,6 @@ def test_a_config_that_was_edited_is_not_resumed(
     run = edited(root, tmp_path, {key: value, "schedule.env_steps": 41})
     assert check(run_verbs(run, root, tmp_path)["train"], run, capsys, said := []) == 2
     assert f"{run}/config.json: {key} is {value}, but the run was trained with {before}" in said[0]
-
-
-def test_a_network_that_was_edited_is_said_by_who_would_drive_it(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = edited(root, tmp_path, {"network.hidden": [9]})
-    assert check(run_verbs(run, root, tmp_path)["export"], run, capsys, said := []) == 2
-    assert "its policy is not of the network that config.json describes: " in said[0]
-    assert "body." in said[0]  # which of its weights
-
-
-def test_a_missing_table_is_reported_as_empty(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(root / "run", run)
-    assert not Run.open(run).absent
-    damage(run / "audit.parquet", "missing")
-    assert cli.main(["report", str(run), "--card"]) == 0
-    assert "Missing tables, taken as empty: audit.parquet." in capsys.readouterr().out
-    shown = diagnose([Run.open(run)]).evidence[0]
-    assert shown.endswith("(how large it may be is unknown: no audited row has a reward)")
 
 
 def edited(root: Path, folder: Path, values: dict[str, object]) -> Path:
@@ -267,29 +215,6 @@ def test_a_store_with_a_damaged_file_is_said(
         assert set(codes) == {2}
 
 
-def test_damaged_contents_in_a_manifest_are_said_with_their_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    store = tmp_path / "store"
-    StoreWriter(store).write_all([one(1), one(2)])
-    manifest = next((store / "recordings").glob("*/*.parquet"))
-    columns = pq.ParquetFile(manifest).metadata.row_group(0)
-    contents = next(
-        column
-        for column in map(columns.column, range(columns.num_columns))
-        if column.path_in_schema.startswith("distinctive_rows.")
-        and column.path_in_schema.endswith(".content")
-    )
-    content = bytearray(manifest.read_bytes())
-    begin = contents.dictionary_page_offset or contents.data_page_offset
-    content[begin : begin + contents.total_compressed_size] = bytes(contents.total_compressed_size)
-    manifest.write_bytes(content)
-    assert cli.main(["audit", str(store)]) == 2
-    said = capsys.readouterr().err
-    assert f"its file recordings/{manifest.parent.name}/{manifest.name} cannot be read" in said
-    assert "--drop-damaged" in said
-
-
 @pytest.mark.parametrize("task", ["a key", "{", ""])
 def test_a_task_of_another_restock_is_said(
     task: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -323,12 +248,6 @@ def writers(root: Path, out: Path) -> list[list[str]]:
     ]
 
 
-@pytest.mark.long
-def test_a_folder_that_is_not_there_is_made(root: Path, tmp_path: Path) -> None:
-    for number, argv in enumerate(writers(root, tmp_path / "a" / "new")):
-        assert cli.main(argv) == 0, (number, argv)
-
-
 def test_a_target_that_cannot_be_written_is_said(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -359,43 +278,6 @@ def test_a_memory_limit_that_is_too_small_is_said(
         assert "damaged" not in said, argv
 
 
-def test_too_little_memory_is_said_by_a_verb_without_a_limit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(args: list[str]) -> int:
-        try:
-            raise duckdb.OutOfMemoryException("Out of Memory Error: 9 GiB used\n\nPossible: …")
-        except duckdb.Error as error:
-            raise StoreError("is damaged or cannot be read") from error
-
-    monkeypatch.setattr(cli, "_dispatch", full)
-    assert cli.main(["coverage", "store/"]) == 2
-    said = capsys.readouterr().err
-    assert "restock coverage store/: DuckDB's memory limit" in said
-    assert "9 GiB used" in said
-    assert "free some memory" in said
-    assert not {"damaged", "Possible", "--memory-limit"} & set(said.split())
-
-
-def test_a_mujoco_gl_that_cannot_be_used_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from mujoco.rendering.classic import gl_context
-
-    def imported(args: list[str]) -> int:  # again, as the first import of MuJoCo in a process does
-        runpy.run_path(str(gl_context.__file__), run_name=gl_context.__name__)
-        return 0
-
-    monkeypatch.setattr(cli, "_dispatch", imported)
-    monkeypatch.setenv("MUJOCO_GL", "foo")
-    assert cli.main(["twin", "layout", "default"]) == 2
-    said = capsys.readouterr().err
-    assert "MUJOCO_GL in the environment: MuJoCo cannot use 'foo'" in said
-    assert "egl, osmesa or glfw" in said
-    monkeypatch.setenv("MUJOCO_GL", "disable")
-    assert cli.main(["twin", "layout", "default"]) == 0
-
-
 def test_a_path_that_is_not_utf_8_is_no_bug(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -421,18 +303,3 @@ def test_what_nobody_foresaw_exits_2_and_developers_see_where(
     monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
     assert cli.main(["info", "a.mcap"]) == 2
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_the_guarded_readers_name_the_file(tmp_path: Path) -> None:
-    file = tmp_path / "x.parquet"
-    with pytest.raises(RunError, match=r"x\.parquet: does not exist"):
-        read_table(file, error=RunError)
-    write_table(pa.table({"a": list(range(1000))}), file)
-    content = bytearray(file.read_bytes())
-    content[60] ^= 1  # within a page: its checksum says so
-    file.write_bytes(content)
-    with pytest.raises(RunError, match=r"x\.parquet: is damaged"):
-        read_table(file, error=RunError, remedy="make it again")
-    (tmp_path / "x.json").write_text("[" * 100_000)
-    with pytest.raises(RunError, match=r"x\.json: is damaged"):
-        read_json(tmp_path / "x.json", error=RunError)

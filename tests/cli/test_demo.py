@@ -11,9 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from rich.text import Text
 from support.panels import panel_of
-from support.paths import ROOT
 from support.stores import recording_transitions
 
 from restock import cli
@@ -161,40 +159,6 @@ def test_a_demo_that_cannot_begin_writes_nothing(tmp_path: Path, given: tuple[st
     assert cli.main(["demo", *out, flag, where]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
-
-
-@pytest.mark.parametrize("given", [("--seconds", "0"), ("--seconds", "nan"), ("--episodes", "0")])
-def test_a_demo_that_could_not_end_does_not_begin(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: tuple[str, str]
-) -> None:
-    assert cli.main(["demo", "--out", str(tmp_path / "out"), *given]) == 2
-    assert capsys.readouterr().err.startswith(f"restock: {given[0]}: must be")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_name_in_brackets_is_said_as_it_is(tmp_path: Path) -> None:
-    said: list[str] = []
-    Work(tmp_path, verb, said.append).do(Stage("info", "", "", ["info", "a[old].mcap"]))
-    assert "info 'a[old].mcap'" in "\n".join(Text.from_markup(line).plain for line in said)
-
-
-def test_a_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    assert cli.main(["demo", "--out", str(out), "--dry-run"]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[-1] == f"$ restock report {out / 'run'}"
-    assert not out.exists()
-
-
-def test_logs_of_another_robot_are_ingested_by_their_profile(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = ["--logs", str(ROOT / "sample_logs"), "--profile", "turtlebot3"]
-    assert cli.main(["demo", "--out", str(tmp_path / "out"), *given, "--dry-run"]) == 0
-    (ingest,) = [
-        line for line in capsys.readouterr().out.splitlines() if line.startswith("$ restock ingest")
-    ]
-    assert ingest.endswith("--profile turtlebot3")
 
 
 @pytest.mark.slow

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import json
-import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.fleets import SyntheticRobot, fleet_store
 from support.page_scripts import charts_of
 
 from restock import cli
-from restock.errors import ConfigError
-from restock.replay.fleet.drift import measure_drift
-from restock.replay.store.store import Store
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -85,31 +80,6 @@ def test_a_fleet_with_nothing_to_compare_says_so(
         assert "no change that matters" not in text.lower()
 
 
-def test_alike_robots_without_a_reference_are_not_called_unchanged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    robots = [SyntheticRobot("amr-1"), SyntheticRobot("amr-2")]
-    store = fleet_store(tmp_path / "store", robots, weeks=1, recordings=3)
-    assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert any(row["p"] is not None for row in document["tests"])  # of the robots, with each other
-    assert (document["tested"], document["findings"]) == (0, [])
-    page = tmp_path / "page.html"
-    assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
-    assert "Nothing could be tested: every robot drove in one week" in page.read_text("utf-8")
-
-
-def test_too_few_episodes_in_every_week_are_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    store = fleet_store(
-        tmp_path / "store", [SyntheticRobot("amr-1")], weeks=2, recordings=1, episodes=2
-    )
-    assert cli.main(["coverage", "drift", str(store)]) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"Nothing could be tested: none of \d+ comparisons has enough episodes", out)
-
-
 def test_no_change_is_said_with_its_number_of_tests(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -129,11 +99,3 @@ def test_no_change_is_said_with_its_number_of_tests(
     assert said in text.text
     assert cli.main(["coverage", "drift", str(store)]) == 0
     assert said in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "options", [{"every": "fortnight"}, {"reference": 0}, {"least_episodes": 1}]
-)
-def test_what_it_cannot_do_is_refused(options: dict[str, Any], store: Path) -> None:
-    with Store(store) as opened, pytest.raises(ConfigError):
-        measure_drift(opened, **options)

@@ -98,18 +98,6 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
     assert "is not a run directory" in capsys.readouterr().err
 
 
-def test_what_cannot_be_compared_names_the_option_and_its_store(
-    stores: dict[str, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    capsys.readouterr()
-    old = f"{stores['one']}@99"
-    assert main(["audit", str(stores["one"]), "--against", old, "--json"]) == 1
-    checks = json.loads(capsys.readouterr().out)["audits"]
-    (found,) = (one for one in checks if one["audit"] == "comparable")
-    assert found["doc"].startswith(f"--against {old}: has no version 99")
-    assert "--against" in found["advice"]
-
-
 @pytest.mark.parametrize(
     ("verb", "option"),
     [

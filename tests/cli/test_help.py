@@ -35,29 +35,6 @@ def test_prose_is_wrapped_and_parted_by_single_empty_lines(
         assert ["", ""] not in [lines[at : at + 2] for at in range(len(lines))]
 
 
-def test_a_window_of_one_column_has_an_end() -> None:
-    command = [sys.executable, "-m", "restock", "store", "compact", "--help"]
-    done = subprocess.run(
-        command, env=os.environ | {"COLUMNS": "1"}, capture_output=True, timeout=60, check=False
-    )
-    assert done.returncode == 0
-    boxes = [line for line in done.stdout.decode().splitlines() if line[0:1] in "╭│╰" and line]
-    assert {len(line) for line in boxes} == {30}
-
-
-def test_a_paragraph_has_none_of_the_line_breaks_of_the_source(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "90")
-    lines = lines_of(capsys, "profile")
-    start = next(place for place, line in enumerate(lines) if "profile check PROFILE" in line)
-    paragraph = lines[start : lines.index("", start)]
-    assert len(paragraph) > 2
-    assert min(map(len, paragraph[:-1])) > 70
-    lines = lines_of(capsys, "coverage")
-    assert sum(line.startswith("    ") for line in lines) == 2  # examples stay as they are
-
-
 def test_the_jobs_of_a_verb_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     text = "\n".join(lines_of(capsys, "twin"))
     assert "  layout  describe a floor\n" in text

@@ -25,7 +25,6 @@ from restock.process import (
     interrupts_raised,
     kill_as_interrupt,
     was_interrupted,
-    went_on_after_interrupt,
 )
 from restock.replay import Panel, Store, build_panel, load_mixture
 
@@ -133,24 +132,6 @@ def test_a_second_interrupt_ends_a_training_at_once(
     assert was_interrupted()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert not capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("usual_ctrl_c")
-def test_an_error_after_an_interrupt_that_was_dealt_with_is_none() -> None:
-    with kill_as_interrupt():
-        with duckdb.connect(config={"threads": 1}) as connection:
-            connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
-            with pytest.raises(duckdb.Error):
-                connection.sql("SELECT stop(1)").fetchall()
-        assert was_interrupted()
-        went_on_after_interrupt()
-        assert not was_interrupted()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        assert was_interrupted()
-    with kill_as_interrupt():
-        assert not was_interrupted()
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")

@@ -72,12 +72,3 @@ def test_an_extra_is_added_to_the_restock_that_is_installed(
     assert install_command("onnx") == command
     with pytest.raises(ConfigError, match=re.escape(f"{command}, or do without")):
         import_extra("no_such_module", "onnx", "it is needed", instead="do without")
-
-
-def test_a_machine_that_cannot_draw_still_does_the_rest(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(info, "DRAWS", "raise SystemExit('no EGL here')")
-    code, found = reported(capsys)
-    assert code == 0
-    assert (found["pictures"]["state"], found["pictures"]["what"]) == ("missing", "no EGL here")

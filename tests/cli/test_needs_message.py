@@ -50,30 +50,6 @@ def test_a_recording_that_does_not_fit_is_told_how_to_go_on() -> None:
     assert "its topics are /scan; choose" in str(error.value)
 
 
-def test_of_very_many_topics_those_that_could_be_used_are_named() -> None:
-    sensors = {f"sensor_{number}": "std_msgs/msg/Float64" for number in range(200)}
-    with pytest.raises(RecordingError) as error:
-        wanted_fields(load_profile("warehouse_amr"), topics(lidar=SCAN, **sensors), {})
-    assert "its topics are /lidar, 200 others, which `restock info` lists; choose" in str(
-        error.value
-    )
-
-
-def test_a_field_of_another_name_is_no_matter_of_topics() -> None:
-    """After an update of the robot, one profile does not fit the recordings from before it."""
-    profile = load_profile("warehouse_amr")
-    there = {s.topic: topic(s.type) for s in profile.sources.values()}
-    leaves = {
-        s.topic: [Leaf(path, (), "") for path in field_paths(s)] for s in profile.sources.values()
-    }
-    leaves["/odom"] = [Leaf(f"twist.twist.{path}", (), "") for path in ("linear.x", "angular.yaw")]
-    with pytest.raises(RecordingError) as error:
-        wanted_fields(profile, there, leaves)
-    assert "`inputs.wheels.fields`: /odom: no field 'twist.twist.angular.z'" in str(error.value)
-    assert "with a profile each: a copy with the other field and another `name`" in str(error.value)
-    assert "its topics are" not in str(error.value)
-
-
 def test_a_topic_that_was_skipped_is_not_called_absent() -> None:
     profile = load_profile("warehouse_amr")
     there = {s.topic: topic(s.type) for s in profile.sources.values()}

@@ -15,9 +15,6 @@ from support.paths import ROOT
 
 from restock import cli
 from restock.cli import output
-from restock.cli.learning.eval import show_measures
-from restock.ingest.task.schema import RECORDING_COLUMNS
-from restock.replay.trace import origin
 
 ROWS = [
     {"audit": "aisles", "status": "fail", "rows": 12_345, "what": "words of it " * 20},
@@ -33,71 +30,6 @@ def test_a_pipe_gets_all_of_a_table_in_120_columns(capsys: pytest.CaptureFixture
     assert text.split().count("words") == 20
     assert "12,345" in text
     assert "\x1b" not in text
-
-
-def test_a_pipe_gets_all_of_a_table_whose_words_do_not_fit(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    type_name = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    row = {f"count_{place}": 12_345_678 for place in range(5)}
-    row |= {"type": type_name, "clock": "2 backsteps, 1 repeated stamps, 1 zero stamps, 1 left out"}
-    output.print_table([row])
-    lines = capsys.readouterr().out.splitlines()
-    assert sum(type_name in line for line in lines) == 1
-    at = lines[0].index("clock")
-    assert " ".join(line[at:].strip() for line in lines[2:]) == row["clock"]
-
-
-@pytest.mark.parametrize("columns", [None, 80])
-def test_a_table_with_a_key_is_parted_and_never_wider_than_others(
-    columns: int | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if columns is not None:
-        monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-        monkeypatch.setenv("TERM", "dumb")
-        monkeypatch.setenv("COLUMNS", str(columns))
-    row = {"condition": "near_collision", "policy": "planner"}
-    row |= {f"measure {place}": f"{place}.25 [{place}.1, {place}.4]" for place in range(12)}
-    output.print_parted([row], key=("condition", "policy"), title="measures")
-    tables = capsys.readouterr().out.split("\n\n")
-    assert len(tables) > 1
-    assert tables[0].startswith("measures\n")
-    assert sum("measures" in table for table in tables) == 1
-    for table in tables:
-        assert max(map(len, table.splitlines())) <= (columns or 120)
-        assert "near_collision" in table
-        assert "planner" in table
-    assert all(str(row[f"measure {place}"]) in "".join(tables) for place in range(12))
-    output.print_parted([{"a": 1, "b": 2}], key=("a",))
-    assert capsys.readouterr().out.split()[:2] == ["a", "b"]
-
-
-def test_an_evaluation_shows_every_measure_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
-    measures = ("success", "discounted_return", "bumps_per_km", "time_lost_s")
-    row: dict[str, Any] = {"perturbation": "none", "condition": "near_collision"}
-    row |= {"policy": "limited:planner", "episodes": 1000, "time_s": 21.5}
-    row |= {"closest_person_least_m": 0.31, "closest_person_m": 0.84, "time_lost_episodes": 5}
-    row |= {"limited_share": 0.125, "stopped_share": 0.0625}
-    for name in measures:
-        row |= {name: 12.25, f"{name}_low": 12.125, f"{name}_high": 12.5}
-    show_measures([row])
-    text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= 120
-    assert "people, least (mean) m" in text
-    assert "0.31 (0.84)" in text
-    for column in ("discounted return", "bumps per km", "time s", "lost s", "held back"):
-        assert column in text
-
-
-def test_prose_is_one_line_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
-    output.stdout().print("a long sentence " * 30)
-    assert len(capsys.readouterr().out.splitlines()) == 1
-
-
-def test_a_message_is_said_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    line = f"wrote runs/a[old]/{'x' * 90}[/y]/:key:.html"
-    output.say(line)
-    assert capsys.readouterr().err == f"{line}\n"
 
 
 def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(
@@ -159,49 +91,6 @@ def test_forced_colours_do_not_reach_a_pipe(
     assert "\x1b" not in capsys.readouterr().out
 
 
-def test_an_error_is_red_on_a_terminal_only(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["inget"]) == 2
-    assert capsys.readouterr().err.startswith("restock: no verb")
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    assert cli.main(["inget"]) == 2
-    assert capsys.readouterr().err.startswith("\x1b[1;31mrestock:\x1b[0m no verb")
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert cli.main(["inget"]) == 2
-    assert capsys.readouterr().err.startswith("restock: no verb")
-
-
-@pytest.mark.parametrize("verb", cli.VERBS)
-def test_help_has_no_noise(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([verb, "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "{None" not in text
-    assert "None)" not in text
-    assert "(default: False)" not in text
-    assert "(default: True)" not in text
-
-
-def test_what_an_option_says_is_one_paragraph(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Wrapped to the window, without the line breaks of the source."""
-    monkeypatch.setenv("COLUMNS", "120")
-    assert cli.main(["ingest", "--help"]) == 0
-    text = capsys.readouterr().out
-    lines = text[text.index("--repeated") : text.index("--tag KEY")].splitlines()
-    paragraph = [reported for line in lines if (reported := line.strip("│ "))]
-    assert len(paragraph) > 2
-    assert all(len(line) > 70 for line in paragraph[1:-1]), paragraph
-    assert cli.main(["eval", "--help"]) == 0
-    text = capsys.readouterr().out
-    (line,) = (line for line in text.splitlines() if "--no-drive" in line)
-    assert line.strip("│ ").endswith(
-        "Drive nothing: use (or just show) the episodes in RUN/eval/episodes.parquet."
-    )
-
-
 def test_a_long_recording_shows_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -255,10 +144,3 @@ def test_a_bar_leaves_what_goes_into_a_file_alone(tmp_path: Path) -> None:
     assert done.stdout == b"data\n"
     assert b"x" in shown
     assert b"data" not in shown
-
-
-def test_a_trace_leaves_the_documents_of_a_manifest_out() -> None:
-    """JSON and TOML of many lines, which `restock sql` shows."""
-    documents = {column.name for column in RECORDING_COLUMNS if column.name.endswith("_json")}
-    assert documents >= {"task_json", "exposures_json"}
-    assert documents <= set(origin._LEFT_OUT)

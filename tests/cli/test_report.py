@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from html import escape
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -28,18 +28,13 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.look.blocks import ask, statements
-from restock.report.look.write import DARK
-from restock.report.run import fed
-from restock.report.run.facts import Facts, evaluation_bias, gather, mean_success
+from restock.report.run.facts import Facts, evaluation_bias, gather
 from restock.report.run.floor import floor_section
 from restock.report.run.headline import headline
-from restock.report.run.page import success, ways_section
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
-from restock.train.twin.floors.floor_files import write_floor
-from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.occupancy_grid import into_frame
 
 HOSTILE = "<script>alert(1)</script>"
@@ -289,48 +284,14 @@ def test_its_charts_are_specifications_that_vega_takes(html: str) -> None:
         assert "Undefined" not in json.dumps(vl_convert.vegalite_to_vega(spec))
 
 
-def test_policies_of_one_name_are_told_apart() -> None:
-    assert policy_words(["agent", "run:a/x/quotas", "run:b/x/quotas", "onnx:x/quotas.onnx"]) == {
-        "agent": "agent",
-        "run:a/x/quotas": "a/x/quotas",
-        "run:b/x/quotas": "b/x/quotas",
-        "onnx:x/quotas.onnx": "x/quotas.onnx",
-    }
-    assert policy_words(["planner", "run:runs/planner", "limited:run:runs/no_practice"]) == {
-        "planner": "planner",
-        "run:runs/planner": "run:planner",
-        "limited:run:runs/no_practice": "no practice, limited",
-    }
-    for name in ("run:.", "cloned:driver"):
-        assert policy_words([name]) == {name: name}
-
-
 def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:
     assert "alert(1)" in html  # it is shown …
     assert HOSTILE not in html  # … as text
 
 
-def heading(html: str) -> str:
-    found = re.search(r"<h1>(.*?)</h1>", html, re.DOTALL)
-    assert found is not None
-    return found[1]
-
-
 def test_the_headline_is_a_comparison_with_its_interval(run: Path) -> None:
     found = headline(gather(run))
     assert re.match(r"Worse than the planner in wheel slip \(−80 points \[−95, −6\d\]\)", found)
-
-
-def test_what_training_took_counts_the_steps_without_an_update(run: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(run, tmp_path / "run"))
-    offline = filled("progress", gradient_steps=300, env_steps=0, phase="offline", wall_s=4.0)
-    warmup = filled("progress", gradient_steps=300, env_steps=2016, phase="warmup", wall_s=11.0)
-    schema = pa.schema(TABLES["progress"])
-    rows = [offline, warmup | {"updates": 0, "loss": None}]
-    pq.write_table(pa.Table.from_pylist(rows, schema), copy / "progress.parquet")
-    took = gather(copy).trained
-    assert (took["env_steps"], took["gradient_steps"], took["wall_s"]) == (2016, 300, 11.0)
-    assert not took["updated_online"]
 
 
 def test_without_a_baseline_the_headline_says_so(run: Path, tmp_path: Path) -> None:
@@ -339,89 +300,6 @@ def test_without_a_baseline_the_headline_says_so(run: Path, tmp_path: Path) -> N
     table = pq.read_table(file)
     pq.write_table(table.filter(pa.compute.equal(table["policy"], "agent")), file)
     assert headline(gather(copy)).startswith("No baseline drove the same episodes")
-
-
-def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_path: Path) -> None:
-    assert ways_section(gather(run)) is None
-    copy = shutil.copytree(run, tmp_path / "run")
-    file = copy / "eval" / "episodes.parquet"
-    drawn = pq.read_table(file).to_pylist()
-    driven = [  # before the others, and of two ways in all
-        {**row, "layouts": "hall.toml, ways of the logs", "success": row["policy"] == "agent"}
-        for row in drawn
-        if row["episode_seed"] < 2 and row["condition"] == "nominal"
-    ]
-    named = [{**row, "layouts": "hall.toml"} for row in drawn]
-    pq.write_table(pa.Table.from_pylist([*driven, *named], schema=EVAL_EPISODES), file)
-    facts = gather(copy)
-    section = ways_section(facts)
-    assert section is not None
-    assert "4 of 84 episodes" in section.intro
-    shown = {row["policy"]: row["success"] for row in section.tables[0].rows}
-    assert shown == {"agent": "100% [34%, 100%]", "planner": "0% [0%, 66%]"}
-    assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
-
-
-def test_conditions_count_the_same_in_the_one_average_of_success() -> None:
-    """Partly and wholly blocked aisles count by half each."""
-    cells = [
-        {"cell": "nominal", "success": 1.0, "episodes": 100},
-        {"cell": "blocked_aisle (partial)", "success": 0.2, "episodes": 3},
-        {"cell": "blocked_aisle (full)", "success": 0.4, "episodes": 9},
-    ]
-    assert mean_success(cells) == pytest.approx(0.65)
-
-
-def test_a_condition_is_spelt_one_way(html: str) -> None:
-    shown = re.sub(r"<(pre|code)>.*?</\1>", "", html.split("</style>")[1], flags=re.DOTALL)
-    assert "wheel slip" in shown
-    assert "wheel_slip" not in shown
-
-
-def test_every_colour_of_a_figure_has_one_for_a_dark_ground(html: str) -> None:
-    """All but colours of marks that stand out on both."""
-    figures = "".join(re.findall(r"<svg.*?</svg>", html, re.DOTALL))
-    drawn = set(re.findall(r'(?:fill|stroke)="(#[0-9a-f]{6})"', figures))
-    both = {"#1f2937", "#fdfdfd", "#e69f00", "#cc79a7", "#56b4e9"}
-    assert drawn - both <= set(DARK)
-    for colour in drawn & set(DARK):
-        assert f'svg [fill="{colour}"]' in html
-
-
-def test_headline_and_callout_tell_no_difference_of_few_episodes(run: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(run, tmp_path / "run")
-    file = copy / "eval" / "episodes.parquet"
-    table = pq.read_table(file)
-    slips = pa.compute.equal(table["condition"], "wheel_slip")
-    late = pa.compute.greater(
-        table["episode_seed"], pa.compute.min(table["episode_seed"]).as_py() + 3
-    )
-    pq.write_table(table.filter(pa.compute.invert(pa.compute.and_(slips, late))), file)
-    assert "too few episodes to tell a difference in wheel slip" in headline(gather(copy))
-
-
-def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> None:
-    facts = gather(run)
-    facts.cells += [{**row, "perturbation": "friction"} for row in facts.cells]
-    section = success(facts)
-    assert section is not None
-    clean, friction = section.tables
-    assert not clean.folded
-    assert friction.folded
-    assert friction.title.endswith("friction")
-    for table in (clean, friction):
-        assert len(table.rows) == 4
-        assert [row["kind of episode"] for row in table.rows] == ["nominal", "", "wheel slip", ""]
-        # What no episode tells has no column.
-        assert not {"least distance to people", "time lost to the planner"} & set(table.columns)
-
-
-def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:
-    facts = gather(run)
-    facts.cells += [
-        {**row, "policy": "random", "success": 0.6} for row in facts.clean_cells("agent")
-    ]
-    assert headline(facts).startswith("Nothing was learned: no better than a random policy")
 
 
 def test_every_section_has_its_figures(html: str) -> None:
@@ -496,13 +374,6 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     assert '<section id="twin-gap">' not in page
 
 
-def test_drawn_shares_are_over_the_whole_run(run: Path) -> None:
-    fed = {(r["source"], r["stratum"]): r for r in gather(run).sampled}
-    assert fed["logs", "nominal"]["drawn_rows"] == 180
-    assert fed["logs", "nominal"]["drawn_share"] == pytest.approx(0.9)
-    assert fed["fresh", HOSTILE]["drawn_share"] == pytest.approx(0.1)
-
-
 def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path: Path) -> None:
     made = Run.create(tmp_path / "run", {"config": {}})
     made.append("progress", [filled("progress", phase="online")])
@@ -518,12 +389,6 @@ def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path
     made.flush()
     fed = {row["stratum"]: row["effective_share"] for row in gather(made.path).sampled}
     assert fed == pytest.approx({"a": 0.95, "b": 0.05})
-
-
-def test_the_kept_evaluation_is_the_best_and_not_the_last(run: Path) -> None:
-    kept = gather(run).policy
-    assert kept is not None
-    assert (kept.chosen, kept.env_steps, kept.gradient_steps) == ("best", 2000, 500)
 
 
 def test_the_evaluation_bias_is_named(run: Path) -> None:
@@ -567,15 +432,6 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
         assert f"{failed} failed clean episodes there" in str(section.figures[1].caption)
 
 
-def test_logs_in_another_frame_are_counted_and_not_drawn(run: Path, tmp_path: Path) -> None:
-    (floor,) = open_floors("default")
-    away = replace(floor, name="away", map_origin=(900.0, 0.0, 0.0))
-    write_floor(away, tmp_path / "away.toml")
-    facts = _on_floors(run, tmp_path / "a", str(tmp_path / "away.toml"), "away")
-    assert facts.elsewhere > 0
-    assert facts.visited == []
-
-
 def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
     table = with_clear_view(recording_transitions(1))
     store = write_store(tmp_path / "store", [table])
@@ -594,15 +450,6 @@ def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
     found = np.array([(row["x_m"], row["y_m"]) for row in cells for _ in range(row["rows"])])
     for axis in (0, 1):
         np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
-
-
-@pytest.mark.parametrize("layouts", ["generated:train:3", "gone.toml"])
-def test_a_floor_that_is_not_drawn_is_named_as_missing(
-    run: Path, tmp_path: Path, layouts: str
-) -> None:
-    facts = _on_floors(run, tmp_path / "a", layouts, "default")
-    assert facts.missing[-1].startswith(("No floor is drawn", "The floor is not drawn"))
-    assert floor_section(facts) is None
 
 
 def test_the_verb_prints_where_the_page_is_and_writes_its_figures(
@@ -656,18 +503,3 @@ def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
             build_report(place)
         assert refused.value.where == str(place)
         assert cli.main(["report", str(place)]) == 2
-
-
-def test_shares_stand_side_by_side_and_what_is_short_or_lost_by_weights_is_said(run: Path) -> None:
-    facts = gather(run)
-    kinds = {row["kind"] for row in fed.share_bars(facts)}
-    assert kinds == {"natural", "wanted", "drawn"}
-    short, lost = fed.remarks(facts)
-    assert "was short by 40.0% of the rows fed, of 50.0% wanted: too few rows of" in short
-    assert "nominal (86.27% of the rows, 90.00% of the draws, 50.00% of the gradient)" in lost
-    facts.sampled = [row | {"effective_share": row["drawn_share"]} for row in facts.sampled]
-    assert fed.remarks(facts) == [short]
-    figure = fed.shares_figure(facts)
-    assert figure is not None
-    assert "wanted" in figure.widest
-    assert [row["drawn"] for row in fed.fed_table(facts).rows] == ["90%", "10%"]

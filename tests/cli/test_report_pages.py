@@ -151,13 +151,6 @@ def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> N
 
 CONTROL_PERIOD_S = 0.2
 NO_PLAN = {"orders": [], "total": 0.0, "total_low": 0.0, "total_high": 0.0, "hours": 0.0}
-NEVER_SEEN = {
-    **{"asked_by": "audit missing_cells", "cell": "blocked_aisle, action 7"},
-    **{"condition": "blocked_aisle", "stratum": None, "action": 7, "zone": None, "robot": None},
-    **{"counted": "rows", "needed": 1, "there": 0, "missing": 1, "thinnest_zones": []},
-    **{"best": None, "amount": None, "amount_low": None, "amount_high": None},
-    **{"never_seen_in": "blocked_aisle", "at_least": 9},
-}
 
 
 def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[str, Any]:
@@ -189,18 +182,6 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     assert all(conditions > 1 for _, _, conditions in counted)
     expected = {robot: f"{rows * CONTROL_PERIOD_S / 3600:.2f}" for robot, rows, _ in counted}
     assert {row["robot"]: row["hours"] for row in table.rows} == expected
-
-
-@pytest.mark.long
-def test_a_gap_without_a_rate_says_how_many_episodes_would_show_one(store_path: Path) -> None:
-    with Store(store_path) as store:
-        cards, sections = coverage_of(store, missing(NEVER_SEEN))
-        closed, _ = coverage_of(store, missing())
-    assert cards["gap"] == "1"
-    assert not any("to log next" in label for label in cards)  # no "0 missions"
-    (row,) = sections["shopping"].tables[-1].rows
-    assert "at least 9 more episodes" in row["best"]
-    assert (closed["gaps"], closed["missions to log next"]) == ("0", "0")
 
 
 def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:

@@ -10,11 +10,8 @@ from typing import Any
 
 import pytest
 from support.driven_robot import Drive, up_to_the_panel, write_bag
-from support.profile_texts import WAREHOUSE
 
 from restock import cli
-from restock.cli.start import outcomes
-from restock.cli.start.decisions import robot_line
 from restock.cli.start.stages import Stage
 from restock.cli.start.start import StartCommand, Way
 from restock.cli.start.work import Ended, Work
@@ -62,13 +59,6 @@ def bag(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_done_is_not_done_again(tmp_path: Path, bag: Path) -> None:
-    verbs, out = Verbs(), tmp_path / "out"
-    assert way(out, verbs, bag) == ["done"] * 3
-    assert way(out, verbs, bag) == ["kept"] * 3
-    assert verbs.ran == ["ingest", "mix", "train"]
-
-
 def test_what_a_changed_input_decides_is_done_again(tmp_path: Path, bag: Path) -> None:
     verbs, out = Verbs(), tmp_path / "out"
     way(out, verbs, bag)
@@ -80,30 +70,6 @@ def test_what_a_changed_input_decides_is_done_again(tmp_path: Path, bag: Path) -
     assert (out / "earlier" / "run-2" / "mine.txt").read_text() == "a note"
     (out / "store").rmdir()
     assert way(out, verbs, bag, number=2) == ["done"] * 3
-
-
-def test_a_failed_stage_is_tried_again(tmp_path: Path, bag: Path) -> None:
-    verbs, out = Verbs(), tmp_path / "out"
-    verbs.codes["mix"] = 2
-    assert way(out, verbs, bag) == ["done", "failed", "done"]
-    assert way(out, verbs, bag) == ["kept", "failed", "kept"]
-    verbs.codes.clear()
-    assert way(out, verbs, bag) == ["kept", "done", "done"]
-
-
-def test_a_stage_that_shows_its_progress_keeps_its_complaint_too(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def verb(command: list[str]) -> int:
-        sys.stderr.write("10 steps\nrestock: runs/a: no room\n")
-        return 2
-
-    said: list[str] = []
-    stage = Stage("train", "", "", ["train"], shows_progress=True)
-    ended = Work(tmp_path / "out", verb, said.append).do(stage)
-    assert ended.errors == ["runs/a: no room"]
-    assert "10 steps" in capsys.readouterr().err
-    assert not any("no room" in line for line in said)  # it was said
 
 
 def test_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path, bag: Path) -> None:
@@ -199,19 +165,6 @@ def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path: Path) -> N
     assert way._further_floors(floor) == (tmp_path / "floor-2.toml",)
     assert any("floor-3.toml is not used: it has no room for wheel_slip" in line for line in said)
     assert way._further_floors(Ended("floor", "", "planned")) == ()
-
-
-def test_a_folder_without_a_recording_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "empty").mkdir()
-    out = tmp_path / "out"
-    assert cli.main(["start", str(tmp_path / "empty"), "--out", str(out), "--json"]) == 2
-    assert capsys.readouterr().err == (
-        f"restock: {tmp_path / 'empty'}: no recording in this folder\n"
-        "  recordings end in .mcap, .db3, .bag or are rosbag2 folders\n"
-    )
-    assert not out.exists()
 
 
 class Parked(Drive):
@@ -314,31 +267,6 @@ def test_without_a_trusted_twin_the_policy_is_from_logs_alone(
     again = start(capsys, *argv)[1]["stages"]
     failed = {name for name, stage in stages.items() if stage["status"] == "failed"}
     assert {stage["name"] for stage in again if stage["status"] != "kept"} == failed
-
-
-def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
-    """Of a stranger's Neato "fqe 4.18" stood beside "logged -1.05", as if it were a gain."""
-    few = "1 episode, and weights take at least 5"
-    rows = [
-        {"measure": "return", "condition": "all", "episodes": 1, "low": None, "high": None}
-        | {"estimator": name, "value": value, "refused": None if value else few}
-        for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None))
-    ]
-    reported, refused = outcomes.on_logs({"results": rows, "notes": []})
-    assert reported.startswith(
-        "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
-    )
-    assert refused.startswith(f"refused: {few}. So it is not known whether the policy is better")
-
-
-def test_what_nothing_says_of_the_robot_is_called_a_guess(tmp_path: Path) -> None:
-    """Wheels and mass that follow from the outline were called the stand-in's, from the logs."""
-    profile = tmp_path / "profile.toml"
-    robot = '[robot]\ndrive = "differential"\ntrack_m = 0.4\n[robot.origin]\ntrack_m = "urdf"\n'
-    profile.write_text(f"{WAREHOUSE}\n{robot}")
-    reported = robot_line(profile)
-    assert "track 0.4 m (from urdf)" in reported
-    assert "wheel radius, mass guessed from its outline" in reported
 
 
 def test_a_person_chooses_among_command_topics(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,7 @@ from support.driven_robot import Drive, up_to_the_panel, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock import cli
-from restock.cli.start.decisions import fit_is_worse, no_room, node_refuses
-from restock.cli.start.start import StartCommand, Way
-from restock.cli.start.work import Ended, Work
+from restock.cli.start.decisions import fit_is_worse, node_refuses
 from restock.errors import ConfigError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import load_profile
@@ -24,16 +21,6 @@ def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
     """Return the exit code, and the document."""
     code = cli.main(["start", *argv, "--json"])
     return code, json.loads(capsys.readouterr().out)
-
-
-def test_without_room_for_a_mission_the_twin_is_not_used() -> None:
-    def floor(**document: Any) -> Ended:
-        return Ended("floor", "", "done", document=document)
-
-    assert no_room(floor(episodes=["nominal"])) is None
-    assert "no mission fits" in str(no_room(floor(episodes=[])))
-    # Without any floor the twin has its own, where that is asked for.
-    assert no_room(Ended("floor", "", "failed")) is None
 
 
 def test_a_worse_fit_is_reported_with_its_figures() -> None:
@@ -72,23 +59,6 @@ def test_a_lidar_that_sees_into_the_robot_stops_it(
     (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
     _, document = start(capsys, *argv)
     assert "length_m and width_m of [task.body]" in document["stopped"]["remedies"][0]
-
-
-@pytest.mark.parametrize(
-    ("status", "said"), [("done", "cannot be evaluated on logs."), (None, "cannot be evaluated.")]
-)
-def test_an_evaluation_in_the_twin_is_not_forgotten(
-    tmp_path: Path, status: str | None, said: str
-) -> None:
-    def verb(command: list[str]) -> int:
-        sys.stdout.write(json.dumps({"results": []}))
-        return 0
-
-    lines: list[str] = []
-    way = Way(StartCommand(("bag",), tmp_path / "out"), Work(tmp_path / "out", verb, lines.append))
-    floor = None if status is None else Ended("floor", "", "failed")  # on the twin's own
-    way._judge(floor, {"left_out": []})
-    assert any(f"the policy {said}" in line for line in lines)
 
 
 def test_a_profile_that_the_node_refuses_is_told_with_the_policy(tmp_path: Path) -> None:

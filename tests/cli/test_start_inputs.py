@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,11 +29,9 @@ from restock.cli.start.decisions import (
     missions_unseen,
     possible_kinds,
     practice_settings,
-    updates_settings,
 )
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
-from restock.ingest.containers.open_recording import recordings_in
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.propose import drives
 from restock.replay.store.store import Store
@@ -98,24 +95,6 @@ def test_salvage_reads_a_damaged_recording_as_far_as_intact(
     assert not (out / "floor.toml").exists()
 
 
-@pytest.mark.long
-def test_a_robot_larger_than_its_aisles_is_told_to_be_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    aisle = np.zeros((80, 300), np.uint8)
-    aisle[34:46, 5:295] = 254  # .6 m wide, around y = 1 m
-    write_pgm(tmp_path / "aisle.pgm", aisle)
-    known = tmp_path / "aisle.yaml"
-    known.write_text("image: aisle.pgm\nresolution: 0.05\norigin: [-1.0, -1.0, 0]\n")
-    bag, out = write_bag(Drive(), tmp_path / "bag"), tmp_path / "out"
-    argv = (str(bag), "--out", str(out), "--map", str(known), "--footprint", "0.9x0.8")
-    code, document = start(capsys, *argv)
-    assert code == 3
-    assert "no free place that a robot fits in" in document["stages"][-1]["errors"][0]
-    assert document["stopped"]["remedies"][0].startswith("measure the robot")
-    assert not (out / "floor.toml").exists()
-
-
 CART = """<robot name='cart'><link name='base_link'>
 <inertial><mass value='20'/></inertial>
 <collision><geometry><box size='0.6 0.4 0.2'/></geometry></collision></link>{}</robot>"""
@@ -165,30 +144,6 @@ def test_a_robots_own_types_are_read_by_their_definitions(tmp_path: Path) -> Non
     assert "--definitions" in recording["topics"]["/accel"]["skipped"]
 
 
-def test_definitions_go_to_every_stage_that_reads_recordings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "my_msgs"
-    folder.mkdir()
-    (folder / "Level.msg").write_text("float64 value\n")
-    out = str(tmp_path / "out")
-    flag = ("--definitions", str(folder))
-    bags = str(write_bag(Drive(), tmp_path / "bags"))
-    assert cli.main(["start", bags, "--out", out, "--dry-run", *flag]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    given = [line.split()[2] for line in printed if f"--definitions {folder}" in line]
-    assert given == ["info", "profile", "profile", "ingest", "twin"]
-
-
-def test_a_file_of_any_name_may_lie_beside_the_recordings(
-    tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (damaged.parent / os.fsdecode(b"odd\xff.txt")).write_text("not UTF-8")
-    code, document = start(capsys, str(damaged.parent), "--out", str(tmp_path / "out"))
-    assert code == 3  # for the recording that is cut
-    assert document["stages"][0]["status"] == "failed"
-
-
 def test_what_is_no_recording_is_refused_and_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -211,33 +166,6 @@ def test_what_is_no_recording_is_refused_and_nothing_is_written(
         assert "\n  " in printed.err
         assert printed.out == ""
         assert not Path("out").exists()
-
-
-@pytest.mark.long
-def test_several_kinds_of_robots_are_told_apart(
-    tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """And what cannot be read is named, and does not stop the others."""
-    bags, out = damaged.parent, tmp_path / "out"
-    write_bag(Drive(), bags / "a")
-    write_bag(Drive(), bags / "b")
-    write_bag(OtherLidar(), bags / "c")
-    argv = (str(bags), "--out", str(out), *up_to_the_panel(tmp_path))
-    code, document = start(capsys, *argv)
-    assert code == 3
-    found = document["stages"][0]
-    assert found["status"] == "failed"
-    assert "--salvage" in found["errors"][0]
-    assert "recordings of 2 kinds of robots" in document["stopped"]["why"]
-    assert ": 2 recordings (" in document["stopped"]["why"]
-    assert " | 1 recording (" in document["stopped"]["why"]
-    options = shlex.join(up_to_the_panel(tmp_path))
-    assert document["stopped"]["remedies"][:2] == [
-        f"restock start {bags / 'a'} {bags / 'b'} --out {out} {options}",
-        f"restock start {bags / 'c'} --out {out}-2 {options}",
-    ]
-    _, document = start(capsys, *argv, "--accept")
-    assert f"restock ingest {bags / 'a'} {bags / 'b'} --store" in commands(document)["ingest"]
 
 
 def test_unread_recordings_are_sorted_by_kind_too(
@@ -266,56 +194,12 @@ def test_unread_recordings_are_sorted_by_kind_too(
     assert "by the 2 largest of 3 recordings of this robot" in proposed["outcome"][0]
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_all_recordings_of_two_fleets_are_in_the_calls(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Of 19 recordings the calls named 12, and with --accept rows of two fleets were mixed."""
-    fleets = [str(SHARED / name) for name in ("fleet-neato", "fleet-turtlebot3")]
-    code, document = start(capsys, *fleets, "--out", str(tmp_path / "out"))
-    assert code == 3
-    *calls, _ = document["stopped"]["remedies"]
-    named = [word for call in calls for word in call.split() if word.startswith(str(SHARED))]
-    every = [str(path) for fleet in fleets for path in recordings_in(fleet)]
-    assert sorted(named) == sorted(every)
-    assert not any(len({fleet in call for fleet in fleets}) == 1 for call in calls)
-
-
 class OtherLidar(Drive):
     """The same drive with half the beams."""
 
     def topics(self) -> dict[str, Any]:
         tenth = np.arange(0, self.duration_s, 0.1)
         return super().topics() | {"/scan": columns(tenth, scans(np.full((len(tenth), 36), 3.0)))}
-
-
-def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:
-    few = {"rows": 267, "max_replays_per_row": 400.0}
-    allowed = 267 * 400 / 128  # updates
-    settings = dict(one.split("=") for one in updates_settings(few, 1.0, twin=True, seconds=30.0))
-    assert int(settings["schedule.offline_updates"]) == int(allowed / 2)
-    assert int(settings["schedule.env_steps"]) == 15_000  # what 30 s drive, not the usual 200,000
-    many = {"rows": 12_000, "max_replays_per_row": 400.0}
-    assert updates_settings(many, 1.0, twin=True, seconds=30.0) == []
-    # On the logs alone nothing is driven, and all draws are for them.
-    (alone, _) = updates_settings(few, 9.0, twin=False)
-    assert alone == f"schedule.offline_updates={int(allowed)}"
-
-
-def test_a_damaged_ros1_bag_is_reported_as_damaged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cut = tmp_path / "cut.bag"
-    cut.write_bytes(b"#ROSBAG V2.0\n" + bytes(500))
-    argv = ["start", str(cut), "--out", str(tmp_path / "mine")]
-    assert cli.main(argv) == 3
-    said = " ".join(capsys.readouterr().out.split())
-    assert "ROS 1 bag cannot be read" in said
-    assert "add --salvage to this command" in said
-    assert cli.main([*argv, "--salvage"]) == 3
-    said = " ".join(capsys.readouterr().out.split())
-    assert "nothing in it can be salvaged" in said
-    assert "see the message for each above" in said
 
 
 def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> None:

@@ -15,12 +15,11 @@ from support.stores import recording_transitions, write_store
 from restock import cli
 from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.damaged_files import VERIFIED, verify_store
+from restock.ingest.store.damaged_files import verify_store
 from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
 FLIPS = 60
-NOTE = "not verified: `restock store verify"
 
 
 @pytest.fixture(scope="module")
@@ -138,34 +137,3 @@ def test_a_file_is_read_once_while_its_size_and_time_are_the_same(store: Path) -
         flip(file, 1000)
         opened.verify()
         assert opened.unverified() == 0
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"transitions": 3}'])
-def test_a_damaged_memory_is_as_none(text: str, store: Path) -> None:
-    (store / VERIFIED).write_text(text)
-    with Store(store) as opened:
-        assert opened.unverified() == 2
-        opened.verify()
-        assert opened.unverified() == 0
-
-
-def test_other_verbs_say_that_they_did_not_verify(
-    store: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    verbs = (["sql", str(store), "SELECT 1"], ["coverage", str(store)])
-    for argv in verbs:
-        assert cli.main(argv) == 0
-        assert f"2 files of {store} {NOTE} {store}`" in capsys.readouterr().err
-    assert cli.main(["store", "verify", str(store)]) == 0
-    capsys.readouterr()
-    for argv in verbs:
-        assert cli.main(argv) == 0
-        assert NOTE not in capsys.readouterr().err
-
-
-def test_a_log_that_names_an_impossible_file_is_refused(store: Path) -> None:
-    """One bit makes a percent sign of a 5: `%00` is a character that no path can hold."""
-    log = max(store.glob("transitions/_delta_log/*.json"))
-    log.write_bytes(log.read_bytes().replace(b".parquet", b"%00.parquet"))
-    with pytest.raises(StoreError, match="names a file that cannot be"):
-        Store(store)

@@ -50,14 +50,3 @@ def test_a_pipe_is_written_into_and_not_replaced(tmp_path: Path) -> None:
     reader.join(10)
     assert heard == ["told"]
     assert pipe.is_fifo()
-
-
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="no /proc")
-def test_a_stream_of_this_process_is_written_into(tmp_path: Path) -> None:
-    """As /dev/stdout is, where a shell has put it into a file."""
-    with (tmp_path / "out").open("w+") as out:
-        link = tmp_path / "stdout"
-        link.symlink_to(f"/proc/self/fd/{out.fileno()}")
-        write_text(link, "told")
-        assert link.is_symlink()
-        assert out.read() == "told"

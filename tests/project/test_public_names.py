@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 from support.paths import ROOT
 
-import restock
 from restock.public import FACES, imported
 
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
@@ -23,7 +22,6 @@ EXAMPLES = sorted((ROOT / "docs" / "examples").glob("*.py"))
 ROOMS = [face for face in FACES if face not in ("restock", "restock.report")]
 # Made by an `open` of their own.
 HOLD_PATHS = {"Panel", "Run"}
-ROOM_FOLDERS = ("ingest", "replay", "train")
 # What a path may begin with, and the names that may follow.
 KNOWN = {face: set(importlib.import_module(face).__all__) for face in FACES}
 KNOWN["restock"] |= {"ingest", "replay", "report", "train", "twin", "errors", "public"}
@@ -38,14 +36,6 @@ def test_importing_the_rooms_loads_none_of_the_heavy_libraries() -> None:
     heavy = "{'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair', 'msgspec', 'tyro', 'gymnasium'}"
     names = ", ".join(["restock", *ROOMS])
     assert python(f"import sys, {names}; print({heavy} & set(sys.modules))") == "set()"
-
-
-@pytest.mark.long
-def test_importing_restock_is_enough_to_reach_a_room() -> None:
-    code = "import restock; print(restock.twin.EpisodeSpec.__name__, restock.train.train.__name__)"
-    assert python(code) == "EpisodeSpec train"
-    with pytest.raises(AttributeError, match="module 'restock' has no attribute 'nothing'"):
-        restock.nothing  # noqa: B018
 
 
 @pytest.mark.parametrize("face", [*ROOMS, "restock.report"])
@@ -80,29 +70,6 @@ def test_a_name_is_what_type_checkers_see(face: str) -> None:
             assert name in dir(module)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         module.nothing  # noqa: B018
-
-
-@pytest.mark.long
-def test_no_module_takes_the_place_of_a_name_however_late_it_is_imported() -> None:
-    everything = [
-        ".".join(["restock", *path.relative_to(ROOT / room).with_suffix("").parts])
-        for room, folder in (("src/restock", "src/restock"), *((".", r) for r in ROOM_FOLDERS))
-        for path in sorted((ROOT / folder).rglob("*.py"))
-        if path.name not in ("__init__.py", "__main__.py")
-    ]
-    assert len(everything) > 200
-    code = f"""
-        import importlib
-        for name in {everything!r}:
-            importlib.import_module(name)
-        for face in {ROOMS!r}:
-            module = importlib.import_module(face)
-            for name in module.__all__:
-                print(face, name, getattr(module, name).__class__.__name__ == "module")
-    """
-    lines = python(textwrap.dedent(code)).splitlines()
-    assert len(lines) > 40
-    assert not [line for line in lines if line.endswith("True")]
 
 
 @pytest.mark.parametrize("path", [*PAGES, *EXAMPLES], ids=lambda path: path.name)

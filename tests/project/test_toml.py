@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,14 +20,10 @@ from restock.ingest.profile.profile import Profile
 from restock.replay.mixture.mixture import Mixture
 from restock.toml import Checked, parse_toml, read_toml, toml_value, typed
 from restock.train.dqn.config import (
-    NetworkConfig,
     TrainConfig,
-    apply_overrides,
-    as_overrides,
-    parse_config,
 )
 from restock.train.study.study import Study
-from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.perturbation import Schedule
 
 plain = st.recursive(
     st.booleans()
@@ -40,20 +35,6 @@ plain = st.recursive(
     ),
     max_leaves=8,
 )
-
-
-def test_numbers_of_numpy_are_pythons_in_a_struct() -> None:
-    """A sweep takes its values from `np.linspace`, `np.arange` or a generator."""
-    config = TrainConfig(seed=np.int64(3), network=NetworkConfig(hidden=np.array([64, 32])))  # type: ignore[arg-type]
-    assert parse_config(msgspec.to_builtins(config), where="test").seed == 3
-    assert config.network.hidden == [64, 32]
-    schedule = Schedule({"payload_kg": (np.float32(0), np.float64(30))})  # type: ignore[dict-item]
-    for one in (
-        Perturbation(payload_kg=np.float32(30)),  # type: ignore[arg-type]
-        typed({"payload_kg": np.float64(30)}, Perturbation, where="test"),
-        schedule.draw(np.random.default_rng(0)),
-    ):
-        assert type(msgspec.to_builtins(one)["payload_kg"]) is float
 
 
 def test_a_value_refused_in_python_is_an_error_of_restock() -> None:
@@ -71,15 +52,6 @@ def test_a_value_refused_in_python_is_an_error_of_restock() -> None:
 @given(plain)
 def test_a_value_reads_back_equal(value: Any) -> None:
     assert tomllib.loads(f"key = {toml_value(value)}")["key"] == value
-
-
-def test_what_is_no_number_reads_back_so() -> None:
-    assert math.isnan(tomllib.loads(f"key = {toml_value(math.nan)}")["key"])
-
-
-def test_a_setting_keeps_letters_beyond_16_bits() -> None:
-    settings = {"env": {"layouts": "halls/\U0001f4e6.toml"}}
-    assert apply_overrides({}, as_overrides(settings)) == settings
 
 
 Share = Annotated[float, Meta(ge=0, lt=1)]
@@ -230,27 +202,12 @@ def test_each_setting_with_names_to_choose_from_lists_them(kind: type) -> None:
         assert set(re.findall(r'"(.+?)"', listed)) == names, refused.value.what
 
 
-def test_errors_name_keys_below_a_prefix() -> None:
-    for values, message in (
-        ({"share": 3.0}, "env.share must be in [0, 1), got 3.0"),
-        ({"nothing": 1}, "unknown key `env.nothing`"),
-    ):
-        with pytest.raises(ConfigError) as refused:
-            typed(values, Config, where="--set", prefix="env")
-        assert str(refused.value) == f"--set: {message}"
-
-
 def test_a_missing_key_is_named() -> None:
     class Needs(Checked, frozen=True):
         name: str
 
     with pytest.raises(ConfigError, match="missing key `name`"):
         typed({}, Needs, where="config.toml")
-
-
-def test_a_pair_of_another_length_is_refused_in_python_too() -> None:
-    with pytest.raises(ValueError, match="pair must have 2 values, got 1"):
-        Config(pair=(0.5,))  # type: ignore[arg-type]
 
 
 def test_a_renamed_key_is_refused_with_its_new_name() -> None:
@@ -316,9 +273,3 @@ def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
 def test_deep_nesting_is_refused(text):
     with pytest.raises(ConfigError, match=r"^a\.toml: is nested more than 64 levels deep$"):
         parse_toml(text, where="a.toml")
-
-
-def test_many_dots_are_not_deep_nesting():
-    values = ", ".join(["1.5"] * 1000)
-    text = f"""a = [{values}]\nb = "{"." * 1000}"\nc = "{"x" * 100_000}"\n"""
-    assert len(parse_toml(text, where="a.toml")["a"]) == 1000
