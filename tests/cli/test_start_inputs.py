@@ -216,11 +216,8 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
     [
         ("--mixture", "coverag", "one of coverage, uniform"),
         ("--profile", "no_such.toml", "no such profile"),
-        ("--definitions", "humbel", "no ROS distribution, folder or file"),
-        ("--footprint", "wide", "--footprint"),
         ("--minutes", "nan", "--minutes"),
         ("--out", "a_file", "give a folder with --out"),
-        ("--tag", "north", "'north' is not KEY=VALUE"),
         ("--map", "no_map.yaml", "no_map.yaml: cannot be read: No such file"),
         ("--urdf", "box.urdf", "'box' has no wheels"),
     ],

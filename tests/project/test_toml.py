@@ -93,27 +93,17 @@ class Config(Checked, frozen=True):
 # What is wrong, and how both a file and Python say so.
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"share": 1.0}, "share must be in [0, 1), got 1.0"),
-    ({"share": -0.5}, "share must be in [0, 1), got -0.5"),
     ({"share": math.nan}, "share must be in [0, 1), got nan"),
     ({"positive": math.inf}, "positive must be finite, got inf"),
-    ({"most": -math.inf}, "most must be finite, got -inf"),
-    ({"unbounded": math.nan}, "unbounded must be finite, got nan"),
-    ({"several": math.inf}, "several must be finite, got inf"),
     ({"points": [[0.0, math.nan]]}, "points[0][1] must be finite, got nan"),
-    ({"place": [math.nan, 0.0]}, "place[0] must be finite, got nan"),
     ({"count": 0}, "count must be at least 1, got 0"),
     ({"positive": 0.0}, "positive must be above 0, got 0.0"),
-    ({"most": 1.5}, "most must be at most 1, got 1.5"),
     ({"low": -1.0}, "low must be in (-1, 1], got -1.0"),
     ({"list_of": [0.1, 7.0]}, "list_of[1] must be in [0, 1), got 7.0"),
-    ({"tuple_of": [7.0]}, "tuple_of[0] must be in [0, 1), got 7.0"),
     ({"pair": [0.5, 0]}, "pair[1] must be at least 1, got 0"),
     ({"table": {"a": 0.1, "b": 2.0}}, "table.b must be in [0, 1), got 2.0"),
     ({"lists": {"a": [0.1], "b": [0.1, 3.0]}}, "lists.b[1] must be in [0, 1), got 3.0"),
-    ({"maybe": 2.0}, "maybe must be in [0, 1), got 2.0"),
-    ({"either": 2.0}, "either must be in [0, 1), got 2.0"),
     ({"several": [0.1, 3.0]}, "several[1] must be in [0, 1), got 3.0"),
-    ({"several": {"a": 3.0}}, "several.a must be in [0, 1), got 3.0"),
     ({"count": 2, "free": "x"}, "count must be 1 where free is given"),
 ]
 IN_FILES: list[tuple[dict[str, Any], str]] = [
@@ -123,9 +113,7 @@ IN_FILES: list[tuple[dict[str, Any], str]] = [
     ({"nothing": 1}, "unknown key `nothing`"),
     ({"inners": [{"nothing": 1}]}, "unknown key `inners[0].nothing`"),
     ({"share": "x"}, "`share`: Expected `float`, got `str`"),
-    ({"share": True}, "`share`: Expected `float`, got `bool`"),
     ({"either": "no"}, "`either`: Invalid enum value 'no'; choose from \"auto\", a number"),
-    ({"either": []}, '`either`: Expected `float | str`, got `array`; choose from "auto", a number'),
 ]
 
 

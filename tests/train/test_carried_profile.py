@@ -106,28 +106,6 @@ def test_a_run_is_evaluated_and_resumed_without_its_profile(
     assert again.profile == resumed.profile
 
 
-def test_a_trace_reads_the_messages_by_the_carried_profile(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with Store(folder / "store") as store:
-        row = store.sql("SELECT min(transition_id) FROM transitions").fetchall()[0][0]
-    assert main(["trace", str(folder / "store"), str(row), "--recording", TUESDAY, "--json"]) == 0
-    traced = json.loads(capsys.readouterr().out)
-    assert {message["input"] for message in traced["messages"]} >= {"command", "scan"}
-    assert traced["notes"] == []
-
-
-def test_mix_says_which_of_two_profiles_a_panel_carries(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name, recording in (("first", TUESDAY), ("second", MONDAY)):
-        ingest(tmp_path, name, recording, tmp_path / "store")
-    capsys.readouterr()
-    assert main(["mix", str(tmp_path / "store"), "--out", str(tmp_path / "panel")]) == 0
-    assert "the panel carries second" in " ".join(capsys.readouterr().out.split())
-    assert profile_of_panel(Panel.open(tmp_path / "panel")).name == "second"
-
-
 @pytest.mark.parametrize(
     ("text", "problem"),
     [

@@ -121,12 +121,3 @@ def test_rows_that_nobody_could_label_show_nothing() -> None:
     unknown = [dataclasses.replace(one, cells=names) for one in (first, second)]
     assert verdict(first, second) == "comparable"
     assert verdict(*unknown) == "inconclusive"
-
-
-def test_a_cell_that_only_one_was_fed_is_an_infinite_ratio() -> None:
-    (check, *_) = [
-        c
-        for c in failing(feed(1), feed(2, logs=(0.702, 0.298, 0.0)))
-        if c.name == "share of logs/rare"
-    ]
-    assert check.value == float("inf")

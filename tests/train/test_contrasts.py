@@ -157,24 +157,3 @@ def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: P
     for text in (page, html):
         assert "Treatment: mixture; what differs: replay.logs_share." in text
         assert "The primary contrast was named before the runs" in text
-
-
-def test_an_interval_of_an_arm_stays_in_the_range_of_its_measure(tmp_path: Path) -> None:
-    plan = study(tmp_path, STUDY.replace("[0, 1, 2, 3]", "[0, 1, 2]"))
-    for job in plan.jobs:
-        level = (0.0, 0.1, 1.0)[job.seed]
-        opposite = 1.0 - level if job.arm.name == "quotas" else level
-        make_run(job.path, document(job.seed), success=level)
-        add_evaluation(job.path, driven("agent", opposite, 12.0))
-        job.done.write_text(plan.fingerprint(job))
-    one, other = plan.study.arms
-    found = findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
-    for row in found["arms"]:
-        assert row["success wheel_slip"][1:] == [0.0, 1.0]
-        assert row["bumps_per_km"][1] == 0.0
-        assert row["bumps_per_km"][2] > row["bumps_per_km"][0]
-    (row,) = [row for row in found["contrasts"] if row["measure"] == "success_rare"]
-    assert (row["low"], row["high"]) == (-1.0, 1.0)
-    for outcome in found["comparisons"][0]["outcomes"]:
-        if outcome["difference_low"] is not None:
-            assert -1 <= outcome["difference_low"] <= outcome["difference_high"] <= 1

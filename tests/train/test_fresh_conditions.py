@@ -51,25 +51,6 @@ def test_only_rows_of_unended_episodes_have_no_condition(live: Session) -> None:
     assert open_ones["episodes"] <= live.config.env.num_envs
 
 
-def test_a_condition_is_that_of_the_step_in_its_episode(live: Session) -> None:
-    slipped = rows(
-        live,
-        "SELECT condition, count(DISTINCT (episode, episode_step)) AS steps,"
-        " bool_and(action = 1) AS forward FROM audit WHERE source = 'fresh' GROUP BY condition",
-    )
-    by_name = {row["condition"]: row for row in slipped}
-    assert by_name["wheel_slip"]["steps"] > 20
-    assert by_name["wheel_slip"]["forward"]  # only a forward command can slip
-    kinds = rows(
-        live,
-        "SELECT DISTINCT audit.condition, list_contains(conditions, audit.condition) AS held"
-        " FROM audit JOIN episodes ON audit.episode = episodes.episode::VARCHAR"
-        " WHERE source = 'fresh' AND condition <> 'nominal'",
-    )
-    assert kinds
-    assert all(row["held"] for row in kinds)
-
-
 @pytest.mark.parametrize(
     ("table", "condition", "measure"),
     [
@@ -95,19 +76,6 @@ def test_every_table_counts_the_same_rows(
         " coalesce(condition, 'unlabelled') AS condition, count(*) AS n"
         " FROM audit WHERE source = 'fresh' GROUP BY ALL ORDER BY ALL",
     )
-
-
-def test_what_the_ring_held_is_by_condition_too(live: Session) -> None:
-    available = rows(
-        live,
-        "SELECT gradient_steps, sum(available_rows) AS available,"
-        " any_value(ring_rows) AS ring_rows,"
-        " sum(available_rows) FILTER (stratum = 'unlabelled') AS unknown"
-        " FROM strata JOIN progress USING (gradient_steps)"
-        " WHERE source = 'fresh' GROUP BY ALL ORDER BY ALL",
-    )
-    assert all(row["available"] == row["ring_rows"] for row in available)
-    assert all(row["unknown"] == 0 for row in available[:-3])  # their episodes have ended since
 
 
 def test_actions_are_counted_with_what_the_policy_wants(live: Session) -> None:

@@ -15,7 +15,6 @@ from support.paths import ROOT
 
 import restock
 from restock.cli import main
-from restock.errors import RunError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.store.manifest import definitions
@@ -311,17 +310,6 @@ def test_a_step_that_blew_up_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
         "SELECT step_index, terminated FROM transitions WHERE truncated OR terminated"
     )
     assert {"step_index": 9, "terminated": False} in rows.to_arrow_table().to_pylist()
-
-
-def test_episodes_under_way_when_keeping_begins_are_left_out(tmp_path: Path) -> None:
-    made = Collecting(tmp_path / "run")
-    made.drive(5)
-    made.keep()
-    made.drive(LONGEST - 5)
-    with pytest.raises(RunError, match="no finished episode"):
-        flush(made.folder, StoreWriter(tmp_path / "store"), made.profile)
-    made.drive(LONGEST)
-    assert flush(made.folder, StoreWriter(tmp_path / "store"), made.profile).episodes == ENVS
 
 
 @pytest.mark.slow

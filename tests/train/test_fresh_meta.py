@@ -102,17 +102,3 @@ def test_metadata_beside_a_buffer_equals_a_single_step_ring() -> None:
         np.testing.assert_array_equal(meta.condition(everywhere), ring.condition(everywhere))
         np.testing.assert_array_equal(meta.by_condition.counts, ring.by_condition.counts)
     assert len(meta) == len(ring) == 12
-
-
-def test_a_part_of_the_environments_may_step_alone() -> None:
-    meta = FreshMeta(6, 3, conditions=("nominal",), behaviour_policy="x")
-    meta.write(np.array([2]), np.array([1]), np.array([False]), env_step=0, gradient_step=0)
-    keys = meta.write(
-        np.array([0, 3]), np.array([0, 1]), np.array([False, True]), env_step=1, gradient_step=0
-    )
-    assert keys.tolist() == [0, 1]
-    assert meta.set_labels(1, np.array([0, 0])) == 2
-    assert meta.condition(np.array([0, 2, 3])).tolist() == [-1, 0, 0]
-    meta.forget()
-    assert len(meta) == 0
-    assert meta.by_condition.counts.tolist() == [0]

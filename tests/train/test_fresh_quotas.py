@@ -18,7 +18,6 @@ from support.toy_twin import CONDITIONS as TOY_CONDITIONS
 from support.toy_twin import TASK as TOY_TASK
 
 from restock.cli.data.mix import TRAINING
-from restock.cli.learning.train import describe_forecast
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import held
 from restock.replay.mixture.mixture import parse_mixture
@@ -195,23 +194,6 @@ def test_a_stratum_without_rows_is_named_before_and_after(tmp_path: Path) -> Non
     (row,) = [row for row in audited(live.run.path) if row["source"] == "batch"]
     assert row["stratum"] == "wheel_slip"
     assert row["drawn_share"] < 0.5 * row["wanted_share"]
-
-
-def test_what_a_run_will_be_short_of_is_said_before_it_begins() -> None:
-    row = {"stratum": "slip", "wanted_share": 0.3, "logs_share": 0.1, "fresh_share": 0.0}
-    fed = {
-        "forecast": [row | {"short_share": 0.2, "reason": "its 5 logged rows give 400 draws each"}],
-        "planned_draws": {"offline": 1000.0, "online": 9000.0, "end_env_steps": 2000},
-    }
-    first, warning = describe_forecast(fed, config())
-    assert first == (
-        "quotas of the 10,000 rows in 2,000 environment steps that the critic is fed:"
-        " slip 30.0% (10.0% logged, 0.0% fresh)"
-    )
-    assert warning.startswith(
-        "warning: slip will be short by 20.0% of the rows fed, of 30.0% wanted: its 5 logged rows"
-        " give 400 draws each; log more of it"
-    )
 
 
 # -- budgets in seconds -------------------------------------------------------------------------

@@ -135,8 +135,6 @@ def test_each_measure_that_is_asked_is_judged(run: Path, driven: Any) -> None:
     [
         (["--margins", "success=0"], "--margins success"),
         (["--margins", "success=1.5"], "--margins success"),
-        (["--margins", "success=much"], "--margins"),
-        (["--margins", "speed=1"], "--margins"),
         (["--margins", "stopped_s=1"], "--margins stopped_s"),
         (["--budget", "20"], "--budget"),
         (["--conditions", "nominal,fire"], "--conditions"),

@@ -77,33 +77,3 @@ def test_compiled_code_keeps_what_numpy_does(
             assert column.dtype == of_numpy.columns[name].dtype
             assert np.array_equal(column, of_numpy.columns[name]), name
             assert np.array_equal(of_compiled.last[name], of_numpy.last[name])
-
-
-@compiled
-def test_kept_rows_refuse_what_does_not_fit() -> None:
-    rng = np.random.default_rng(0)
-    ring = ring_of(rng)
-
-    def kept(**changed: Any) -> None:
-        keep_rows(
-            **{**batch(rng, 3, 4, weighted=True), **changed},
-            ring=ring,
-            logged=SampledRows(LOGGED),
-            fresh=SampledRows(FRESH),
-            by_native=True,
-        )
-
-    for slots in ([0, 1, 2, CAPACITY], [0, 1, 2, -1]):
-        with pytest.raises(IndexError, match=f"slot {slots[-1]} is not one of {CAPACITY}"):
-            kept(slots=np.array(slots))
-    with pytest.raises(IndexError, match="room for 2 values, not 3"):
-        kept(log_rows=np.arange(2))
-    with pytest.raises(TypeError, match="contiguous vector of 'l'"):
-        kept(log_rows=np.arange(3, dtype=np.float64))
-    with pytest.raises(ValueError, match="slots has another shape"):
-        kept(slots=np.zeros(20, np.int64))
-    short = batch(rng, 3, 4, weighted=True)["values"]
-    with pytest.raises(IndexError, match="room for 6 values, not 7"):
-        kept(values=BatchValues(short.td[:6], short.q, short.weight, short.tail))
-    with pytest.raises((TypeError, ValueError)):
-        kept(values=BatchValues(short.td, short.q, short.weight, short.tail[:, :2]))

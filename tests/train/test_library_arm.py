@@ -11,7 +11,6 @@ import pyarrow.compute as pc
 import pytest
 from support.long import one_in
 
-from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.evaluation.policies import load_agent
@@ -152,39 +151,3 @@ def test_arms_that_cannot_be_are_refused(tmp_path: Path, arm: str, said: str) ->
     )
     with pytest.raises(ConfigError, match=said):
         load_study(tmp_path / "s.toml")
-
-
-@pytest.mark.slow
-def test_a_study_of_methods_ends_in_one_comparison(tmp_path: Path, capsys) -> None:
-    pytest.importorskip("stable_baselines3")
-    settings = "\n".join((*SETTINGS, "record.tensorboard = false"))
-    (tmp_path / "s.toml").write_text(f"""
-treatment = "method"
-seeds = [0]
-[settings]
-{settings}
-[evaluation]
-episodes = 1
-[[arms]]
-name = "restock"
-[[arms]]
-name = "dqn"
-library = "sb3-dqn"
-[[arms]]
-name = "ppo"
-library = "sb3-ppo"
-arguments = {{ n_steps = 40, batch_size = 20, n_epochs = 2 }}
-""")
-    out = tmp_path / "out"
-    argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
-    assert main(argv) == 0
-    found = json.loads(capsys.readouterr().out)
-    dqn, ppo = found["comparisons"]
-    assert dqn["verdict"] == ppo["verdict"] == "comparable"
-    assert {row["condition"] for row in ppo["outcomes"]} >= {"nominal", "wheel_slip"}
-    page = (out / "study.md").read_text()
-    assert "Not held: replay (library.replay); the target rule (library.target)" in page
-    made = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*.parquet")}
-    main(argv)
-    assert "3 of 3 runs already exist" in capsys.readouterr().err
-    assert {path: path.stat().st_mtime_ns for path in made} == made

@@ -382,15 +382,6 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
     assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
 
 
-def test_the_margin_is_for_rows_of_the_named_policy() -> None:
-    shelf = logs()
-    operator = shelf.behaviour_policy.codes == shelf.behaviour_policy.names.index("operator")
-    terms = LogTerms.of(config(loss={"margin": 1.0}).loss, shelf, torch.device("cpu"))
-    expert = terms.expert_rows(np.arange(len(shelf)))
-    assert expert is not None
-    np.testing.assert_array_equal(expert.numpy(), operator)
-
-
 def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
     shelf = logs()
     nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # named so by a profile

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 from support.kept_run import QUICK, kept_network, kept_run
 from support.panels import panel_of
 from support.stores import recording_transitions, write_store
@@ -22,9 +21,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.train.dqn.algorithm import DQN
-from restock.train.dqn.config import LossConfig, NetworkConfig
-from restock.train.dqn.fitted_q import soft_greedy
+from restock.train.dqn.config import NetworkConfig
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy
 from restock.train.evaluation.ope_dataset import OpeSteps, load_ope_dataset, read_steps
 
@@ -166,17 +163,6 @@ def test_weights_use_logged_or_else_cloned_probabilities(
 
 def _known(steps: OpeSteps) -> OpeSteps:
     return replace(steps, probability=np.full(len(steps.rows), 0.3))
-
-
-def test_soft_greedy_puts_its_probability_on_the_best() -> None:
-    network = DQN(LossConfig()).make_network(NETWORK, 4, 3, torch.Generator().manual_seed(1))
-    observation = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
-    probability = soft_greedy(network, observation, 0.3)
-    np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-6)
-    np.testing.assert_allclose(probability.max(axis=1), 0.8, rtol=1e-6)
-    with torch.no_grad():
-        best = network(torch.from_numpy(observation)).argmax(dim=1).numpy()
-    np.testing.assert_array_equal(probability.argmax(axis=1), best)
 
 
 def test_the_verb_evaluates_and_says_why_it_refuses(

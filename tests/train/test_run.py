@@ -81,28 +81,6 @@ def test_no_flipped_bit_of_a_table_is_read_in_silence(
     assert all("policies.parquet" in said for said in refused)
 
 
-def test_a_long_table_waits_until_it_has_grown(tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "a", {})
-
-    def on_disk() -> int:
-        return pq.read_metadata(run.path / "policies.parquet").num_rows
-
-    def add(count: int) -> None:
-        run.append_columns("policies", {**policies(1, 0), "rows": np.zeros(count)})
-
-    add(5000)
-    run.flush(everything=False)
-    add(100)
-    run.flush(everything=False)
-    assert on_disk() == 5000
-    add(300)
-    run.flush(everything=False)
-    assert on_disk() == 5400
-    add(1)
-    run.flush()
-    assert on_disk() == 5401
-
-
 def test_reopening_truncates_to_the_checkpoint(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {})
     run.append("policies", [policies(1, 10)])

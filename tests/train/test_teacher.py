@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import torch
@@ -25,8 +23,6 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Mirror
 from restock.replay.mixture.mixture import Linear
 from restock.replay.sampling.ring import FreshRing
-from restock.report.run.card import as_markdown, replay_card
-from restock.report.run.facts import Facts
 from restock.state import restored, saved
 from restock.train.dqn.algorithm import td_target
 from restock.train.dqn.behaviour import (
@@ -46,7 +42,6 @@ from restock.train.feed.teacher import (
 )
 from restock.train.loop import train
 from restock.train.prepare import prepare_new, prepare_resumed
-from restock.train.prepare import train as train_new
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -409,28 +404,6 @@ def test_the_record_says_what_the_filter_did(taught: Any) -> None:
     assert near[-1] < near[0]
 
 
-def test_the_replay_card_names_the_teacher(taught: Any) -> None:
-    known: dict[str, Any] = {field.name: [] for field in dataclasses.fields(Facts)}
-    known |= {"run": taught.run.path, "config": {}, "panel": None, "policy": None}
-    untaught = replay_card(Facts(**known))
-    assert untaught["teacher"] is None
-    assert "none: every action may be chosen" in as_markdown(untaught)
-    known["config"] = {"config": msgspec.to_builtins(taught.config)}
-    known["teacher"] = taught.run.table("teacher").to_pylist()[-1:]
-    card = replay_card(Facts(**known))
-    assert "given; no logged rows to clone; an action is plausible" in as_markdown(card)
-    drawn = {"source": "logs", "behaviour_policy": "operator", "rows": 9, "share": 1.0}
-    known["policies"] = [drawn]
-    card = replay_card(Facts(**known))
-    assert card["teacher"]["source"] == "given"
-    page = as_markdown(card)
-    assert "given; logged rows of operator cloned; an action is plausible from 0.5 of" in page
-    assert "| fresh | nominal |" in page.split("## What the teacher's filter did at the end")[1]
-    known["config"]["config"]["teacher"]["mirror"] = True
-    mirrored = as_markdown(replay_card(Facts(**known)))
-    assert "rows of operator cloned, half of its rows mirrored; an action" in mirrored
-
-
 def test_a_kept_policy_comes_back_with_its_filter(taught: Any) -> None:
     weights = checkpoint.load(taught.run.best)["network"]
     policy = make_policy(taught.config, TASK.observation_size, len(TASK.actions))
@@ -472,16 +445,6 @@ def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:
     restored(teacher, before)
     assert drive(8) == first
     assert len({action for answers in first for action in answers}) > 1
-
-
-def test_what_cannot_teach_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    with pytest.raises(ConfigError, match="the teacher function returned nothing"):
-        train_new(out=out, teacher=lambda env, observation: None)
-    assert not out.exists()
-    with pytest.raises(ConfigError, match="this run has no logs"):
-        train_new(out=out, settings=["teacher.source=logs"])
-    assert not out.exists()
 
 
 def test_the_operator_teaches_where_there_is_a_goal(tmp_path: Path) -> None:

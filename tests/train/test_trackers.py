@@ -68,24 +68,6 @@ def follow(run: Run, name: str) -> Events:
     return events
 
 
-def test_a_sink_that_fails_is_counted_and_said_and_left_alone(tmp_path: Path) -> None:
-    broken, said = Broken(fails_after=2), list[str]()
-    events = Events(tmp_path, {"mlflow": lambda: broken}, said.append)
-    for step in range(10):
-        events.scalars(step, "train", {"loss": 1.0})
-    events.close()
-    assert broken.taken == [0, 1]
-    assert broken.requested == 2 + GIVE_UP_AFTER
-    assert tracked(tmp_path)["failures"] == {
-        "mlflow": {"failed": GIVE_UP_AFTER, "first": "ConnectionError: the server is gone"}
-    }
-    assert [line.split(":")[0] for line in said] == [
-        "mlflow failed, training goes on",
-        f"mlflow failed {GIVE_UP_AFTER} times in a row",
-        f"mlflow failed in {GIVE_UP_AFTER} calls; first",
-    ]
-
-
 def test_training_ends_as_ever_where_a_tracker_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,12 +21,10 @@ from support.paths import ROOT
 from support.stores import recording_transitions
 
 from restock.cli import main
-from restock.cli.learning.train import describe_run
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.train.dqn.config import TrainConfig
-from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
 from restock.train.run.run import RunLock
 
@@ -87,26 +85,6 @@ def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> N
     assert shares == {"offline": 1.0, "online": 0.5}
     audit = pq.read_table(trained / "audit.parquet").to_pylist()
     assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
-
-
-def test_a_run_says_what_fills_its_quotas(panel: Path, tmp_path: Path) -> None:
-    task = load_profile("warehouse_amr").task
-    text = "max_replays_per_row = 4\n[each_condition]\nshare = 'natural'\n"
-    rows = recording_transitions(1, episodes=40, task=task)
-    few = build_panel(rows, parse_mixture(text), tmp_path / "panel", task=task)
-    settings = [word for word in TINY if word != "--set"]
-    longer = [*settings, "schedule.env_steps=9000"]
-    said = describe_run(prepare_new(tmp_path / "a", few.path, None, longer))
-    draws = 30 * 32 + 8900 * 0.25 * 32
-    nominal = next(stratum for stratum in few.strata if stratum.name == "nominal")
-    share = len(few) * 4 / draws * nominal.natural_share
-    assert f"{draws:,.0f} rows in 9,000 environment steps that the critic is fed: nominal" in said
-    assert f"({share:.1%} logged" in said
-    untwinned = [*settings, "env.twin=false"]
-    alone = describe_run(prepare_new(tmp_path / "a", panel, None, untwinned))
-    assert "logged)" in alone
-    assert "fresh" not in alone
-    assert "in the twin" not in alone
 
 
 def test_quota_that_nothing_can_fill_is_named_first(

@@ -97,22 +97,6 @@ def test_a_run_in_blocks_is_the_run_one_by_one(tmp_path: Path) -> None:
     assert fed["audit"].select(audit).equals(expected["audit"].select(audit))
 
 
-def test_a_draw_that_depends_on_td_errors_waits_for_them(device: str, tmp_path: Path) -> None:
-    live = in_blocks(tmp_path / "run", device)
-    assert live.blocks is not None
-    live.batches._draws.needs_td = True  # type: ignore[union-attr]
-    order = []
-
-    def draw() -> Any:
-        order.append("drawn")
-        return live.batches.draw_offline()
-
-    for _ in live.blocks.make(5, draw, conservative=0.0, labelled=False):
-        order.append("learnt")
-    assert order == ["drawn", "learnt"] * 5
-    live.close()
-
-
 @pytest.mark.long
 def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path) -> None:
     whole = trained(in_blocks(tmp_path / "whole", device))

@@ -14,16 +14,14 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from support.kept_run import kept_run
 from support.paths import ROOT
-from support.profile_texts import WAREHOUSE
 
 from restock import cli
 from restock.errors import ConfigError, RecordingError, RunError, StoreError
-from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.replay.trace.moment import find_moment, seen_between
+from restock.replay.trace.moment import find_moment
 from restock.replay.trace.trace import Trace, TracePlaces, trace_row
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
@@ -107,25 +105,6 @@ def test_an_mcap_holds_the_recordings_own_messages_unchanged(event: Event, shown
             assert len(payloads) <= len(copied[topic]) <= len(payloads) + 3, topic
     # What was in force before it is there, from the start on.
     assert {"/map", "/tf_static", "/goal_pose", "/plan"} <= copied.keys()
-
-
-def test_scan_of_an_inverted_lidar_is_shown_from_above(event: Event) -> None:
-    hanging = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
-    at_ns = event.row["stamp_ns"]
-    with open_recording(RECORDING) as recording:
-        upright, turned = (
-            seen_between(recording, parse_profile(text, where="p"), at_ns - 10**9, at_ns).scans
-            for text in (WAREHOUSE, hanging)
-        )
-    assert len(upright) == len(turned) > 3
-    for one, other in zip(upright, turned, strict=True):
-        assert one is not None
-        assert other is not None
-        assert np.array_equal(one.ranges_m, other.ranges_m)
-        assert (other.angle_min_rad, other.angle_increment_rad) == (
-            -one.angle_min_rad,
-            -one.angle_increment_rad,
-        )
 
 
 def test_an_mcap_holds_what_the_store_has_of_each_step(event: Event, shown: Path) -> None:

@@ -164,13 +164,9 @@ def png_header(width: int, height: int) -> bytes:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"\x89PNG", "is not a PGM"),
         pytest.param(b"P5\n4 4\n255\nab", "truncated", marks=SAYS_TRUNCATED),
         (b"P5\n99999 99999\n255\n", "more than 40,000,000 pixels"),
         (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # by the header: no pixel follows
-        (png_header(7900, 7900), "7,900 x 7,900 pixels"),
-        (b"P5\nfour 4\n255\n", "cannot be read as an image"),
-        (b"P2\n2 1\n255\n1 x", "cannot be read as an image"),
         (b"P2\n2 1\n9\n1 10", "too large"),
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
     ],
@@ -187,16 +183,10 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
     [
         ("resolution: 0.05\norigin: [0, 0, 0]\n", "image"),
         ("image: a.pgm\nresolution: -1\norigin: [0, 0, 0]\n", "resolution"),
-        ("image: a.pgm\nresolution: .nan\norigin: [0, 0, 0]\n", "resolution"),
-        ("image: a.pgm\nresolution: 0.05\norigin: [0, 0]\n", "origin"),
-        ("image: a.pgm\nresolution: 0.05\norigin: [.nan, 0, 0]\n", "origin"),
         ("image: a.pgm\nresolution: 0.05\norigin: [1.0e+300, 0, 0]\n", "origin"),
         ("image: ../a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "outside its folder"),
-        ('image: "a\\0b"\nresolution: 0.05\norigin: [0, 0, 0]\n', "not a file name"),
-        ("image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nmode: odd\n", "mode"),
         ("image: gone.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "cannot be read"),
         ("image: [\n", "YAML"),
-        ("", "got `null`"),
     ],
 )
 def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, message: str) -> None:

@@ -61,9 +61,7 @@ def test_conditions_and_perturbations_apply_to_it() -> None:
     ("old", "new", "message"),
     [
         ('name="lidar"', 'name="laser"', "no site named lidar"),
-        ('<velocity name="left"', '<velocity name="l"', "no actuator named left"),
         ("<freejoint/>", "", "0 free joints, but must have one body, the base"),
-        ('pos="0 0.2 0"', 'pos="0.1 0.2 0"', "wheels are 0.05 m ahead of the base"),
         ('pos="0.1 0 0.2"', 'pos="0.2 0 0.2"', "site lidar is 0.20 m ahead"),
         ('<geom type="sphere" size="0.1" mass="1.5"', '<geom size=".1" contype="0" conaffinity="0" '
          'mass="1.5"', "wheel left wheel needs one geom with contacts"),
@@ -82,16 +80,11 @@ def test_what_a_model_lacks_is_said_by_name(old: str, new: str, message: str) ->
     ("text", "message"),
     [
         ('<mujoco><include file="/etc/passwd"/></mujoco>', "has a <include>"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "has a DOCTYPE"),
-        ("a robot", "is not XML"),
         ('<mujoco><asset><mesh file="a.stl"/></asset></mujoco>', "has a <mesh>"),
         ('<mujoco><worldbody><replicate count="1000000"/></worldbody></mujoco>', "<replicate>"),
-        ('<mujoco><extension><plugin plugin="x"/></extension></mujoco>', "has a <extension>"),
         ('<mujoco><option timestep="10"/></mujoco>', "option timestep='10', which must be from"),
-        ('<mujoco><option timestep="nan"/></mujoco>', "not a finite number"),
         ("<mujoco>" + "<body>" * 101 + "</body>" * 101 + "</mujoco>", "101 of <body>"),
         ("<robot/>", "is not MJCF: its root is <robot>"),
-        ("<mujoco>", "is not XML"),
         ("<mujoco>" + " " * MAX_BYTES + "</mujoco>", "is longer than"),
     ],
 )  # fmt: skip
