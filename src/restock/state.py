@@ -37,9 +37,8 @@ class Stateful:
         """Restore everything that `state_dict` saved; raise `mismatch` for another's state.
 
         Raises:
-            RunError: it is not a mapping, or lacks one of these names: another version saved it.
+            RunError: it lacks one of these names: another version saved it.
         """
-        self.expect_state(state, ())
         for name in self.SAME:
             if not _alike(saved(getattr(self, name)), state.get(_key(name))):
                 raise self.mismatch(_key(name), state.get(_key(name)))
@@ -53,13 +52,8 @@ class Stateful:
         self.restored()
 
     def expect_state(self, state: Mapping[str, Any], names: Sequence[str]) -> None:
-        """Raise RunError if a state is not a mapping or lacks one of these names."""
+        """Raise RunError if a state lacks one of these names."""
         own = type(self).__name__
-        if not isinstance(state, Mapping):
-            raise RunError(
-                f"a state of {own} is a dict, got {repr(state)[:80]}",
-                remedy="give what its state_dict() returned",
-            )
         if lacking := next((_key(name) for name in names if _key(name) not in state), None):
             raise RunError(
                 f"the saved state of {own} has no {lacking}: another version of Restock saved it",

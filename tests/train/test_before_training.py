@@ -416,18 +416,3 @@ def test_a_run_is_judged_with_its_rows(
     assert both.evidence[-1] == "rows: ACTIONS_MIRRORED: the logs' left is the twin's right"
     why = f"{of_run} by the run's own figures, {together} with the rows that were fed:"
     assert (why in both.evidence) is (of_run != together)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--before-training", "nowhere"], "there is no such panel or store"),
-        (["--before-training", "."], "is not a panel or a store"),
-        (["run", "--before-training", "."], "cannot be combined with a run"),
-    ],
-)
-def test_what_cannot_be_diagnosed_is_said(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["diagnose", *words]) == 2
-    assert said in " ".join(capsys.readouterr().err.split())

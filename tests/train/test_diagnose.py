@@ -273,6 +273,9 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
         ([str(tmp_path / "young")], "has no evaluation to diagnose"),
         ([str(tmp_path)], "is not a run directory"),
         ([], "needs a run"),
+        (["--before-training", "nowhere"], "there is no such panel or store"),
+        (["--before-training", "."], "is not a panel or a store"),
+        (["run", "--before-training", "."], "cannot be combined with a run"),
         (
             [str(tmp_path / "well"), "--confirm", str(tmp_path / "c")],
             "is HEALTHY: there is nothing to confirm",

@@ -54,10 +54,11 @@ def trained(live: Session) -> Session:
 
 WAYS: dict[str, dict[str, Any]] = {
     "default": {},
-    "conservative": {"loss": {"conservative": 0.5}},
-    "hard target": {"target": {"rule": "hard", "every": 13}},
-    "margin": {"loss": {"margin": 0.5, "margin_policies": ["operator"]}},
-    "clipped": {"optimizer": {"learning_rate": 3e-3, "max_grad_norm": 0.1}},
+    "every term": {
+        "loss": {"conservative": 0.5, "margin": 0.5, "margin_policies": ["operator"]},
+        "optimizer": {"learning_rate": 3e-3, "max_grad_norm": 0.1},
+        "target": {"rule": "hard", "every": 13},
+    },
     "teacher": {"teacher": {"source": "logs", "offline_updates": 20}},
 }
 

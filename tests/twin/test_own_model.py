@@ -80,6 +80,7 @@ def test_what_a_model_lacks_is_said_by_name(old: str, new: str, message: str) ->
     ("text", "message"),
     [
         ('<mujoco><include file="/etc/passwd"/></mujoco>', "has a <include>"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "has a DOCTYPE"),
         ('<mujoco><asset><mesh file="a.stl"/></asset></mujoco>', "has a <mesh>"),
         ('<mujoco><worldbody><replicate count="1000000"/></worldbody></mujoco>', "<replicate>"),
         ('<mujoco><option timestep="10"/></mujoco>', "option timestep='10', which must be from"),

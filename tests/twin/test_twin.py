@@ -320,7 +320,6 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be 1 or more"),
         ({"conditions": {"ice": 1.0}}, "ice"),
         ({"render_mode": "human"}, "unknown render_mode 'human'"),
         ({"perturbation": Perturbation(timestep_s=0.003)}, "does not divide"),

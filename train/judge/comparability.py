@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64, Ints
-from restock.errors import ArgumentError, RunError
+from restock.errors import RunError
 from restock.toml import by_path
 from restock.train.run.run import Run
 
@@ -332,9 +332,6 @@ class Arm:
     """Runs of one method. Raises RunError where they are not, or have not learnt anything."""
 
     def __init__(self, name: str, paths: Sequence[Path | str]) -> None:
-        if isinstance(paths, Path | str):  # a text is a sequence, too: of its letters
-            what = f"{name} must be a list of runs, got {str(paths)!r}"
-            raise ArgumentError(what, remedy=f"give [{str(paths)!r}]")
         self.name = name
         self.runs = [Run.open(path) for path in paths]
         for run in self.runs:
