@@ -23,7 +23,7 @@ from support.panels import panel_of
 from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
-from restock.errors import RunError, policy_words
+from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.store.store import Store
 from restock.report import build_report
