@@ -31,6 +31,7 @@ from restock.report.look.blocks import ask, statements
 from restock.report.run.facts import Facts, evaluation_bias, gather
 from restock.report.run.floor import floor_section
 from restock.report.run.headline import headline
+from restock.report.run.page import ways_section
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -503,3 +504,32 @@ def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
             build_report(place)
         assert refused.value.where == str(place)
         assert cli.main(["report", str(place)]) == 2
+
+
+def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_path: Path) -> None:
+    assert ways_section(gather(run)) is None
+    copy = shutil.copytree(run, tmp_path / "run")
+    file = copy / "eval" / "episodes.parquet"
+    drawn = pq.read_table(file).to_pylist()
+    driven = [  # before the others, and of two ways in all
+        {**row, "layouts": "hall.toml, ways of the logs", "success": row["policy"] == "agent"}
+        for row in drawn
+        if row["episode_seed"] < 2 and row["condition"] == "nominal"
+    ]
+    named = [{**row, "layouts": "hall.toml"} for row in drawn]
+    pq.write_table(pa.Table.from_pylist([*driven, *named], schema=EVAL_EPISODES), file)
+    facts = gather(copy)
+    section = ways_section(facts)
+    assert section is not None
+    assert "4 of 84 episodes" in section.intro
+    shown = {row["policy"]: row["success"] for row in section.tables[0].rows}
+    assert shown == {"agent": "100% [34%, 100%]", "planner": "0% [0%, 66%]"}
+    assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
+
+
+def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:
+    facts = gather(run)
+    facts.cells += [
+        {**row, "policy": "random", "success": 0.6} for row in facts.clean_cells("agent")
+    ]
+    assert headline(facts).startswith("Nothing was learned: no better than a random policy")

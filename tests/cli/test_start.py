@@ -12,6 +12,7 @@ import pytest
 from support.driven_robot import Drive, up_to_the_panel, write_bag
 
 from restock import cli
+from restock.cli.start import outcomes
 from restock.cli.start.stages import Stage
 from restock.cli.start.start import StartCommand, Way
 from restock.cli.start.work import Ended, Work
@@ -281,3 +282,18 @@ def test_a_person_chooses_among_command_topics(
     assert "/base/cmd_vel, /cmd_vel" in document["stopped"]["why"]
     _, document = start(capsys, *argv, "--accept")
     assert document["stages"][-1]["name"] == "mix"
+
+
+def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
+    """Of a stranger's Neato "fqe 4.18" stood beside "logged -1.05", as if it were a gain."""
+    few = "1 episode, and weights take at least 5"
+    rows = [
+        {"measure": "return", "condition": "all", "episodes": 1, "low": None, "high": None}
+        | {"estimator": name, "value": value, "refused": None if value else few}
+        for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None))
+    ]
+    reported, refused = outcomes.on_logs({"results": rows, "notes": []})
+    assert reported.startswith(
+        "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
+    )
+    assert refused.startswith(f"refused: {few}. So it is not known whether the policy is better")

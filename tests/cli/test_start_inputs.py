@@ -29,6 +29,7 @@ from restock.cli.start.decisions import (
     missions_unseen,
     possible_kinds,
     practice_settings,
+    updates_settings,
 )
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
@@ -259,3 +260,16 @@ def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(
     assert not any("blocked_aisle" in one for one in conditions)
     assert (missions_unseen(to, floor) is None) is lidar
     assert missions_unseen(to, {"episodes": ["nominal"]}) is None
+
+
+def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:
+    few = {"rows": 267, "max_replays_per_row": 400.0}
+    allowed = 267 * 400 / 128  # updates
+    settings = dict(one.split("=") for one in updates_settings(few, 1.0, twin=True, seconds=30.0))
+    assert int(settings["schedule.offline_updates"]) == int(allowed / 2)
+    assert int(settings["schedule.env_steps"]) == 15_000  # what 30 s drive, not the usual 200,000
+    many = {"rows": 12_000, "max_replays_per_row": 400.0}
+    assert updates_settings(many, 1.0, twin=True, seconds=30.0) == []
+    # On the logs alone nothing is driven, and all draws are for them.
+    (alone, _) = updates_settings(few, 9.0, twin=False)
+    assert alone == f"schedule.offline_updates={int(allowed)}"

@@ -368,3 +368,15 @@ def test_of_two_faults_the_experiment_answers_for_the_target(
     monkeypatch.setattr("restock.train.judge.diagnose.train", lambda session: None)
     answer = confirm(run, found, tmp_path / "c")
     assert (answer["cause"], answer["confirmed"]) == (cause, confirmed)
+
+
+@pytest.mark.parametrize("cause", ["BUFFER", "TARGET", "DIVERGENCE"])
+def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None:
+    run = make_run(tmp_path / "r")
+    config = run.document["config"]
+    changed = parse_config(apply_overrides(config, swapped(run, cause)), where="test")
+    sections = {"BUFFER": {"replay", "env"}, "TARGET": {"target"}, "DIVERGENCE": {"optimizer"}}
+    before, after = config, msgspec.to_builtins(changed)
+    changes = {key for key in before if before[key] != after[key]}
+    assert changes
+    assert changes <= sections[cause]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -306,3 +307,11 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
             true_value = getattr(true, item.name)
             assert item.value == pytest.approx(true_value, abs=within[item.name]), item
     assert found.held_out[-1].after_m < 0.25 * found.held_out[-1].before_m
+
+
+def test_the_command_prints_json(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2"]
+    assert cli.main([*line, "--segments", "8", "--json"]) == ExitCode.OK
+    said = json.loads(capsys.readouterr().out)
+    assert [item["name"] for item in said["fits"][0]["estimates"]] == ["gain"]
+    assert said["out"] is None

@@ -28,8 +28,8 @@ from restock.toml import Checked, read_toml, typed
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_files import read_floor
-from restock.train.twin.floors.occupancy_grid import OccupancyGrid, out_of_frame
-from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame
+from restock.train.twin.physics.episode import EpisodeSpec, describe_floor
 from restock.train.twin.survey.picture import (
     LONG_SIDE,
     MARGIN,
@@ -411,3 +411,19 @@ def test_recordings_in_other_frames_are_named_and_get_a_floor_of_their_own(
 
 class _Zones(Checked, frozen=True):
     zone: list[Zone]
+
+
+def test_a_robot_that_hardly_moved_starts_where_it_was_and_goes_where_it_could() -> None:
+    """Send missions into the room that it saw if its own places are too close together."""
+    cells = np.full((120, 80), 100, np.int8)
+    cells[2:-2, 2:-2] = 0
+    around = np.array([(3.65, 2.65), (3.75, 2.65), (3.75, 2.75)])  # in three squares
+    made = floor_of_grid(
+        OccupancyGrid(cells, 0.1), name="hall", where="a test", room_m=0.15, turn_m=0.2,
+        visited_m=around,
+    )  # fmt: skip
+    floor = made.floor
+    assert any("missions start there and also go to" in note for note in made.notes)
+    assert len(floor.goals_m) > 20
+    assert all(np.hypot(*(around - start).T).min() < 0.3 for start in floor.starts_m)
+    assert "nominal" in describe_floor(floor)["episodes"]
