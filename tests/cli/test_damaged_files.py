@@ -116,7 +116,7 @@ def check(
 
 @pytest.mark.parametrize(
     ("name", "turn"),
-    one_in(3 * len(DAMAGES) + 1, [(name, turn) for name in FILES for turn in range(len(DAMAGES))]),
+    one_in(6 * len(DAMAGES) + 1, [(name, turn) for name in FILES for turn in range(len(DAMAGES))]),
 )
 def test_a_damaged_run_is_said_by_every_verb(
     name: str, turn: int, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -9,7 +9,7 @@ import pytest
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import Leaf
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.needs import field_paths, near, wanted_fields
+from restock.ingest.steps.needs import field_paths, wanted_fields
 
 SCAN, PATH = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Path"
 
@@ -20,23 +20,6 @@ def topics(**types: str) -> dict[str, SimpleNamespace]:
 
 def topic(kind: str, skipped: str | None = None) -> SimpleNamespace:
     return SimpleNamespace(type=kind, expected=9, skipped=skipped)
-
-
-@pytest.mark.parametrize(
-    ("available", "said"),
-    [
-        (topics(scan=SCAN), ""),
-        (topics(plam=SCAN), "did you mean /plam?"),  # spelled nearly like it
-        (topics(scan=SCAN, planner_global=PATH), "did you mean /planner_global?"),
-        (topics(far=PATH, global_plan=PATH), "did you mean /global_plan?"),
-        (topics(plan=PATH), ""),
-    ],
-    ids=["another type", "spelling", "type", "two of the type", "it is there"],
-)
-def test_a_topic_is_suggested_by_its_type_or_its_spelling(
-    available: dict[str, SimpleNamespace], said: str
-) -> None:
-    assert near("/plan", available, PATH) == said
 
 
 def test_a_recording_that_does_not_fit_is_told_how_to_go_on() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -51,44 +50,6 @@ def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(
     assert "32m" not in text
     bare = text.replace("\x1b[1m", "").replace("\x1b[0m", "")
     assert max(map(len, bare.splitlines())) <= 72
-
-
-def test_a_narrow_terminal_cuts_no_word_that_it_has_room_for(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    monkeypatch.setenv("TERM", "xterm-256color")
-
-    def shown(columns: int, row: dict[str, Any]) -> str:
-        monkeypatch.setenv("COLUMNS", str(columns))
-        output.print_table([row])
-        text = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
-        assert max(map(len, text.splitlines())) <= columns
-        return text
-
-    shelf = {"condition": "near_collision", "rows": 6, "share": "1.7%", "episodes": 2}
-    shelf |= {"success": "", "zones": 1, "recordings": 1, "who drove": "unknown"}
-    assert "near_collision     6  1.7%" in shown(80, shelf)
-    drivers = {"why": "two drivers had a goal, and neither reached it", "other_episodes": 0}
-    drivers |= {"more_success_of_the_two": 0.25, "more_return_of_the_two": -0.5}
-    assert "two drivers" in shown(60, drivers)
-    topic = {"topic": "/map_pose_continuous", "expected": 1541, "skipped": 0, "clock": ""}
-    topic |= {"type": "geometry_msgs/msg/PoseWithCovarianceStamped", "reason": ""}
-    lines = shown(72, topic)
-    assert "/map_pose_continuous" in lines  # the longest word gives way, and is all there
-    assert "reason" in lines
-    assert topic["type"] in "".join(line[45:64].strip() for line in lines.splitlines()[2:])
-    numbers = {f"n{i}": 12_345 + i for i in range(8)}
-    text = shown(40, numbers)  # too many of them: folded, no digit lost
-    assert sum(character.isdigit() for character in text) == 8 * (5 + 1)
-
-
-def test_forced_colours_do_not_reach_a_pipe(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    output.print_table(ROWS)
-    assert "\x1b" not in capsys.readouterr().out
 
 
 def test_a_long_recording_shows_how_far_it_is(

@@ -43,15 +43,3 @@ def test_losses_are_reported_by_new_and_by_check(
     assert cli.main(["profile", "new", str(whole), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["losses"] == []
     assert cli.main(["profile", "check", str(file), str(whole)]) == 0
-
-
-def test_what_cannot_be_read_is_left_out_and_named(
-    tmp_path: Path, cut: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = write_bag(Drive(), tmp_path / "bags" / "whole")
-    assert cli.main(["profile", "new", str(tmp_path / "bags"), "--json"]) == 3
-    printed = capsys.readouterr()
-    said = json.loads(printed.out)
-    assert said["read"] == [str(whole)]
-    assert said["unreadable"] == [str(cut)]
-    assert f"left out of the proposal: {cut}" in printed.err

@@ -375,23 +375,6 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     assert '<section id="twin-gap">' not in page
 
 
-def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path: Path) -> None:
-    made = Run.create(tmp_path / "run", {"config": {}})
-    made.append("progress", [filled("progress", phase="online")])
-    made.append(
-        "strata",
-        [
-            # A stratum that only the first, small interval held.
-            filled("strata", gradient_steps=1, stratum="a", drawn_rows=50, effective_share=0.5),
-            filled("strata", gradient_steps=1, stratum="b", drawn_rows=50, effective_share=0.5),
-            filled("strata", gradient_steps=2, stratum="a", drawn_rows=900, effective_share=1.0),
-        ],
-    )
-    made.flush()
-    fed = {row["stratum"]: row["effective_share"] for row in gather(made.path).sampled}
-    assert fed == pytest.approx({"a": 0.95, "b": 0.05})
-
-
 def test_the_evaluation_bias_is_named(run: Path) -> None:
     facts = gather(run)
     facts.logged = [

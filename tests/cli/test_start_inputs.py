@@ -169,6 +169,7 @@ def test_what_is_no_recording_is_refused_and_nothing_is_written(
         assert not Path("out").exists()
 
 
+@pytest.mark.long
 def test_unread_recordings_are_sorted_by_kind_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -51,6 +51,7 @@ def test_a_full_disk_behind_stdout_is_said_when_all_is_ingested(bags: Path, tmp_
     assert recordings(tmp_path / "store") == 3
 
 
+@pytest.mark.long
 def test_what_an_encoding_lacks_is_substituted(bags: Path, tmp_path: Path) -> None:
     store = str(tmp_path / "store")
     latin = os.environ | {"PYTHONIOENCODING": "ascii"}

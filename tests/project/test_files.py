@@ -6,10 +6,9 @@ import os
 import threading
 from pathlib import Path
 
-import pyarrow as pa
 import pytest
 
-from restock.files import write_bytes, write_table, write_text
+from restock.files import write_bytes, write_text
 
 
 def test_a_file_is_replaced_and_its_folder_made(tmp_path: Path) -> None:
@@ -27,17 +26,6 @@ def test_an_exclusive_file_is_never_replaced(tmp_path: Path) -> None:
         write_bytes(path, b"second", exclusive=True)
     assert path.read_bytes() == b"first"
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_folder_is_named_as_it_was_given(tmp_path: Path) -> None:
-    """And not the file beside it that would have replaced it."""
-    for write in (lambda: write_text(tmp_path, "a"), lambda: write_table(pa.table({}), tmp_path)):
-        with pytest.raises(IsADirectoryError) as error:
-            write()
-        assert error.value.filename == str(tmp_path)
-        assert error.value.filename2 is None
-    with pytest.raises(FileExistsError):
-        write_text(tmp_path, "a", exclusive=True)
 
 
 def test_a_pipe_is_written_into_and_not_replaced(tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from restock.train.dqn.config import (
     TrainConfig,
 )
 from restock.train.study.study import Study
-from restock.train.twin.physics.perturbation import Schedule
 
 plain = st.recursive(
     st.booleans()
@@ -35,18 +34,6 @@ plain = st.recursive(
     ),
     max_leaves=8,
 )
-
-
-def test_a_value_refused_in_python_is_an_error_of_restock() -> None:
-    for make, says in (
-        (lambda: TrainConfig(seed=-1), r"seed must be in \[0, 2147483647\], got -1"),
-        (lambda: TrainConfig(seed="1"), "seed must be a number, got '1'"),  # type: ignore[arg-type]
-        (lambda: Mixture(), "no strata"),
-        (lambda: Schedule({"nothing": (0, 1)}), "unknown range 'nothing'"),
-    ):
-        with pytest.raises(ConfigError, match=says) as refused:
-            make()
-        assert isinstance(refused.value, ValueError)
 
 
 @given(plain)

@@ -42,6 +42,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     return zipfile.ZipFile(built)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("room", ["ingest", "replay", "train"])
 def test_every_file_of_a_room_is_in_the_wheel(wheel: zipfile.ZipFile, room: str) -> None:
     files = [p for p in (ROOT / room).rglob("*") if p.suffix in SHIPPED and p.is_file()]
@@ -50,6 +51,7 @@ def test_every_file_of_a_room_is_in_the_wheel(wheel: zipfile.ZipFile, room: str)
     assert not missing
 
 
+@pytest.mark.long
 def test_every_file_of_the_front_door_is_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     front = ROOT / "src"
     links = {front / "restock" / room for room in ("ingest", "replay", "train")}
@@ -62,6 +64,7 @@ def test_every_file_of_the_front_door_is_in_the_wheel(wheel: zipfile.ZipFile) ->
     assert not missing
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     platform.machine() != "x86_64" or not shutil.which("cc"), reason="nothing to compile it with"
 )
@@ -81,6 +84,7 @@ def test_every_file_that_is_compiled_is_declared() -> None:
     assert built["optional"]
 
 
+@pytest.mark.long
 def test_the_wheel_takes_one_top_level_name(wheel: zipfile.ZipFile) -> None:
     top = {name.split("/")[0] for name in wheel.namelist()}
     assert {name for name in top if not name.endswith(".dist-info")} == {"restock"}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from support.paths import ROOT
-from support.toy_run import config, logs, session
 
 from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError
@@ -63,38 +61,6 @@ def test_successes_are_whole_episodes_without_the_teacher() -> None:
     assert {episode.name(row) for row in np.flatnonzero(everyone)} == {"planner's own"}
     assert not (found & rows_of_policies(policy, ["operator"])).any()
     assert not rows_of_policies(policy, ["nobody", "unknown"]).any()
-
-
-def test_rows_of_no_known_episode_are_nobodys_success() -> None:
-    policy = coded(["planner"] * 2)
-    found = rows_of_successes(policy, coded([None, None]), np.ones(2, np.float32), np.zeros(2), [])
-    assert not found.any()
-
-
-def test_queried_teacher_learns_online_from_its_rows_alone(
-    tmp_path: Path,
-) -> None:
-    """Every other episode is the planner's own way to the end of the corridor."""
-    shelf = logs()
-    half = len(shelf) // 2
-    names = ["planner"] * half + ["operator"] * half
-    shelf = replace(
-        shelf,
-        behaviour_policy=coded(names),
-        episode=coded(["alone"] * half + ["operators"] * half),
-    )
-    for source, online in (("logs", len(shelf)), ("operator", half)):
-        teacher = {"source": source, "successes": True}
-        live = session(
-            tmp_path / source,
-            config(teacher=teacher, schedule={"env_steps": 4}),
-            logs=shelf,
-            teacher=lambda env, observation: np.zeros(len(observation), np.int64),
-        )
-        assert live.imitation is not None
-        assert len(live.imitation._offline.rows) == len(shelf)
-        assert len(live.imitation.cloned) == online
-        live.close()
 
 
 @pytest.fixture(scope="module")

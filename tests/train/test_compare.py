@@ -97,14 +97,6 @@ def test_replay_and_practice_may_differ_together_where_the_data_are_the_treatmen
     assert compared(capsys, first, third, "--treatment", "data")[0] == 1
 
 
-def test_online_only_is_a_mixture_without_logs(tmp_path, capsys) -> None:
-    first = arm(tmp_path, "a", range(1))
-    second = [str(make_run(tmp_path / "b", document(1, panel=None)))]
-    code, found = compared(capsys, first, second, "--treatment", "mixture")
-    assert code == 0
-    assert [d["setting"] for d in found["differences"]] == ["panel.id"]
-
-
 def test_a_run_of_half_the_updates_is_refused(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(1))
     second = [str(make_run(tmp_path / "b", document(1), updates=UPDATES // 2))]
@@ -152,19 +144,6 @@ def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, epis
         assert row["difference"] == -1.0
         assert (row["difference_low"], row["difference_high"]) == (None, None)
         assert row["no_interval"] == why
-
-
-def test_what_the_treatment_allows_to_differ_decides_nothing(tmp_path, capsys) -> None:
-    first = arm(tmp_path, "a", range(1), fresh_episodes=400)
-    second = arm(tmp_path, "b", range(1, 2), slip_share=0.15, fresh_episodes=400)
-    code, found = compared(capsys, first, second, "--treatment", "mixture")
-    decides = {check["name"]: check["decides"] for check in found["checks"]}
-    assert code == 0
-    assert (decides["updates"], decides["mix"]) == (True, False)
-    assert main(["compare", *first, *second, "--treatment", "mixture"]) == 0
-    shown = capsys.readouterr()
-    assert "differs: allowed" in shown.out
-    assert "COMPARABLE" in shown.err
 
 
 def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:

@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import msgspec
 import pytest
 
-from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import Hard, Polyak, TrainConfig, load_config, parse_config
@@ -22,10 +20,6 @@ def test_the_config_refuses_unknown_keys_with_their_path() -> None:
         parse_config({"target": {"rule": "polyak", "taw": 1}}, where="x.toml")
     with pytest.raises(ConfigError, match=r"logs_share must be in \[0, 1\], got 2"):
         parse_config({"replay": {"logs_share": 2.0}}, where="x.toml")
-
-
-def test_the_target_rule_is_written_with_its_name() -> None:
-    assert msgspec.to_builtins(TrainConfig())["target"] == {"rule": "polyak", "tau": 0.005}
 
 
 @pytest.mark.parametrize(
@@ -84,22 +78,6 @@ def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> 
     file.write_text('[target]\nrule = "hard"\n')
     with pytest.raises(ConfigError, match=r"a\.toml and --set: `target\.tau` is a setting of"):
         load_config(file, ["target.tau=0.1"])
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--seconds", "-1"], "--seconds: schedule.seconds must be above 0, got -1"),
-        (["--seed", "-1"], "--seed: seed must be in [0, 2147483647], got -1"),
-        (["--env-steps", "-1"], "--env-steps: schedule.env_steps must be at least 0, got -1"),
-        (["--set", "seed=-1"], "--set: seed must be in [0, 2147483647], got -1"),
-    ],
-)
-def test_the_option_that_is_wrong_is_named_as_it_was_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
-    assert main(["train", "--out", str(tmp_path / "run"), *words]) == 2
-    assert capsys.readouterr().err.startswith(f"restock: {said}")
 
 
 @pytest.mark.parametrize(

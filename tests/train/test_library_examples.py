@@ -15,7 +15,6 @@ from support.stores import recording_transitions, write_store
 
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
-from restock.train.dqn.config import load_config
 from restock.train.libraries.library_arm import dqn_arguments, resolve
 from restock.train.twin.env.interface import AFTER_LOGS
 
@@ -89,28 +88,6 @@ def test_stable_baselines3_has_the_settings_of_the_default_recipe(
     else:
         assert given["n_steps"] == config.loss.n_step
     assert {key: given[key] for key in expected} == expected
-
-
-def test_the_single_file_dqn_has_the_settings_of_the_default_recipe() -> None:
-    own = inspect.signature(example("cleanrl_dqn").main).parameters
-    config = load_config(None)
-    expected = {
-        "steps": config.schedule.env_steps,
-        "num_envs": config.env.num_envs,
-        "learning_rate": config.optimizer.learning_rate,
-        "buffer_size": config.replay.ring_rows,
-        "gamma": config.loss.discount,
-        "tau": config.target.tau,
-        "batch_size": config.replay.batch_size,
-        "start_e": 1.0,
-        "end_e": config.epsilon.end,
-        "exploration_steps": config.epsilon.steps,
-        "learning_starts": config.schedule.warmup_env_steps,
-        "updates_per_env_step": config.schedule.updates_per_env_step,
-        "huber_delta": config.loss.huber_delta,
-        "seed": config.seed,
-    }
-    assert {name: parameter.default for name, parameter in own.items()} == expected
 
 
 @pytest.mark.long

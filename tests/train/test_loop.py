@@ -370,7 +370,7 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
         live = session(
             tmp_path / str(weight),
             config(
-                loss={"conservative": weight}, schedule={"offline_updates": 600, "env_steps": 0}
+                loss={"conservative": weight}, schedule={"offline_updates": 250, "env_steps": 0}
             ),
             logs=shelf,
         )

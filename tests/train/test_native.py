@@ -174,24 +174,6 @@ main(["--version"])
 
 
 @compiled
-def test_learning_at_twice_the_batch_is_what_pytorch_makes_of_it() -> None:
-    """Memory grows with the batch, and a smaller one after it uses its beginning."""
-    held = network((48, 48), layer_norm=True)
-    theirs = clone(held).requires_grad_()
-    ours = made_native(held)
-    for rows in (8, 64, 16):
-        given, gradient = normal(rows, OBSERVATION, seed=rows), normal(rows, ACTIONS, seed=1)
-        for each in (held, theirs):
-            each.zero_grad(set_to_none=False)
-        found, expected = ours(given), theirs(given)
-        torch.testing.assert_close(found, expected)
-        found.backward(gradient)
-        expected.backward(gradient)
-        for one, other in zip(held.parameters(), theirs.parameters(), strict=True):
-            torch.testing.assert_close(one.grad, other.grad, rtol=1e-4, atol=1e-4)
-
-
-@compiled
 def test_passes_that_another_one_followed_are_differentiated() -> None:
     """As autograd does: gradients of two passes are added, in any order."""
     held = network((16, 16), layer_norm=True)

@@ -132,23 +132,6 @@ def test_people_and_forklifts_stand_on_the_floor() -> None:
     assert simulation.bumped[there[0]]
 
 
-@pytest.mark.parametrize("layouts", ["default", "generated:3,generated:4"])
-def test_a_lidar_on_a_mast_sees_racks_and_walls(
-    layouts: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    low, high = (
-        WarehouseVectorEnv(
-            8, robot=Robot(lidar=LidarLimits(z_m=z_m)), layouts=layouts, conditions={"nominal": 1.0}
-        )
-        for z_m in (0.3, 1.9)
-    )
-    low.reset(seed=5)
-    high.reset(seed=5)
-    for ranges in both(high, monkeypatch):
-        assert np.isfinite(ranges).all()
-        np.testing.assert_allclose(ranges, low.simulation.cast(np.arange(8)))
-
-
 @pytest.mark.parametrize(
     "lidar", [LidarLimits(angle_min_rad=-1.6, angle_max_rad=1.6), LidarLimits(z_m=1.0)]
 )

@@ -136,27 +136,6 @@ def test_a_bag_carries_its_definitions_and_no_library_version(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("file_format", ["mcap", "rosbag2"])
-def test_the_same_messages_give_the_same_bytes_elsewhere(
-    tmp_path: Path, file_format: Format
-) -> None:
-    for folder in ("here", "a/longer way/there"):
-        _write(tmp_path / folder / "log", file_format)
-    first, second = (
-        {
-            p.name: p.read_bytes()
-            for p in sorted(
-                (tmp_path / f / "log").rglob("*")
-                if file_format == "rosbag2"
-                else [tmp_path / f / "log"]
-            )
-        }
-        for f in ("here", "a/longer way/there")
-    )
-    assert first == second
-    assert len(first) == (2 if file_format == "rosbag2" else 1)
-
-
-@pytest.mark.parametrize("file_format", ["mcap", "rosbag2"])
 def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, file_format: Format) -> None:
     def interrupted() -> None:
         with recording_sink(tmp_path / "log", file_format, TOPICS) as sink:

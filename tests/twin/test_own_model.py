@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 from support.paths import ROOT
-from twin.test_robot import AMR, amr_with, driven
+from twin.test_robot import AMR, driven
 
-from restock.cli.twin.robot import RobotCommand
 from restock.errors import ConfigError
 from restock.ingest.profile.description import MAX_BYTES, mjcf_problem
 from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
@@ -112,19 +111,6 @@ def test_it_travels_in_the_profile_without_its_file(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(text.replace("my_robot", "../my_robot"))
     with pytest.raises(ConfigError, match="is outside the profile's folder"):
         load_profile(tmp_path / "mine.toml")
-
-
-def test_the_verb_says_what_is_built_and_driven(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "my_robot.xml").write_text(MODEL)
-    profile = profile_toml(amr_with("")).replace("lidar_x_m = 0.0", "lidar_x_m = 0.1")
-    (tmp_path / "mine.toml").write_text(profile + '\n[robot]\nmjcf = "my_robot.xml"\n')
-    assert RobotCommand(str(tmp_path / "mine.toml"), json=True).run() == 0
-    printed = msgspec.json.decode(capsys.readouterr().out)
-    assert printed["robot"]["mass_kg"] == pytest.approx(24.0)
-    fast = next(row for row in printed["driven"] if row["speed_mps"] == 1.0)
-    assert fast["driven_mps"] == pytest.approx(1.0, abs=0.03)
 
 
 def test_a_warning_of_mujoco_writes_no_log_file(

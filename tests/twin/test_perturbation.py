@@ -110,19 +110,6 @@ def test_a_bias_moves_its_signal_and_no_other(
         assert other == signal or biased[other] == plain[other]
 
 
-def test_stale_sensors_go_on_bit_for_bit_from_a_saved_state() -> None:
-    slow = Perturbation(lidar_period_s=0.6, localisation_period_s=0.6)
-    env, other = (WarehouseVectorEnv(2, perturbation=slow, seed=3) for _ in range(2))
-    env.reset(seed=3)
-    env.step(np.array([1, 1]))
-    other.reset(seed=9)
-    other.load_state_dict(env.state_dict())
-    for _ in range(3):
-        np.testing.assert_array_equal(
-            env.step(np.array([1, 2]))[0], other.step(np.array([1, 2]))[0]
-        )
-
-
 def test_info_says_what_is_in_force_in_each_environment() -> None:
     env = WarehouseVectorEnv(2, perturbation=Schedule(ranges={"payload_kg": (10, 60)}))
     env.reset(seed=1)

@@ -25,7 +25,6 @@ from restock.train.twin.recording.robot_topics import (
     Scene,
     mission_markers,
     perturbation_text,
-    traffic_markers,
 )
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
@@ -34,10 +33,6 @@ LATCHED = {"/tf_static", "/map", "/behaviour_policy", "/amcl_pose", PERTURBATION
 
 def _markers(data: bytes) -> list[Any]:
     return list(typestore().deserialize_cdr(data, MARKER_ARRAY).markers)
-
-
-def _shown(data: bytes) -> list[tuple[str, int]]:
-    return [(marker.ns, marker.id) for marker in _markers(data)[1:]]
 
 
 def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> None:
@@ -65,31 +60,6 @@ def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> No
     assert (patch.scale.x, patch.scale.y) == (1.0, 0.5)
     assert {m.header.frame_id for m in (goal, pallet, patch)} == {"map"}
     assert all(m.header.stamp.nanosec == 5 for m in decoded)
-
-
-def test_traffic_is_the_whole_scene_in_every_message() -> None:
-    away = [*PARKED_M[:2], 0.0]
-    places = np.array(
-        [
-            [away, away, away],
-            [[1.0, 2.0, 0.5], away, away],
-            [[1.5, 2.0, 0.5], away, [3.0, 4.0, 1.0]],
-            [away, away, away],
-        ]
-    )
-    decoded = traffic_markers(np.arange(4) * 10**9, places)
-    assert [_shown(data) for data in decoded] == [
-        [],
-        [("person", 0)],
-        [("person", 0), ("forklift", 2)],
-        [],
-    ]
-    assert {_markers(data)[0].action for data in decoded} == {3}
-    person, forklift = _markers(decoded[2])[1:]
-    assert (person.pose.position.x, person.header.stamp.sec) == (1.5, 2)
-    assert 2 * np.arctan2(
-        forklift.pose.orientation.z, forklift.pose.orientation.w
-    ) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("file_format", "name"), one_in(2, [("mcap", "a.mcap"), ("rosbag2", "a")]))

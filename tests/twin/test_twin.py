@@ -332,16 +332,6 @@ def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -
         WarehouseVectorEnv(**arguments)
 
 
-def test_perturbations_and_floors_may_be_given_by_name() -> None:
-    made = gymnasium.make(
-        "restock/Warehouse-v0", perturbation="friction", layouts=["generated:3"], seed=None
-    )
-    _, info = made.reset(seed=1)
-    assert (info["perturbation"], info["layout"]) == ("friction", "generated:3")
-    heavy = WarehouseVectorEnv(1, perturbation={"payload_kg": 40.0})
-    assert heavy.perturbation == Perturbation(payload_kg=40.0)
-
-
 def test_the_map_is_drawn_with_its_robot() -> None:
     made = WarehouseVectorEnv(1, render_mode="rgb_array")
     made.reset(seed=1)
