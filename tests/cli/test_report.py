@@ -229,7 +229,7 @@ def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
     assert json.loads((run / "replay_card.json").read_text()) == card
 
 
-def test_the_replay_card_is_one_page_of_markdown_that_trusts_no_name(run: Path, capsys) -> None:
+def test_the_replay_card_is_a_page_that_trusts_no_name(run: Path, capsys) -> None:
     assert cli.main(["report", str(run), "--card"]) == 0
     page = capsys.readouterr().out
     assert (run / "replay_card.md").read_text() == page
@@ -326,7 +326,7 @@ def rows_of(html: str, section: str) -> list[list[str]]:
     return [re.findall(cell, line, re.DOTALL) for line in lines]
 
 
-def test_an_action_that_is_wanted_and_not_in_the_logs_is_on_the_page(html: str) -> None:
+def test_an_action_that_the_logs_lack_is_on_the_page(html: str) -> None:
     table = [row for row in rows_of(html, "actions") if row]
     assert {(row[0], row[2], row[3], row[4]) for row in table if "alert" in row[1]} == {
         ("nominal", "30%", "0.0%", "70%"),
@@ -338,7 +338,7 @@ def test_an_action_that_is_wanted_and_not_in_the_logs_is_on_the_page(html: str) 
     assert ">0<" in part  # … is not never
 
 
-def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) -> None:
+def test_estimates_from_logs_are_on_the_page(html: str) -> None:
     part = html.split('<section id="learning">')[1].split("</section>")[0]
     assert "Off-policy evaluation on held-out logs" in part
     assert "0.50 [0.50, 0.50]" in part
@@ -436,7 +436,7 @@ def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
 
 
-def test_the_verb_prints_where_the_page_is_and_writes_its_figures(
+def test_the_verb_writes_the_page_and_its_figures(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, folder = tmp_path / "deep" / "page.html", tmp_path / "deep" / "figures"
@@ -452,7 +452,7 @@ def test_the_verb_prints_where_the_page_is_and_writes_its_figures(
     ElementTree.parse(folder / "map-where-the-logs-have-been.svg")
 
 
-def test_no_file_of_a_command_is_written_into_a_store_nor_into_another_run(
+def test_no_command_writes_into_a_store_or_another_run(
     run: Path, store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = tmp_path / "run"

@@ -116,7 +116,7 @@ def test_a_damaged_manifest_is_found_in_an_unreadable_store(store: Path) -> None
     assert [Path(one.file).name for one in verify_store(store).damaged] == [file.name]
 
 
-def test_a_file_is_read_once_while_its_size_and_time_are_the_same(store: Path) -> None:
+def test_an_unchanged_file_is_verified_once(store: Path) -> None:
     file = rows_file(store)
     with Store(store) as opened:
         assert opened.unverified() == 2

@@ -227,7 +227,7 @@ def test_there_are_no_cycles() -> None:
     TopologicalSorter({folder: allowed(folder) for folder in MAY_IMPORT}).prepare()
 
 
-def test_imports_run_from_the_command_line_to_train_to_replay_to_ingest() -> None:
+def test_imports_run_from_later_rooms_to_earlier_ones() -> None:
     for folder in MAY_IMPORT:
         for other in allowed(folder):
             assert ROOMS.index(other.split("/")[0]) <= ROOMS.index(folder.split("/")[0])

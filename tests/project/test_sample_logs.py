@@ -60,7 +60,7 @@ def test_mcap_finds_its_chunks_whole() -> None:
         assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
 
 
-def test_another_decoder_reads_every_topic_by_the_definitions_in_the_file() -> None:
+def test_another_decoder_reads_every_topic() -> None:
     with (SAMPLES / "amr_monday.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         seen = {

@@ -102,7 +102,7 @@ def test_paired_t_against_a_published_value() -> None:
 @pytest.mark.parametrize(
     "ahead", [[0.3], [0.3, 0.3], [-0.1, 0.7], [0.0, 0.0, 0.0], [0.1 + 0.2, 0.3, 0.6 - 0.3]]
 )
-def test_two_pairs_or_equal_ones_have_neither_an_interval_nor_a_p(ahead: list[float]) -> None:
+def test_two_pairs_or_equal_ones_have_no_interval(ahead: list[float]) -> None:
     """Two seeds that came to the same difference were significant, with p < .001."""
     found, p = paired_t(np.array(ahead))
     assert found.value == pytest.approx(np.mean(ahead))
@@ -116,7 +116,7 @@ def test_an_interval_is_cut_at_the_range_of_its_quantity() -> None:
     assert np.isnan([unknown.low, unknown.high]).all()
 
 
-def test_over_five_seeds_t_covers_what_it_says_and_a_bootstrap_does_not() -> None:
+def test_over_five_seeds_t_covers_and_a_bootstrap_does_not() -> None:
     rng = np.random.default_rng(0)
     t_hits = bootstrap_hits = 0
     for _ in range(500):
@@ -130,9 +130,7 @@ def test_over_five_seeds_t_covers_what_it_says_and_a_bootstrap_does_not() -> Non
 
 
 @pytest.mark.parametrize(("runs", "episodes"), [(3, 40), (5, 60)])
-def test_a_difference_of_arms_covers_other_seeds_and_other_episodes(
-    runs: int, episodes: int
-) -> None:
+def test_a_difference_of_arms_covers_seeds_and_episodes(runs: int, episodes: int) -> None:
     rng = np.random.default_rng(1)
     hits = 0
     for _ in range(600):

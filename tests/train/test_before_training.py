@@ -187,7 +187,7 @@ def _named(found: RowDiagnosis) -> list[str]:
 
 
 @pytest.mark.parametrize(("high", "named"), [(-0.9, "MIRRORED"), (0.5, "MIXED")])
-def test_only_what_surely_has_the_opposite_sign_is_called_mirrored(high: float, named: str) -> None:
+def test_only_a_sure_opposite_sign_is_called_mirrored(high: float, named: str) -> None:
     answers = []
     for relation in RELATIONS:
         off = relation.x == ACTION_TURN
@@ -337,7 +337,7 @@ def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixt
     assert {row["status"] for row in document["comparisons"]} >= {"off", "not run"}
 
 
-def test_labels_and_ends_are_computed_again_from_the_stored_signals(tmp_path: Path) -> None:
+def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None:
     logs, store = ROOT / "sample_logs/amr_tuesday", StoreWriter(tmp_path / "store")
     ingest(logs, load_profile("warehouse_amr"), store=store)
     as_stored = open_rows(tmp_path / "store")

@@ -56,7 +56,7 @@ def failing(first: Feed, second: Feed) -> list[Check]:
     return [check for check in checks if check.verdict == "incomparable"]
 
 
-def test_feeds_of_one_process_with_enough_episodes_are_comparable() -> None:
+def test_feeds_of_one_process_are_comparable() -> None:
     assert verdict(feed(1, runs=5), feed(2, runs=5)) == "comparable"
 
 
@@ -65,7 +65,7 @@ def test_a_feed_against_itself_is_never_incomparable() -> None:
     assert verdict(few, few) != "incomparable"
 
 
-def test_few_episodes_of_one_process_are_inconclusive_not_different() -> None:
+def test_few_episodes_of_one_process_are_inconclusive() -> None:
     # Many rows of few episodes: a test that counts rows would call nearly all of these different.
     verdicts = [
         verdict(feed(seed, fresh_episodes=150), feed(seed + 100, fresh_episodes=150))
@@ -75,7 +75,7 @@ def test_few_episodes_of_one_process_are_inconclusive_not_different() -> None:
     assert "comparable" not in verdicts
 
 
-def test_the_rarest_stratum_halved_is_found_although_the_distance_is_tiny() -> None:
+def test_the_rarest_stratum_halved_is_found() -> None:
     found = failing(feed(1, runs=5), feed(2, logs=(0.7, 0.299, 0.001), runs=5))
     (raw,) = found
     assert raw.name == "share of logs/rare"
@@ -89,7 +89,7 @@ def test_another_mix_of_conditions_in_the_twin_is_found() -> None:
     assert "share of fresh/wheel_slip" in {check.name for check in found}
 
 
-def test_weights_that_undo_a_boost_are_found_where_the_draws_agree() -> None:
+def test_weights_that_undo_a_boost_are_found() -> None:
     found = failing(feed(1, runs=5), feed(2, runs=5, weight=(1, 0.2, 1, 1, 1)))
     assert {check.name for check in found} >= {"mix after weights"}
     assert not [check for check in found if "after weights" not in check.name]

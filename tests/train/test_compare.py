@@ -83,9 +83,7 @@ def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) ->
     assert (code, found["verdict"]) == (0, "comparable")
 
 
-def test_replay_and_practice_may_differ_together_where_the_data_are_the_treatment(
-    tmp_path, capsys
-) -> None:
+def test_replay_and_practice_may_differ_as_data(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(1))
     second = arm(tmp_path, "b", range(1), slip_share=0.15, config__practice__rule="even")
     for treatment in ("mixture", "practice"):
@@ -106,7 +104,7 @@ def test_a_run_of_half_the_updates_is_refused(tmp_path, capsys) -> None:
     assert (check["value"], check["verdict"]) == (2.0, "incomparable")
 
 
-def test_few_episodes_are_inconclusive_and_more_seeds_are_asked_for(tmp_path, capsys) -> None:
+def test_few_episodes_are_inconclusive(tmp_path, capsys) -> None:
     few = {"fresh_episodes": 400}
     first, second = arm(tmp_path, "a", range(2, 3), **few), arm(tmp_path, "b", range(3, 4), **few)
     assert main(["compare", *first, *second]) == 1

@@ -97,7 +97,7 @@ def finish(plan: StudyPlan, ahead: tuple[float, ...]) -> None:
         job.done.write_text(plan.fingerprint(job))
 
 
-def test_a_study_names_its_primary_contrast_and_adjusts_the_others(tmp_path: Path) -> None:
+def test_a_study_adjusts_all_but_its_primary_contrast(tmp_path: Path) -> None:
     plan = study(tmp_path)
     finish(plan, (0.2, 0.4, 0.4, 0.2))
     first, *others = contrasts(plan, set())
@@ -128,7 +128,7 @@ def driven(policy: str, success: float, time_s: float) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
 
 
-def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: Path) -> None:
+def test_the_page_has_contrasts_then_success_and_safety(tmp_path: Path) -> None:
     text = STUDY.replace("[0, 1, 2, 3]", "[0, 1, 2]").replace("auc_wheel_slip", "success_rare")
     plan = study(tmp_path, text)
     for job in plan.jobs:

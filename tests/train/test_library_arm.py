@@ -132,7 +132,7 @@ def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch
     assert not (tmp_path / "x").exists()
 
 
-def test_arguments_that_the_library_does_not_know_are_its_to_refuse(tmp_path: Path) -> None:
+def test_the_library_refuses_arguments_it_does_not_know(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"refused its arguments: .*wings"):
         trained(tmp_path / "x", "sb3-dqn", wings=2)
 

@@ -46,7 +46,7 @@ def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
     assert sum(row["updates"] for row in tables["progress"]) == feed.batches
 
 
-def test_a_network_that_is_not_finite_stops_the_loop_and_names_the_rows(
+def test_a_nonfinite_network_stops_and_names_the_rows(
     tmp_path: Path,
 ) -> None:
     """Where the buffer is told of TD errors; what was recorded before stays whole."""

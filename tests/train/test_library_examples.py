@@ -61,7 +61,7 @@ class Called(Exception):
 
 
 @pytest.mark.parametrize("name", ["sb3_dqn", "sb3_mixture"])
-def test_stable_baselines3_has_the_settings_of_the_default_recipe(
+def test_sb3_has_the_settings_of_the_default_recipe(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module, given = example(name), {}

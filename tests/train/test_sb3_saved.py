@@ -85,7 +85,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def test_a_model_is_loaded_to_act_without_its_panel_and_leaves_its_run_alone(
+def test_a_model_acts_without_its_panel_and_leaves_its_run_alone(
     saved: Any, tmp_path: Path
 ) -> None:
     saved.replay_buffer.close()
@@ -101,9 +101,7 @@ def test_a_model_is_loaded_to_act_without_its_panel_and_leaves_its_run_alone(
     assert content(tmp_path / "run") == before
 
 
-def test_training_without_the_saved_buffer_does_not_write_into_its_run(
-    saved: Any, tmp_path: Path
-) -> None:
+def test_training_without_the_saved_buffer_leaves_its_run_alone(saved: Any, tmp_path: Path) -> None:
     saved.replay_buffer.close()
     before = content(tmp_path / "run")
     model = sb3.DQN.load(tmp_path / "model", env=saved.env, device="cpu")

@@ -132,9 +132,7 @@ def study_of_two_comparisons(tmp_path: Path) -> Path:
     return out
 
 
-def test_a_finished_study_may_be_moved_and_a_changed_one_says_what_is_different(
-    tmp_path: Path, capsys
-) -> None:
+def test_a_changed_study_says_what_is_different(tmp_path: Path, capsys) -> None:
     study, out = tmp_path / "s.toml", tmp_path / "o"
     arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
     text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
@@ -227,7 +225,7 @@ def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_after_a_run_failed_none_is_begun_and_those_that_run_can_be_interrupted(
+def test_after_a_failed_run_none_is_begun(
     tmp_path: Path, capsys, monkeypatch, interrupted: bool
 ) -> None:
     begun, running, ended = [], Event(), Event()

@@ -41,7 +41,7 @@ def panel(trained: TrainedBuffer) -> Panel:
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_targets_of_logs_are_of_single_steps_and_of_fresh_rows_tianshous_own(
+def test_targets_are_of_single_logged_and_of_n_fresh_steps(
     trained: TrainedBuffer, panel: Panel, n_step: int
 ) -> None:
     buffer, algorithm = trained.buffer, tianshou_dqn(n_step)

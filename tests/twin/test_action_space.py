@@ -21,7 +21,7 @@ def test_each_action_space_passes_gymnasiums_checker(action: str) -> None:
 
 
 @pytest.mark.parametrize("action", ["discrete", "continuous"])
-def test_make_vec_by_vector_entry_point_gives_the_native_environment(action: str) -> None:
+def test_make_vec_gives_the_native_environment(action: str) -> None:
     made = gymnasium.make_vec(
         "restock/Warehouse-v0",
         num_envs=3,
@@ -62,7 +62,7 @@ def test_a_command_of_the_table_does_what_its_index_does() -> None:
             np.testing.assert_allclose(left, right, atol=2e-4)  # float32 commands
 
 
-def test_any_command_is_driven_and_seen_and_rewarded_as_its_nearest_action() -> None:
+def test_any_command_is_seen_and_rewarded_as_its_nearest_action() -> None:
     made = WarehouseVectorEnv(6, action="continuous")
     made.reset(seed=1)
     made.action_space.seed(2)

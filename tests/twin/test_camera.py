@@ -35,7 +35,7 @@ def _share(frame: np.ndarray, color: tuple[int, int, int], within: int = 45) -> 
 
 @needs_egl
 @pytest.mark.parametrize("view", ["chase", "overhead"])
-def test_a_camera_sees_the_robot_its_plan_and_what_is_on_the_floor(view: str) -> None:
+def test_a_camera_sees_the_robot_its_plan_and_the_floor(view: str) -> None:
     env = WarehouseVectorEnv(2, render_mode="rgb_array", camera=view)
     env.set_episodes(SPECS)
     env.reset()

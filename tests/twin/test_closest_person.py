@@ -60,7 +60,7 @@ def test_the_distance_is_that_of_the_outlines(
     assert found <= max(true, 0) + 2e-3
 
 
-def test_the_least_of_an_episode_is_kept_and_who_is_hidden_does_not_count() -> None:
+def test_the_least_distance_is_kept_without_who_is_hidden() -> None:
     traffic = closest((0.0, 0.0, 0.0), {0: (1.6, 0.0, 0.0), 1: (0.0, 2.5, 0.0)})
     assert traffic.closest_m[0] == pytest.approx(1.6 - 0.35 - PERSON_RADIUS_M)
     traffic.position_m[0, 0] = (9.0, 9.0)

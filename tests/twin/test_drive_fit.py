@@ -104,7 +104,7 @@ def recorded(profile: Profile, folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_latency_and_gain_come_back_from_a_recording_of_a_robot_that_steers(
+def test_latency_and_gain_of_a_robot_that_steers_come_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     profile = profile_of(CAR, OUTLINE)

@@ -46,7 +46,7 @@ def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
 
 
 @pytest.mark.long
-def test_the_true_exposure_shows_where_its_cause_is_and_the_rules_find_its_episodes() -> None:
+def test_rules_find_the_episodes_of_a_true_exposure() -> None:
     """Compare true exposures, from what is there, with exposures found from what is sensed."""
     reported: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     true: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}

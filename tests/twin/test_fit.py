@@ -91,7 +91,7 @@ def log(known: Path) -> Iterator[LoggedSegments]:
         yield log_segments(logged_steps(store), 2.0)
 
 
-def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> None:
+def test_every_step_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> None:
     with Store(known) as store:
         found = log_segments(logged_steps(store), 2.0)
         rows = store.sql("SELECT count(*) FROM transitions").fetchall()[0][0]
@@ -102,7 +102,7 @@ def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: 
     assert np.abs(lasts * 1e-9 - 2.0).max() < 0.05
 
 
-def test_a_late_pose_or_tick_moves_segments_on_and_does_not_lose_them(known: Path) -> None:
+def test_a_late_pose_or_tick_moves_segments_on(known: Path) -> None:
     """Keep segments if poses come in bursts, as a Neato's do.
 
     Only 2 of the 12 stretches of its drive began on a fresh pose.
@@ -179,7 +179,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         write_fit(tmp_path / "fitted.toml", [found])
 
 
-def test_friction_under_wheels_that_stand_is_not_identified_and_stays(log: LoggedSegments) -> None:
+def test_friction_under_standing_wheels_is_not_identified(log: LoggedSegments) -> None:
     some = log.take(np.arange(8))
     standing = replace(
         some,
@@ -198,7 +198,7 @@ def test_friction_under_wheels_that_stand_is_not_identified_and_stays(log: Logge
     assert lost.note == "0.05 to 2 explain the log as well (wheels slide in 0.0% of the steps)"
 
 
-def test_a_schedule_of_several_fits_spans_what_all_of_them_identified(tmp_path: Path) -> None:
+def test_a_schedule_of_several_fits_spans_what_all_identified(tmp_path: Path) -> None:
     def one(gain: float, friction: bool) -> FittedTwin:
         perturbation = Perturbation(name="one", gain=gain, friction_scale=0.5)
         return FittedTwin(
@@ -272,7 +272,7 @@ def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.skipif(not BAGS.is_dir(), reason="needs ../shared/bags")
-def test_another_robot_is_asked_only_for_what_it_shares_with_the_twin(tmp_path: Path) -> None:
+def test_another_robot_is_fitted_only_in_what_it_shares(tmp_path: Path) -> None:
     bag = BAGS / "turtlebot3-sim-humble"
     ingest(bag, load_profile("turtlebot3"), store=StoreWriter(tmp_path / "store"))
     with Store(tmp_path / "store") as store:

@@ -59,7 +59,7 @@ KINDS_OF_FLOOR = st.sampled_from(sorted(RECIPES))
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
 @settings(max_examples=20)
-def test_on_a_generated_floor_every_goal_is_reached_from_every_aisle(seed: int, kind: str) -> None:
+def test_every_goal_of_a_generated_floor_is_reached(seed: int, kind: str) -> None:
     floor = generate(seed, RECIPES[kind])
     assert floor == generate(seed, RECIPES[kind])
     planner = Planner(floor)
@@ -226,7 +226,7 @@ def test_a_floor_with_racks_alone_gets_its_aisles_and_goals(tmp_path: Path) -> N
         read_floor(tmp_path / "hall.toml")
 
 
-def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
+def test_what_does_not_fit_a_floor_is_refused_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hall = tmp_path / "hall.toml"
@@ -253,7 +253,7 @@ def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
     assert describe_floor(read_floor(hall))["unreachable_goals"] == 60
 
 
-def test_one_way_rules_turn_the_plan_and_a_shut_in_robot_leaves_against_them() -> None:
+def test_one_way_rules_turn_the_plan_but_shut_nobody_in() -> None:
     floor = default_warehouse()
     lane = floor.segments[2].area  # aisle 2, west
     start, goal = (lane.x_max - 0.5, lane.center[1]), (lane.x_min - 1.0, lane.center[1])
@@ -302,7 +302,7 @@ def _drive(env: WarehouseVectorEnv, specs: list[EpisodeSpec], steps: int) -> np.
 
 
 @pytest.mark.long
-def test_an_episode_is_the_same_alone_and_among_other_floors_whatever_the_threads() -> None:
+def test_an_episode_is_the_same_among_other_floors() -> None:
     floors = open_floors("default,generated:train:3,narrow:1")
     # What comes after a bump is drawn among the floors that are there.
     task = msgspec.structs.replace(load_profile("warehouse_amr").task, bump_terminates=False)

@@ -107,9 +107,7 @@ def test_the_true_parameters_close_the_gap_to_near_the_floor(
     assert after < odometry  # whose wheels are not as large as it takes them to be
 
 
-def test_evidence_that_is_missing_is_counted_as_the_gap_counts_it(
-    stored: Path, gap: TwinGap
-) -> None:
+def test_missing_evidence_is_counted_as_the_gap_counts_it(stored: Path, gap: TwinGap) -> None:
     nominal = next(verdict for verdict in gap.verdicts if verdict.condition == "nominal")
     twice = replace(CONFIG, limits=TrustLimits(segments=2 * nominal.segments, episodes=3))
     with Store(stored) as store:

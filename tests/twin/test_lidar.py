@@ -148,7 +148,7 @@ def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) 
     assert info["signals"]["sector_clearance_m"][0, 0] > 0.5  # straight behind
 
 
-def test_where_the_lidar_is_and_what_it_sees_is_shown_and_what_lies_outside_is_said(
+def test_the_lidars_place_and_what_lies_outside_is_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = "[robot]\ncasters_m = [[0.6, 0.0]]\n[robot.lidar]\nangle_max_rad = 1.5\n"

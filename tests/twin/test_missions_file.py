@@ -40,7 +40,7 @@ def ordered(*given: MissionOrder, seed: int = 0) -> OrderedMissions:
     return OrderedMissions(orders(*given), file, seed, "handover", Perturbation())
 
 
-def test_a_mission_of_a_zone_comes_through_it_and_is_an_episode_like_any_other() -> None:
+def test_a_mission_of_a_zone_comes_through_it() -> None:
     made = orders(SLIP, THERE)
     specs = [made.spec(1, seed) for seed in range(6)]
     assert len(set(specs)) == 6
@@ -69,7 +69,7 @@ def test_what_the_twin_cannot_hold_is_refused_by_name(order: MissionOrder, messa
     assert "missions[1]" in str(error.value)
 
 
-def test_rounds_drive_on_until_enough_met_their_kind_and_never_without_end() -> None:
+def test_rounds_drive_on_until_enough_met_their_kind() -> None:
     missions = ordered(SLIP, MissionOrder(kind="near_collision", missions=2))
     driven = []
     for one_round in missions.rounds():
@@ -95,7 +95,7 @@ def test_missions_of_a_robot_are_those_of_its_tag() -> None:
     assert RecordingPlan(missions=file, tags={"robot": "amr_8"}).orders() == [SLIP]
 
 
-def test_a_dry_run_says_what_would_be_driven_and_a_wrong_file_writes_nothing(
+def test_a_dry_run_or_a_wrong_file_writes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, file = tmp_path / "next.mcap", tmp_path / "next.toml"
@@ -115,7 +115,7 @@ def test_a_dry_run_says_what_would_be_driven_and_a_wrong_file_writes_nothing(
     assert not out.exists()
 
 
-def test_missions_of_a_file_are_recorded_and_counted_by_what_they_met(
+def test_missions_are_counted_by_what_they_met(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "next.toml"
@@ -173,7 +173,7 @@ def drawn(missions: tuple[MissionOrder, ...], share: float, count: int = 400) ->
     return [queue.next(1)[0] for _ in range(count)]
 
 
-def test_a_share_of_trainings_episodes_follows_the_file_and_the_others_are_as_they_were() -> None:
+def test_a_share_of_trainings_episodes_follows_the_file() -> None:
     missions = (SLIP, MissionOrder(kind="blocked_aisle", missions=12))
     plain, mixed = drawn((), 0.5), drawn(missions, 0.5)
     kinds = Counter(spec.condition for spec in mixed)

@@ -255,7 +255,7 @@ def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
     assert gap[0.005] < gap[0.01]
 
 
-def test_friction_is_looked_up_by_place_and_the_slipperiest_patch_counts() -> None:
+def test_the_slipperiest_patch_of_a_place_counts() -> None:
     patches = np.array([[[1.0, 1.0, 0.5, 0.5, 0.1], [1.2, 1.0, 0.5, 0.5, 0.05]]])
     points = np.array([[[0.6, 1.0], [1.0, 1.0], [3.0, 3.0]]])
     np.testing.assert_allclose(friction_at(points, patches, np.array([0.8])), [[0.1, 0.05, 0.8]])

@@ -31,7 +31,7 @@ PAGE = ROOT / "docs" / "twin.md"
 # -- what they say ----------------------------------------------------------------------------
 
 
-def test_every_field_has_a_range_that_holds_its_default_and_a_line_in_the_docs() -> None:
+def test_every_field_has_a_range_and_a_line_in_the_docs() -> None:
     fields = {field.name: field.default for field in msgspec.structs.fields(Perturbation)}
     assert fields.keys() - {"name"} == RANGES.keys()
     page = PAGE.read_text(encoding="utf-8")

@@ -43,7 +43,7 @@ def test_it_is_on_its_own_floor(drive: Drive) -> None:
     assert placed_on(FLOOR, drive)
 
 
-def test_walls_that_are_elsewhere_tell_another_floor_where_its_way_would_fit(drive: Drive) -> None:
+def test_walls_that_are_elsewhere_tell_another_floor(drive: Drive) -> None:
     hall = replace(FLOOR, racks=())  # open ground: all of its poses fit
     assert on_free_ground(hall, drive.places_m).all()
     assert not placed_on(hall, drive)

@@ -45,7 +45,7 @@ def test_a_closed_aisle_is_gone_around() -> None:
     assert not near.any()
 
 
-def test_where_all_ways_seem_closed_the_latest_closure_is_opened_again() -> None:
+def test_if_all_ways_seem_closed_the_latest_is_opened_again() -> None:
     # Both ends of the goal's aisle segment: there is no way in.
     plan = PLANNER.plan(3.0, 3.6, (8.45, 0.9), [(1, 0), (1, 8)])
     np.testing.assert_allclose(plan[-1], (8.45, 0.9))

@@ -46,7 +46,7 @@ def success(
 
 
 @pytest.mark.long
-def test_the_planner_is_good_in_nominal_aisles_and_stuck_in_partly_blocked_ones() -> None:
+def test_the_planner_is_stuck_in_partly_blocked_aisles() -> None:
     assert success(PlannerFollower(), "nominal")["none"] >= 0.95
     blocked = success(PlannerFollower(), "blocked_aisle")
     assert blocked["partial"] <= 0.3
@@ -71,7 +71,7 @@ def test_the_operator_gets_past_pallets(layouts: str) -> None:
 
 
 @pytest.mark.long
-def test_the_operator_takes_over_from_a_stuck_planner_and_hands_back() -> None:
+def test_the_operator_takes_over_and_hands_back() -> None:
     policy = Handover(PlannerFollower(), Operator())
     blocked = success(policy, "blocked_aisle")
     assert blocked["partial"] >= 0.5
@@ -105,7 +105,7 @@ def test_stated_probabilities_match_what_is_done(make: type[PlannerFollower]) ->
         assert (policy.acting == policy.name).all()
 
 
-def test_a_lattice_guides_the_operator_where_it_was_stuck_until_the_episode_ends() -> None:
+def test_a_lattice_guides_an_operator_that_was_stuck() -> None:
     """Get a real Neato's outline through passages of .5 m, which it was stuck before."""
     env = WarehouseVectorEnv(4, conditions={"nominal": 1.0})
     first = Operator(seed=6)
@@ -169,7 +169,7 @@ def small_slow_robot() -> Task:
     )
 
 
-def test_the_operator_of_a_small_slow_robot_drives_through_a_gap_that_is_wide_for_it() -> None:
+def test_a_small_robot_drives_through_a_gap_wide_for_it() -> None:
     """Drive on: it once turned left and right before gaps too narrow for the stand-in."""
     gap = Rect(1.5, 0.0, 2.5, 0.8), Rect(1.5, 1.2, 2.5, 2.0)
     ends = (3.4, 1.0), (0.6, 1.0)

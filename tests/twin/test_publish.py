@@ -129,9 +129,7 @@ def test_a_message_is_measured_then_sent_then_received(messages: list[Message]) 
             assert topic == "/goal_pose" or len(set(delay.tolist())) > 1, topic
 
 
-def test_the_last_measurement_before_a_command_is_what_the_policy_saw(
-    drive: Drive, messages: list[Message]
-) -> None:
+def test_the_last_measurement_is_what_the_policy_saw(drive: Drive, messages: list[Message]) -> None:
     by_topic = _decoded(messages)
     for tick, (command_ns, _) in enumerate(by_topic["/cmd_vel"]):
         held = {
@@ -150,7 +148,7 @@ def test_the_last_measurement_before_a_command_is_what_the_policy_saw(
         )
 
 
-def test_a_plan_that_another_replaces_is_not_sent_again_at_that_tick(drive: Drive) -> None:
+def test_a_replaced_plan_is_not_sent_again_at_that_tick(drive: Drive) -> None:
     # In floating point a plan of 1.2 s, sent every second, is due a last bit before 2.2 s.
     changed = replace(drive, plans=[(6, np.zeros((5, 2))), (11, np.ones((7, 2)))])
     plans = _decoded(_robot().publish(changed, START_NS))["/plan"]

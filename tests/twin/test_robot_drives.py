@@ -35,7 +35,7 @@ CAR_ACTIONS = (
 
 
 @pytest.mark.parametrize("friction", [1.0, 0.25])
-def test_a_robot_that_steers_drives_the_circles_that_it_is_commanded(friction: float) -> None:
+def test_a_robot_that_steers_drives_commanded_circles(friction: float) -> None:
     commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.4, -0.4), (-0.4, 0.3)]
     sim, steady = driven(CAR, OUTLINE, commands, friction)
     np.testing.assert_allclose(steady, commands, atol=0.01)
@@ -44,14 +44,14 @@ def test_a_robot_that_steers_drives_the_circles_that_it_is_commanded(friction: f
     assert not sim.diverged.any()
 
 
-def test_what_its_steering_does_not_allow_it_drives_as_tightly_as_it_can() -> None:
+def test_it_drives_as_tightly_as_its_steering_allows() -> None:
     assert CAR.min_turning_radius_m == pytest.approx(TIGHTEST_M)
     _, steady = driven(CAR, OUTLINE, [(0.3, 2.0), (0.0, 1.0)])
     assert steady[0] == pytest.approx([0.3, 0.3 / TIGHTEST_M], rel=0.02)
     assert steady[1] == pytest.approx([0.0, 0.0], abs=1e-3)  # it stands, its wheels turned
 
 
-def test_its_wheels_turn_no_faster_than_they_steer_and_stay_under_a_stop() -> None:
+def test_its_wheels_turn_no_faster_than_they_steer() -> None:
     robot = msgspec.structs.replace(CAR, max_steering_rate_radps=1.0)
     task = Task(body=OUTLINE, actions=((0.0, 0.0), (0.4, 0.5)))
     commands = np.array([[(0.4, 0.5)] * 3 + [(0.0, 0.0)] * 5])  # .6 s, then a stop
@@ -127,7 +127,7 @@ def test_mecanum_wheels_drive_what_they_are_commanded(friction: float) -> None:
     assert not sim.diverged.any()
 
 
-def test_rollers_carry_it_sideways_when_the_wheels_turn_against_each_other() -> None:
+def test_rollers_carry_it_sideways() -> None:
     """Wheel speeds of a drive to the left, straight into the motors: the model is holonomic."""
     robot = robot_model(MECANUM, Body(0.6, 0.5))
     model = build_robot_alone(robot, 0.01)

@@ -35,7 +35,7 @@ def _markers(data: bytes) -> list[Any]:
     return list(typestore().deserialize_cdr(data, MARKER_ARRAY).markers)
 
 
-def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> None:
+def test_a_mission_shows_its_goal_pallets_and_patches() -> None:
     scene = Scene(
         pallets=np.array([[2.0, 3.0, np.pi / 2], [*PARKED_M[:2], 0.0]]),
         patches=np.array([[1.0, 2.0, 0.5, 0.25, 0.03], [1e6, 1e6, 0.0, 0.0, 1.0]]),
@@ -63,7 +63,7 @@ def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> No
 
 
 @pytest.mark.parametrize(("file_format", "name"), one_in(2, [("mcap", "a.mcap"), ("rosbag2", "a")]))
-def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
+def test_a_recording_holds_frames_map_and_scene(
     tmp_path: Path, file_format: Format, name: str
 ) -> None:
     kinds = {"near_collision": 1.0, "blocked_aisle": 1.0}

@@ -14,7 +14,7 @@ from restock.train.twin.physics.simulation import Simulation
 TASK = load_profile("warehouse_amr").task
 
 
-def test_localisation_drifts_as_an_autoregressive_walk_of_unit_variance() -> None:
+def test_localisation_drifts_as_an_autoregressive_walk() -> None:
     sensing = Sensing(Simulation(4, TASK, default_warehouse(), 0.01, nthread=1), TASK)
     keep = np.exp(-TASK.control_period_s / DRIFT_TIME_S)
     walks = []

@@ -37,7 +37,7 @@ def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GO
     return lattice_around(FLOOR, graph, box[:, :2], half, goal, 0.4, motion, window)
 
 
-def test_a_wide_gap_is_driven_through_and_a_narrow_one_gone_around() -> None:
+def test_a_narrow_gap_is_gone_around_and_a_wide_one_is_not() -> None:
     start = (AISLE.x_min + 0.2, AISLE.center[1], 0.0)
     through, around = with_gap(0.9).plan(*start), with_gap(0.45).plan(*start)
     assert through is not None
@@ -49,7 +49,7 @@ def test_a_wide_gap_is_driven_through_and_a_narrow_one_gone_around() -> None:
         assert np.hypot(*(plan[0] - start[:2])) < 0.15
 
 
-def test_a_gap_that_fits_the_width_alone_must_be_entered_straight() -> None:
+def test_a_tight_gap_must_be_entered_straight() -> None:
     """Pass a .75 m gap with a .7 x .5 m body in line with it, but not askew."""
     lattice = with_gap(0.75)
     in_gap = (AISLE.center[0], AISLE.y_min + 0.375)
@@ -58,7 +58,7 @@ def test_a_gap_that_fits_the_width_alone_must_be_entered_straight() -> None:
     assert lattice.time_s(np.array([*in_gap, np.pi])) > straight  # it would have to back out
 
 
-def test_at_the_goal_no_time_is_left_and_a_slower_robot_takes_longer() -> None:
+def test_time_is_left_by_distance_and_speed() -> None:
     inside = (AISLE.x_max - 0.3, AISLE.center[1])
     assert with_gap(0.9, goal=inside).time_s(np.array([*inside, 1.0])) < 0.3
     slow = Motion(BODY.outline_m, ahead_mps=0.25, back_mps=0.1, turn_radps=0.3)

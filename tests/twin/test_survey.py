@@ -165,7 +165,7 @@ def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("late_s", "frame"), [(0.0, "laser"), (1.5, "laser"), (0.0, "base_link"), (0.0, "/base_scan")]
 )
-def test_scans_make_the_map_that_was_scanned_by_the_clock_that_fits(
+def test_scans_make_the_map_by_the_clock_that_fits(
     tmp_path: Path, late_s: float, frame: str
 ) -> None:
     known = OccupancyGrid(hall(), CELL_M)
@@ -306,9 +306,7 @@ def test_without_a_map_the_floor_is_the_corridor_that_was_driven(tmp_path: Path)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
-def test_zones_of_a_profile_are_those_of_the_floor_in_the_maps_frame(
-    tmp_path: Path, yaw: float
-) -> None:
+def test_zones_of_a_profile_are_in_the_maps_frame(tmp_path: Path, yaw: float) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap((5.0, -1.0, yaw)), frame="odom")
     arguments = ["twin", "layout", "--from", str(bag), "--zones", str(tmp_path / "zones.toml")]
     assert main(arguments) == 0
@@ -346,7 +344,7 @@ def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
     assert extent(PLACE) == pytest.approx((7.1, 5.1), abs=0.6)
 
 
-def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
+def test_a_store_gives_the_floor_of_its_recording(
     tmp_path: Path,
 ) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap()[:60], grid=OccupancyGrid(hall(), CELL_M))
@@ -385,7 +383,7 @@ def lapped(recording: int, away_m: float) -> pa.Table:
     return rows
 
 
-def test_recordings_in_other_frames_are_named_and_get_a_floor_of_their_own(
+def test_recordings_in_other_frames_get_floors_of_their_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tables = [lapped(1, 0.0), lapped(2, 40.0), lapped(3, 0.0)]
@@ -413,7 +411,7 @@ class _Zones(Checked, frozen=True):
     zone: list[Zone]
 
 
-def test_a_robot_that_hardly_moved_starts_where_it_was_and_goes_where_it_could() -> None:
+def test_a_robot_that_hardly_moved_goes_where_it_could() -> None:
     """Send missions into the room that it saw if its own places are too close together."""
     cells = np.full((120, 80), 100, np.int8)
     cells[2:-2, 2:-2] = 0

@@ -61,7 +61,7 @@ def test_single_and_vector_environment_are_the_same_environment() -> None:
         assert earned == earned_too[0]
 
 
-def test_a_seed_gives_the_same_run_whatever_the_threads_or_the_recorder() -> None:
+def test_a_seed_gives_the_same_run_whatever_the_threads() -> None:
     runs = []
     for nthread, record in ((1, False), (2, False), (1, True)):
         made = WarehouseVectorEnv(6, nthread=nthread)
@@ -87,7 +87,7 @@ def test_an_episode_is_the_same_in_any_place_and_company() -> None:
 
 
 @pytest.mark.long
-def test_state_continues_bit_for_bit_through_a_file_and_in_a_fresh_environment(
+def test_state_continues_bit_for_bit_through_a_file(
     env: WarehouseVectorEnv, tmp_path: Path
 ) -> None:
     env.reset(seed=2)
@@ -114,7 +114,7 @@ def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> N
 
 
 @pytest.mark.parametrize("pickler", ["pickle", "cloudpickle"])
-def test_a_pickled_environment_is_a_fresh_one_with_the_same_settings(pickler: str) -> None:
+def test_a_pickled_environment_is_fresh_with_the_same_settings(pickler: str) -> None:
     dumps = pytest.importorskip(pickler).dumps
     made = WarehouseVectorEnv(3, conditions={"wheel_slip": 1.0}, perturbation="friction", seed=5)
     first, _ = made.reset()
@@ -161,7 +161,7 @@ def test_disabled_autoreset_resets_only_the_masked() -> None:
     assert made.steps.tolist() == [5, 0, 5]
 
 
-def test_the_environment_fills_every_signal_and_uses_the_tasks_functions(
+def test_every_signal_is_filled_and_the_tasks_functions_used(
     env: WarehouseVectorEnv,
 ) -> None:
     env.reset(seed=6)

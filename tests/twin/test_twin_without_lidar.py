@@ -63,7 +63,7 @@ def test_the_planner_follows_its_plan_and_stops_for_nothing():
     env.close()
 
 
-def test_the_twin_labels_what_logs_can_be_labelled_by_and_says_the_rest():
+def test_the_twin_labels_what_logs_can_be_labelled_by():
     evaluated, lost = conditions_in_twin(PROFILE.conditions, PROFILE.signals, lidar=False)
     assert lost == unseen(PROFILE.conditions) != {}
     assert [one.name for one in evaluated] == ["wheel_slip"]
