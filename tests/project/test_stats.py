@@ -73,7 +73,7 @@ def test_quantiles_count_clusters_not_rows() -> None:
     values = np.repeat(rng.normal(size=12), 50)  # 12 episodes of equal segments
     cluster = np.repeat(np.arange(12), 50)
     (together,) = clustered_quantiles(values, cluster, [0.5], rng=np.random.default_rng(1))
-    (apart,) = clustered_quantiles(values, np.arange(250), [0.5], rng=np.random.default_rng(1))
+    (apart,) = clustered_quantiles(values, np.arange(600), [0.5], rng=np.random.default_rng(1))
     assert together.value == apart.value == np.quantile(values, 0.5, method="inverted_cdf")
     assert together.high - together.low > 2 * (apart.high - apart.low)
 
@@ -133,7 +133,7 @@ def test_over_five_seeds_t_covers_and_a_bootstrap_does_not() -> None:
 def test_a_difference_of_arms_covers_seeds_and_episodes(runs: int, episodes: int) -> None:
     rng = np.random.default_rng(1)
     hits = 0
-    for _ in range(600):
+    for _ in range(250):
         hard = rng.normal(0, 1, episodes)  # to both arms alike
         arms = [
             hard
