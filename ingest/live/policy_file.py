@@ -35,8 +35,8 @@ from restock.ingest.task.task import Task
 from restock.process import import_extra
 
 FORMAT = "restock-policy/2"
-MAX_BYTES = 16 << 20  # of a file: 4 million weights. Parsed, it takes at most .5 GB
-MAX_NODES = 256
+MAX_BYTES = 16 << 20  # of a file: 4 million weights. Parsed, it takes at most .8 GB
+MAX_PARTS = 256  # nodes, constants, metadata entries
 MAX_WIDTH = 1 << 16  # numbers that a node computes of one observation
 _TOO_LONG = f"is longer than {MAX_BYTES >> 20} MiB"
 ROWS = "N"  # the first dimension of what is computed from observations
@@ -249,8 +249,10 @@ def graph_shapes(model: Any) -> dict[str, Shape]:
     graph = model.graph
     if [(opset.domain, opset.version > 0) for opset in model.opset_import] != [("", True)]:
         raise ValueError("needs operators other than those of ONNX itself")
-    if len(graph.node) > MAX_NODES:
-        raise ValueError(f"has {len(graph.node)} nodes, more than {MAX_NODES}")
+    for many in (graph.node, graph.initializer, model.metadata_props):
+        if len(many) > MAX_PARTS:
+            kind = "nodes, constants or metadata entries"
+            raise ValueError(f"has {len(many):,} {kind}, more than {MAX_PARTS}")
     if len(graph.input) != 1:
         raise ValueError(f"takes {len(graph.input)} inputs, not one observation")
     observation = graph.input[0]
@@ -376,7 +378,7 @@ def _text(shape: Shape) -> str:
 __all__ = [
     "FORMAT",
     "MAX_BYTES",
-    "MAX_NODES",
+    "MAX_PARTS",
     "MAX_WIDTH",
     "ONNX_OPERATORS",
     "OnnxFile",

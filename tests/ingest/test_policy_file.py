@@ -15,7 +15,7 @@ from support.policy_files import changed_policy
 
 from restock.cli import main, run_node
 from restock.errors import ConfigError
-from restock.ingest.live.policy_file import MAX_BYTES, MAX_NODES, OnnxFile, PolicyFile
+from restock.ingest.live.policy_file import MAX_BYTES, MAX_PARTS, OnnxFile, PolicyFile
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import NetworkConfig
 from restock.train.evaluation.onnx_policy import OnnxPolicy, export_onnx
@@ -141,8 +141,12 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "subgraph": (subgraph, "sets axis of ArgMax, which is not a number"),
     "many nodes": (
-        insert(*(node("Relu", ["observation"], [f"r{i}"]) for i in range(MAX_NODES))),
-        f"more than {MAX_NODES}",
+        insert(*(node("Relu", ["observation"], [f"r{i}"]) for i in range(MAX_PARTS))),
+        f"more than {MAX_PARTS}",
+    ),
+    "many constants": (
+        insert(**{f"c{i}": np.zeros((), np.float32) for i in range(MAX_PARTS)}),
+        f"more than {MAX_PARTS}",
     ),
     "a cycle": (insert(node("Relu", ["values"], ["a"])), "reads 'values' before"),
     "twice": (insert(node("Relu", ["observation"], ["values"])), "has 'values' twice"),
