@@ -18,8 +18,6 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.typesys import Stores, get_typestore
 
-from restock.cli import main
-from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import CannotDecode, Ragged
 from restock.ingest.decoding.protobuf_messages import protobuf_type
@@ -84,7 +82,7 @@ def pose(row: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("schema", [json.dumps(SCHEMA).encode(), b""], ids=["schema", "none"])
-def test_json_with_and_without_a_schema(schema: bytes, tmp_path: Path) -> None:
+def test_json_with_and_without_a_schema(schema, tmp_path):
     payloads = [json.dumps(pose(row)).encode() for row in range(4)]
     form = "jsonschema" if schema else ""
     path = write(tmp_path / "j.mcap", ("/pose", "json", "Pose", form, schema, payloads))
@@ -109,7 +107,7 @@ def test_json_with_and_without_a_schema(schema: bytes, tmp_path: Path) -> None:
     assert np.asarray(stamps[3]).tolist() == [10**9 + 3] * 3
 
 
-def test_json_that_does_not_decode_is_counted_by_reason(tmp_path: Path) -> None:
+def test_json_that_does_not_decode_is_counted_by_reason(tmp_path):
     good = json.dumps({"x": 1.5, "stamp": {"sec": 1, "nanosec": 2}}).encode()
     bad = {
         b"{": "not JSON",
@@ -137,7 +135,7 @@ def test_json_that_does_not_decode_is_counted_by_reason(tmp_path: Path) -> None:
         assert any(reason.startswith(says) for reason in account.reasons), (says, account.reasons)
 
 
-def test_json_keeps_integers_that_float64_cannot_hold(tmp_path: Path) -> None:
+def test_json_keeps_integers_that_float64_cannot_hold(tmp_path):
     payloads = [b'{"big": %d, "small": 3}' % (START_NS + row) for row in range(3)]
     path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
     with open_recording(path) as recording:
@@ -155,32 +153,21 @@ def test_json_keeps_integers_that_float64_cannot_hold(tmp_path: Path) -> None:
         (b'{"properties": 7}', 0),
     ],
 )
-def test_json_schemas_that_say_little_or_never_end(schema: bytes, leaves: int) -> None:
+def test_json_schemas_may_say_little_or_never_end(schema, leaves):
     kind = JsonType("T", "embedded", schema, lambda: [])
     assert len(kind.leaves()) == leaves
 
 
-@pytest.mark.parametrize("schema", [b"{", b"[" * 100_000, b'{"a": \xff}', b" " * (5 << 20)])
-def test_invalid_json_schemas(schema: bytes) -> None:
-    with pytest.raises(CannotDecode, match="its definition"):
-        JsonType("T", "embedded", schema, lambda: []).leaves()
-
-
-def test_json_of_very_many_fields_is_refused() -> None:
+def test_json_of_very_many_fields_is_refused():
     wide = json.dumps({str(number): 1 for number in range(30_000)}).encode()
     with pytest.raises(CannotDecode, match="more than 20,000 fields"):
         JsonType("T", "inferred", b"", lambda: [wide]).leaves()
 
 
-def test_invalid_json_paths(tmp_path: Path) -> None:
-    payload = b'{"a.b": 1, "x": {"y": 1}, "none": null, "grid": [[1]]}'
-    path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", [payload]))
-    with open_recording(path) as recording:
-        assert recording.leaves("/t") == ["x.y"]
-        with pytest.raises(RecordingError, match="no value at 'x'"):
-            recording.read({"/t": ["x"]})
-        with pytest.raises(RecordingError, match="no value at 'grid'"):
-            recording.read({"/t": ["grid"]})
+@pytest.mark.parametrize("schema", [b"{", b"[" * 100_000, b'{"a": \xff}', b" " * (5 << 20)])
+def test_invalid_json_schemas(schema):
+    with pytest.raises(CannotDecode, match="its definition"):
+        JsonType("T", "embedded", schema, lambda: []).leaves()
 
 
 # -- protobuf -----------------------------------------------------------------------------------
@@ -256,7 +243,7 @@ def protobuf(payloads: Sequence[bytes]) -> Topic:
     return "/scan", "protobuf", "lab.Scan", "protobuf", definition, payloads
 
 
-def test_protobuf(tmp_path: Path) -> None:
+def test_protobuf(tmp_path):
     path = write(tmp_path / "p.mcap", protobuf([scan(row) for row in range(4)]))
     with open_recording(path) as recording:
         leaves = recording.leaves("/scan")
@@ -286,7 +273,7 @@ def test_protobuf(tmp_path: Path) -> None:
     assert columns["inner.count"].tolist() == [2**63 + row for row in range(4)]
 
 
-def test_protobuf_that_does_not_parse_is_counted(tmp_path: Path) -> None:
+def test_protobuf_that_does_not_parse_is_counted(tmp_path):
     beyond = scan_class()()
     beyond.timestamp.seconds = 2**62
     payloads = [scan(1), b"\xff\xff", scan(2)[:-1], bytes(beyond.SerializeToString()), scan(3)]
@@ -319,7 +306,7 @@ def broken(change: Any) -> bytes:
         (bytes(5 << 20), "of 5,242,880 bytes is too long"),
     ],
 )
-def test_invalid_protobuf_definitions(definition: bytes, says: str | None) -> None:
+def test_invalid_protobuf_definitions(definition, says):
     if says is None:
         assert protobuf_type("lab.Scan", definition).leaves()
         return
@@ -327,23 +314,10 @@ def test_invalid_protobuf_definitions(definition: bytes, says: str | None) -> No
         protobuf_type("lab.Scan", definition)
 
 
-def test_an_endless_protobuf_definition_is_refused() -> None:
-    files = Files()
-    file = files.file.add(name="a.proto", package="a", syntax="proto3")
-    for depth in range(22):
-        message = file.message_type.add(name=f"T{depth}")
-        for side in range(2):
-            kind = F.TYPE_MESSAGE if depth < 21 else F.TYPE_BOOL
-            of = f".a.T{depth + 1}" if depth < 21 else None
-            message.field.add(name=f"f{side}", number=side + 1, type=kind, type_name=of, label=1)
-    with pytest.raises(CannotDecode, match="more than 20,000 fields"):
-        protobuf_type("a.T0", files.SerializeToString())
-
-
 # -- ROS 1 in MCAP, and what is not supported -----------------------------------------------------
 
 
-def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
+def test_ros1_messages_in_mcap(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     kind = "geometry_msgs/msg/PointStamped"
     definition, _ = store.generate_msgdef(kind, ros_version=1)
@@ -365,23 +339,3 @@ def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
         columns = recording.read({"/p": ["header.stamp", "point.x"]})["/p"]
     assert columns.fields["header.stamp"].tolist() == [7, 10**9 + 7, 2 * 10**9 + 7]  # type: ignore[union-attr]
     assert columns.fields["point.x"].tolist() == [0.0, 1.5, 3.0]  # type: ignore[union-attr]
-
-
-def test_info_names_every_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write(
-        tmp_path / "all.mcap",
-        protobuf([scan(1)]),
-        ("/j", "json", "", "", b"", [b'{"x": 1}']),
-        ("/c", "cbor", "Some", "", b"", [b"\xa0"]),
-        ("/p", "protobuf", "lab.Other", "protobuf", scan_files().SerializeToString(), [b""]),
-    )
-    assert main(["info", str(path), "--json"]) == 0
-    topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
-    assert {name: topic["skipped"] for name, topic in topics.items()} == {
-        "/scan": None,
-        "/j": None,
-        "/c": "messages encoded as 'cbor' are not supported",
-        "/p": "its definition does not define lab.Other",
-    }
-    assert topics["/scan"]["type"] == "lab.Scan"
-    assert topics["/j"]["definition"] == "inferred"

@@ -24,14 +24,11 @@ from restock.ingest.decoding import columns as columns_module
 from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.episodes import split, steps_of
 from restock.ingest.store import transitions as transitions_module
-from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import Staged, StoreWriter
 
 WHOLE = 1 << 40
 PROFILE = load_profile("warehouse_amr")
-PROVENANCE = Provenance("0123456789abcdef", "feedc0de", "logs/run.mcap", "1.2.3")
 
 
 def cut_by(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
@@ -157,24 +154,6 @@ def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None
     assert len(tables[0]) > 50
     for other in tables[1:]:
         assert tables[0].equals(other, check_metadata=True)
-
-
-@pytest.mark.parametrize("group", [1, 7, 25])
-def test_rows_do_not_depend_on_which_episodes_come_together(
-    group: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drive = Drive(duration_s=20.0, goals=[(0.0, 3.0, 1.0), (4.2, 6.0, 1.0), (9.0, 20.0, 1.0)])
-    steps = steps_of(PROFILE, drive.topics())
-    episodes = split(PROFILE.task, steps)
-    assert len(episodes.episodes) > 2
-    whole, every = recording_table(PROFILE, steps, episodes, PROVENANCE)
-    monkeypatch.setattr(transitions_module, "GROUP_ROWS", group)
-    table, rows = recording_table(PROFILE, steps, episodes, PROVENANCE)
-    assert table.equals(whole, check_metadata=True)
-    assert np.array_equal(rows.tick, every.tick)
-    assert rows.labels.keys() == every.labels.keys()
-    for name, holds in every.labels.items():
-        assert np.array_equal(rows.labels[name], holds), name
 
 
 @settings(max_examples=60)

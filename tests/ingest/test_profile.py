@@ -76,6 +76,11 @@ def test_the_hash_is_the_same_in_another_process():
         ('pressed = "data"', 'pressed = "front or 3sides"', "inputs.bumper.fields.pressed"),
         ("[clock]", '[goal]\nsource = "hindsight"\n[clock]', "would not be used"),
         ("[clock]", "[goal]\nstill_s = 5.0\n[clock]", "`goal.still_s` is given"),
+        (
+            "[clock]",
+            '[[condition]]\nname = "x"\nkind = "exposure"\ntiming = "post"\nsql = "true"\n[clock]',
+            "exposure is a situation known before acting",
+        ),
     ],
 )
 def test_an_error_names_the_file_and_the_key(old, new, said):
@@ -90,6 +95,12 @@ def test_a_route_needs_a_goal_and_a_plan():
     start, end = TEXT.index("[inputs.plan]"), TEXT.index("[inputs.bumper]")
     with pytest.raises(ConfigError, match=r"`inputs\.plan` is missing"):
         parse_profile(TEXT[:start] + TEXT[end:], where="mine.toml")
+
+
+def test_a_goal_in_hindsight_needs_a_route():
+    text = TEXT.replace('goal = "route"', 'goal = "none"') + '\n[goal]\nsource = "hindsight"\n'
+    with pytest.raises(ConfigError, match=r"`task.goal` is 'none'"):
+        parse_profile(text, where="mine.toml")
 
 
 def test_without_a_goal_its_topics_are_not_needed(tmp_path):

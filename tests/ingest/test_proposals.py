@@ -206,6 +206,14 @@ def sent_to_move_base() -> Topics:
     return topics | {"/move_base/goal": goals}
 
 
+def without_gyro() -> Topics:
+    topics = usual()
+    unknown = np.zeros((len(topics["/imu"][1]), 9))
+    unknown[:, 0] = -1
+    topics["/imu"][1].fields["angular_velocity_covariance"] = unknown
+    return topics
+
+
 def two_lidars() -> Topics:
     topics = usual()
     topics["/scan_front"] = topics["/scan_back"] = topics.pop("/scan")
@@ -333,6 +341,10 @@ ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], A
     "no commands": (
         usual(drop=("/cmd_vel", "/scan")), ODOMETRY, topics_of("command"), ("/odom",),
         ["No command was recorded: the measured motion is used"],
+    ),
+    "an IMU without a gyro": (
+        without_gyro(), (), topics_of("imu"), (None,),
+        ["messages of /imu have no estimate of angular_velocity"],
     ),
     "poses in UTM": (
         Utm(3.0), (), lambda p: p.origin_m,

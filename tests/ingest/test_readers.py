@@ -209,17 +209,6 @@ def test_the_id_is_of_the_content(bag: Path, mcap: Path, tmp_path: Path) -> None
         assert other.recording_id != here.recording_id
 
 
-def test_split_files_are_one_recording(tmp_path: Path) -> None:
-    bag = tmp_path / "split"
-    bag.mkdir()
-    for part in range(3):
-        write_mcap(bag / f"split_{part}.mcap", 4 + part)
-    assert recordings_in(tmp_path / "split") == [bag]
-    with open_recording(bag) as recording:
-        assert recording.topics["/odom"].expected == 15
-        assert len(recording.read({"/odom": ["header.stamp"]})["/odom"]) == 15
-
-
 def test_finding_recordings(tmp_path: Path) -> None:
     (tmp_path / "many" / "a").mkdir(parents=True)
     (tmp_path / "empty").mkdir()
@@ -287,6 +276,13 @@ def test_a_file_that_is_no_recording_is_refused(content: bytes | None, says: str
     with pytest.raises(RecordingError, match=says) as caught:
         open_recording(file)
     assert caught.value.where is not None
+
+
+def test_a_missing_distribution_and_an_empty_path_are_named(mcap):
+    with pytest.raises(RecordingError, match="definitions named 'hamble'"):
+        open_recording(mcap, definitions="hamble")
+    with pytest.raises(RecordingError, match="the path of a recording is empty"):
+        open_recording("")
 
 
 @pytest.mark.parametrize(

@@ -28,22 +28,29 @@ def ingested(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict
     return dict(one)
 
 
-@pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the first fifth of a recording, as a crash would leave it."""
-    path = tmp_path_factory.mktemp("part") / "part.mcap"
-    content = MONDAY.read_bytes()
-    path.write_bytes(content[: len(content) // 5])
+def first(tmp_path_factory: pytest.TempPathFactory, name: str, share: float) -> Path:
+    """Return the first share of a recording, as a crash would leave it."""
+    path, content = tmp_path_factory.mktemp(name) / f"{name}.mcap", MONDAY.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
     return path
 
 
-def test_the_whole_after_a_part_is_said(
-    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return first(tmp_path_factory, "part", 1 / 8)
+
+
+@pytest.fixture(scope="module")
+def third(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the whole that the part is of."""
+    return first(tmp_path_factory, "third", 1 / 3)
+
+
+def test_the_whole_after_a_part_is_said(part, third, tmp_path, capsys):
     store = tmp_path / "store"
     first = ingested(capsys, part, "--salvage", "--store", store)
     assert first["repeats"] is None
-    whole = ingested(capsys, MONDAY, "--store", store)
+    whole = ingested(capsys, third, "--salvage", "--store", store)
     assert whole["status"] == "written"
     assert whole["repeats"] == {
         "recording_id": first["recording_id"],
@@ -58,13 +65,11 @@ def test_the_whole_after_a_part_is_said(
     assert f"`restock store remove {store} {first['recording_id']}` takes out that one" in note
 
 
-def test_the_whole_takes_the_place_of_a_part_where_asked(
-    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_whole_takes_the_place_of_a_part_where_asked(part, third, tmp_path, capsys):
     """As of a bag that was still being written the night before. The part does not come back."""
     store, replace = tmp_path / "store", ("--repeated", "replace")
     first = ingested(capsys, part, "--salvage", "--store", store, *replace)
-    whole = ingested(capsys, MONDAY, "--store", store, *replace)
+    whole = ingested(capsys, third, "--salvage", "--store", store, *replace)
     (note,) = (note for note in whole["notes"] if "which was removed" in note)
     assert note.startswith(f"in place of {part} (recording {first['recording_id']}), a part of it")
     assert [row["recording_id"] for row in StoreWriter(store).live().to_pylist()] == [
@@ -75,9 +80,7 @@ def test_the_whole_takes_the_place_of_a_part_where_asked(
     assert whole["recording_id"] in again["error"]
 
 
-def test_what_people_corrected_stays(
-    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_people_corrected_stays(part, third, tmp_path, capsys):
     store = tmp_path / "store"
     first = ingested(capsys, part, "--salvage", "--store", store)
     review = tmp_path / "review.csv"
@@ -86,18 +89,16 @@ def test_what_people_corrected_stays(
         f"{first['recording_id']}/0,near_collision,0,3,yes\n"
     )
     assert main(["store", "label", str(store), "--corrections", str(review)]) == 0
-    whole = ingested(capsys, MONDAY, "--store", store, "--repeated", "replace")
+    whole = ingested(capsys, third, "--salvage", "--store", store, "--repeated", "replace")
     (note,) = (note for note in whole["notes"] if "It stays" in note)
     assert "people corrected 1 label of it" in note
     assert f"`restock store remove {store} {first['recording_id']}`" in note
 
 
 @pytest.mark.long
-def test_a_part_after_the_whole_is_refused_where_asked(
-    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_after_the_whole_is_refused_where_asked(part, third, tmp_path, capsys):
     store = tmp_path / "store"
-    whole = ingested(capsys, MONDAY, "--store", store)
+    whole = ingested(capsys, third, "--salvage", "--store", store)
     refuse = ["ingest", str(part), "--salvage", "--store", str(store), "--repeated", "refuse"]
     assert main(refuse) == 2
     error = capsys.readouterr().err
@@ -105,15 +106,15 @@ def test_a_part_after_the_whole_is_refused_where_asked(
     assert "--repeated keep" in error
     assert len(StoreWriter(store).live()) == 1
     # Ingesting the very recording again replaces its own rows: that is no repeat.
-    again = ingested(capsys, MONDAY, "--store", store, "--force", "--repeated", "refuse")
+    again = ingested(
+        capsys, third, "--salvage", "--store", store, "--force", "--repeated", "refuse"
+    )
     assert again["status"] == "written"
     assert again["repeats"] is None
 
 
 @pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
-def test_a_drive_that_was_replayed_and_recorded_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_that_was_replayed_and_recorded_again(tmp_path, capsys):
     profile, store = tmp_path / "neato.toml", tmp_path / "store"
     (original,) = (NEATO / "2022-original").iterdir()
     assert main(["profile", "new", str(original), "--out", str(profile)]) == 0
@@ -133,24 +134,6 @@ def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
         store.fit([staged])
         store.commit_staged([staged])
         assert store.repeated(staged, 0.2) is None
-
-
-def test_sketches_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or a thousand recordings would read each other's a thousand times."""
-    writer, requested = StoreWriter(tmp_path / "s"), []
-    manifests = StoreWriter.manifests
-
-    def counted(self: StoreWriter, ingests: list[Any], *args: Any, **more: Any) -> pa.Table:
-        requested.append(len(ingests))
-        return manifests(self, ingests, *args, **more)
-
-    monkeypatch.setattr(StoreWriter, "manifests", counted)
-    for index in (1, 2, 3):
-        rows = recording_transitions(index, episodes=5)
-        staged = writer.stage(manifest(rows), rows)
-        writer.write(manifest(rows), rows)
-        assert StoreWriter(tmp_path / "s").repeated(staged, 0.1) is None
-    assert requested == [0, 1, 1]
 
 
 def test_hashes_see_a_thousandth_and_no_less() -> None:

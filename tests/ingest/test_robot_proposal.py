@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import Drive, columns, typed_topics, write_topics
-from support.paths import ROOT
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
@@ -21,8 +20,6 @@ from restock.ingest.propose.footprint import footprint_of
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import propose_robot
 from restock.ingest.propose.roles import robots_in
-
-RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 
 
 def link(name: str, shape: str = "", mass: float = 0.0) -> str:
@@ -182,10 +179,15 @@ def test_any_tree_of_joints_ends_in_values_or_a_sentence(
         assert value != float("inf")
 
 
-def test_a_proposed_profile_has_the_robot_of_the_file(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_topics(typed_topics(Drive()), tmp_path_factory.mktemp("drive") / "bag")
+
+
+def test_a_proposed_profile_has_the_robot_of_the_file(bag, tmp_path):
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(robot(wheels((0.2, 0.22), (0.2, -0.22))))
-    with open_recording(RECORDING) as recording:
+    with open_recording(bag) as recording:
         proposed = propose_profile(recording, "mine", urdf=urdf)
         plain = propose_profile(recording, "mine")
     own = parse_profile(proposed.toml, where="proposed")
@@ -253,7 +255,7 @@ def test_robots_in_a_recording_have_their_own_outlines(said_of, outline, source,
         assert source in found.source
 
 
-def test_a_file_that_is_no_robot_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_no_robot_is_refused(bag, tmp_path):
     path = tmp_path / "arm.urdf"
     for content, message in (
         (robot().encode(), "has no wheels"),
@@ -261,7 +263,7 @@ def test_a_file_that_is_no_robot_is_refused(tmp_path: Path) -> None:
     ):
         path.write_bytes(content)
         with (
-            open_recording(RECORDING) as recording,
+            open_recording(bag) as recording,
             pytest.raises(ConfigError, match=message),
         ):
             propose_profile(recording, "mine", urdf=path)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Reader, Writer
+from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from restock.errors import RecordingError
@@ -58,19 +58,6 @@ def test_an_index_that_names_another_connection(bag: Path, record: int, other: i
     content[place : place + 4] = struct.pack("<I", other)
     bag.write_bytes(content)
     assert read(bag) == ({"/flag": ROWS, "/number": ROWS}, 2 * ROWS, 0)
-
-
-def test_values_are_those_that_rosbags_reads(bag: Path) -> None:
-    with Reader(bag) as reader:
-        wanted = [
-            (stamp, TYPES.deserialize_ros1(data, connection.msgtype).data)
-            for connection, stamp, data in reader.messages()
-            if connection.topic == "/number"
-        ]
-    with open_recording(bag) as recording:
-        columns = recording.read({"/number": ["data"]})["/number"]
-    assert columns.log_time_ns.tolist() == [stamp for stamp, _ in wanted]
-    assert np.array_equal(columns.fields["data"], [value for _, value in wanted])
 
 
 def test_a_message_of_a_connection_that_is_not_named_is_counted(bag: Path) -> None:

@@ -115,23 +115,6 @@ def test_values_of_no_use_make_ticks_unusable(topic, field, values, problem, tic
     assert np.isfinite(steps.signals["wheel_speed_mps"]).all()
 
 
-def test_scans_of_inf_and_nan_and_changing_geometry():
-    drive = Drive()
-    topics = drive.topics()
-    tenth = np.arange(0, 6, 0.1)
-    ranges = np.full((60, 72), 3.0)
-    ranges[:30, ::2] = np.inf
-    ranges[:30, 1::4] = np.nan
-    topics["/scan"] = columns(tenth, scans(ranges))
-    topics["/scan"].fields["angle_min"][30:] = 0.0  # as some drivers: forward first
-    steps = steps_of(PROFILE, topics)
-    assert set(steps.problem) == {""}
-    clearance = steps.signals["sector_clearance_m"]
-    assert np.isfinite(clearance).all()
-    assert clearance.max() == PROFILE.task.range_max_m  # sectors with nothing but inf and NaN
-    assert clearance[-1].max() < 3.0
-
-
 @pytest.mark.parametrize("nothing", [np.nan, 0.0])
 def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
     topics = Drive().topics()

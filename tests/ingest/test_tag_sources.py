@@ -125,6 +125,11 @@ def test_custom_data_that_cannot_be_used(tmp_path, text, says):
     assert any("its own metadata cannot be used: custom_data" in note for note in notes)
 
 
+def test_entries_of_custom_data_that_are_no_text_are_counted():
+    (_, _, entries), more = custom_data("custom_data:\n  a: [1]\n  b: c\n  g: ~\n", "a bag")
+    assert (entries, more) == ({"b": "c"}, 1)
+
+
 @pytest.mark.parametrize(
     ("pattern", "path", "tags"),
     [

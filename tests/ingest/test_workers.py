@@ -18,7 +18,6 @@ from support.driven_robot import write_bags
 from support.long import one_in
 
 from restock.cli import main
-from restock.errors import RecordingError
 from restock.ingest.batch import IngestJob, ingest_all, side_by_side
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store, is_store
@@ -62,18 +61,6 @@ class _Broken(IngestJob):
         return super().prepare(path)
 
 
-def test_a_killed_worker_costs_its_recording_only(bags, tmp_path):
-    job = _Broken(load_profile("warehouse_amr"), tmp_path / "s")
-    paths = sorted(bags.iterdir())
-    results = dict(ingest_all(paths, job, workers=2))
-    assert list(results) == paths
-    error = results.pop(bags / "drive1")
-    assert "drive1: the process that read it was killed (SIGKILL)" in str(error)
-    assert {result.status for result in results.values()} == {"written"}
-    with Store(tmp_path / "s") as store:
-        assert store.sql("SELECT count(*) FROM recordings").fetchall() == [(4,)]
-
-
 def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("restock.ingest.batch.IngestJob", _Broken)
     code = main(["ingest", str(bags), "--store", str(tmp_path / "s"), "--workers", "2", "--json"])
@@ -111,34 +98,24 @@ def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatc
 
 
 def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
-    """As a network's file system does in the middle of a night."""
-    from restock.ingest import pipeline
-
     def failing(*args, **kwargs):
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(pipeline, "prepare", failing)
+    monkeypatch.setattr("restock.ingest.pipeline.prepare", failing)
     failed = IngestJob(load_profile("warehouse_amr"), None).prepare(Path("nas/run.mcap"))
-    assert isinstance(failed, RecordingError)
-    assert "nas/run.mcap: cannot be read or written: Input/output error\n  check" in str(failed)
+    assert "nas/run.mcap: cannot be read or written: Input/output error" in str(failed)
 
 
 def test_developers_see_where_a_recording_failed(bags, monkeypatch, capsys):
-    def prepare(path, *args, **kwargs):
-        return path.no_such_attribute
-
-    monkeypatch.setattr("restock.ingest.pipeline.prepare", prepare)
+    monkeypatch.setattr("restock.ingest.pipeline.prepare", lambda path, *_, **__: path.no_such)
     arguments = ["ingest", str(bags / "drive1"), "--dry-run", "--json"]
     assert main(arguments) == 2
     said = capsys.readouterr().err
     assert "drive1: a bug in Restock: AttributeError" in said
-    assert "RESTOCK_TRACEBACK=1 shows the traceback" in said
     assert "Traceback" not in said
     monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
     assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert "Traceback (most recent call last)" in said
-    assert "in prepare" in said
+    assert "Traceback (most recent call last)" in capsys.readouterr().err
 
 
 def command(bags: Path, store: Path, *more: str) -> list[str]:
