@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.driven_robot import START_NS, Drive, columns, without, write_topics
-from support.paths import ROOT
+from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -19,7 +18,7 @@ from restock.replay.store.store import Store
 
 TWIST = "geometry_msgs/msg/Twist"
 NAV, TELEOP, OUT, JOY = "/cmd_vel_nav", "/teleop_cmd_vel", "/cmd_vel", "/joy"
-TAKEN_OVER_S = (4.0, 7.0)
+TAKEN_OVER_S, NS = (4.0, 7.0), 10**9
 SOURCES = """
 [command_sources.navigation]
 topic = "/cmd_vel_nav"
@@ -82,16 +81,23 @@ def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
     return found
 
 
-def profile_of(bag: Path, folder: Path, sources: str) -> Path:
-    """Return a proposal with these sources of commands and no others."""
-    file = folder / "p.toml"
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a proposal without its sources of commands."""
+    folder = tmp_path_factory.mktemp("plain")
+    bag, file = write_topics(taken_over(), folder / "bag"), folder / "p.toml"
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
     kept, skip = [], False
     for line in file.read_text().splitlines():
         skip = line.startswith("[command_sources") or (skip and not line.startswith("["))
         kept += [] if skip else [line]
-    file.write_text("\n".join(kept) + "\n" + sources)
-    return file
+    return "\n".join(kept) + "\n"
+
+
+def profile_of(plain: str, folder: Path, sources: str) -> Path:
+    """Return the proposal with these sources of commands."""
+    (folder / "p.toml").write_text(plain + sources)
+    return folder / "p.toml"
 
 
 def policies(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
@@ -103,9 +109,9 @@ def policies(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_the_source_whose_command_is_in_force_is_who_drove(storage, tmp_path, capsys):
+def test_the_source_whose_command_is_in_force_is_who_drove(plain, storage, tmp_path, capsys):
     bag = write_topics(taken_over(), tmp_path / "bag", storage=storage)
-    rows = policies(bag, profile_of(bag, tmp_path, SOURCES), tmp_path / "s")
+    rows = policies(bag, profile_of(plain, tmp_path, SOURCES), tmp_path / "s")
     assert len(rows) > 50
     by_hand = [s for s, policy in rows if policy == "teleop"]
     assert min(by_hand) == pytest.approx(TAKEN_OVER_S[0], abs=0.2)
@@ -115,20 +121,20 @@ def test_the_source_whose_command_is_in_force_is_who_drove(storage, tmp_path, ca
     assert "whose command it equals: navigation, teleop" in capsys.readouterr().out
 
 
-def test_a_button_says_it_where_no_source_has_the_command(tmp_path, capsys):
+def test_a_button_says_it_where_no_source_has_the_command(plain, tmp_path, capsys):
     topics = taken_over()
     del topics[TELEOP], topics[NAV]
     bag = write_topics(topics, tmp_path / "bag")
-    rows = policies(bag, profile_of(bag, tmp_path, PRESSED), tmp_path / "s")
+    rows = policies(bag, profile_of(plain, tmp_path, PRESSED), tmp_path / "s")
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"unknown"}
 
 
-def test_no_later_command_says_who_drives_now(tmp_path):
+def test_no_later_command_says_who_drives_now(plain, tmp_path):
     """What sources say after a moment changes nobody before it."""
     topics, late = taken_over(), START_NS + 5 * 10**9
     bag = write_topics(topics, tmp_path / "bag")
-    profile = profile_of(bag, tmp_path, SOURCES)
+    profile = profile_of(plain, tmp_path, SOURCES)
     before = policies(bag, profile, tmp_path / "s")
     for name in (NAV, TELEOP):
         columns_ = topics[name][1]
@@ -138,20 +144,14 @@ def test_no_later_command_says_who_drives_now(tmp_path):
     assert {p for s, p in other if s > 5.2} == {"unknown"}
 
 
-def test_a_recording_without_sources_has_unknown_drivers(tmp_path, capsys):
+def test_a_recording_without_sources_has_unknown_drivers(plain, tmp_path, capsys):
     topics = taken_over()
-    bag = write_topics(topics, tmp_path / "bag")
-    profile = profile_of(bag, tmp_path, SOURCES)
-    plain = profile.read_text().replace(SOURCES, "")
+    profile = profile_of(plain, tmp_path, SOURCES)
     with_sources, without = load_profile(profile), parse_profile(plain, where="p")
     assert with_sources.hash != without.hash
     del topics[NAV], topics[TELEOP], topics[JOY]
     lone = write_topics(topics, tmp_path / "lone")
     assert {policy for _, policy in policies(lone, profile, tmp_path / "s")} == {"unknown"}
-    capsys.readouterr()
-    assert main(["profile", "check", str(profile), str(bag), "--json"]) == 0
-    inputs = {one["input"]: one for one in json.loads(capsys.readouterr().out)["inputs"]}
-    assert inputs["command_sources.teleop"]["messages"] == 30
 
 
 MUX, STEP = "/chosen", np.array([0.025, 0.06])
@@ -184,10 +184,10 @@ def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.4])
-def test_a_source_is_followed_through_a_smoother(limit, tmp_path):
+def test_a_source_is_followed_through_a_smoother(plain, limit, tmp_path):
     """No smoothed command equals one of any source."""
     bag = write_topics(smoothed(limit), tmp_path / "bag")
-    profile = profile_of(bag, tmp_path, SOURCES + THROUGH)
+    profile = profile_of(plain, tmp_path, SOURCES + THROUGH)
     assert load_profile(profile).inputs.command.topic == OUT
     rows = policies(bag, profile, tmp_path / "s")
     assert len(rows) > 50
@@ -195,66 +195,41 @@ def test_a_source_is_followed_through_a_smoother(limit, tmp_path):
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
-def test_a_source_is_unknown_where_the_multiplexer_was_silent(tmp_path):
-    topics = smoothed()
+def test_a_source_is_unknown_where_the_multiplexer_was_silent(plain, tmp_path):
+    topics, profile = smoothed(), profile_of(plain, tmp_path, SOURCES + THROUGH)
     chosen = topics[MUX][1]
-    kept = (chosen.log_time_ns < START_NS + 8 * 10**9) | (
-        chosen.log_time_ns > START_NS + 10 * 10**9
-    )
-    topics[MUX] = (TWIST, without(chosen, kept))
-    bag = write_topics(topics, tmp_path / "bag")
-    rows = policies(bag, profile_of(bag, tmp_path, SOURCES + THROUGH), tmp_path / "s")
+    silent = (chosen.log_time_ns >= START_NS + 8 * NS) & (chosen.log_time_ns <= START_NS + 10 * NS)
+    some = topics | {MUX: (TWIST, without(chosen, ~silent))}
+    rows = policies(write_topics(some, tmp_path / "some"), profile, tmp_path / "s")
     assert {policy for s, policy in rows if 8.6 < s < 9.8} == {"unknown"}
     assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
-
-
-def test_drivers_are_unknown_without_the_multiplexer(tmp_path):
-    topics = smoothed()
     del topics[MUX]
-    bag = write_topics(topics, tmp_path / "b")
-    rows = policies(bag, profile_of(bag, tmp_path, SOURCES + THROUGH), tmp_path / "s")
-    assert len(rows) > 50
+    rows = policies(write_topics(topics, tmp_path / "none"), profile, tmp_path / "t")
     assert {policy for _, policy in rows} == {"unknown"}
 
 
-def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
-    text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
-    chain = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\n"
-    with pytest.raises(ConfigError, match="`command_through` is given without"):
-        parse_profile(
-            text + chain + "fields = {speed_mps = 'linear.x', yaw_rate_radps = 'angular.z'}",
-            where="p",
-        )
-    with pytest.raises(ConfigError, match="does not show when this source drives"):
-        parse_profile(text + SOURCES + chain + "fields = {speed_mps = 'linear.x'}", where="p")
+CHAIN = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\nfields = {}\n"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("text", "said"),
     [
-        ('"buttons[4]"', '"button[4]"', None),
-        (
-            'pressed = "buttons[4]"',
-            'speed_mps = "axes[1]"',
-            "does not show when this source drives",
-        ),
-        ('pressed = "buttons[4]"', 'presed = "buttons[4]"', "unknown 'presed'"),
-        ("[command_sources.teleop]", '[command_sources.""]', "1 to 64 printable"),
-        (
-            "fields =",
-            "optional = true\nfields =",
-            "may always lack a source of commands",
-        ),
+        (CHAIN.replace("{}", "{speed_mps = 'linear.x', yaw_rate_radps = 'angular.z'}"), "without"),
+        (SOURCES + CHAIN.replace("{}", "{speed_mps = 'linear.x'}"), "does not show when this"),
+        (PRESSED.replace('pressed = "buttons[4]"', 'speed_mps = "axes[1]"'), "does not show when"),
+        (PRESSED.replace("pressed", "presed"), "unknown 'presed'"),
+        (PRESSED.replace("teleop", '""'), "1 to 64 printable"),
+        (PRESSED.replace("fields", "optional = true\nfields"), "may always lack a source"),
     ],
 )
-def test_what_is_no_source_is_refused_with_its_key(old, new, said, tmp_path, capsys):
+def test_sources_that_show_nothing_are_refused(text, said):
+    with pytest.raises(ConfigError, match=said):
+        parse_profile(WAREHOUSE + text, where="p")
+
+
+def test_a_button_that_is_not_there_is_named_with_its_key(plain, tmp_path, capsys):
     bag = write_topics(taken_over(2.0), tmp_path / "bag")
-    profile = profile_of(bag, tmp_path, PRESSED.replace(old, new))
-    if said is not None:
-        with pytest.raises(ConfigError, match=said):
-            load_profile(profile)
-        return
-    capsys.readouterr()
+    profile = profile_of(plain, tmp_path, PRESSED.replace("buttons", "button"))
     assert main(["profile", "check", str(profile), str(bag)]) == 2
     assert "`command_sources.teleop.fields`: /joy: no field 'button'" in capsys.readouterr().err
 

@@ -8,7 +8,6 @@ import shutil
 from contextlib import contextmanager
 from pathlib import Path
 
-import pyarrow as pa
 import pytest
 from support.long import one_in
 from support.s3_server import files_of
@@ -16,7 +15,7 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import QueryError, StoreError
-from restock.ingest.store import commits, lineage
+from restock.ingest.store import lineage
 from restock.ingest.store import writer as writer_module
 from restock.ingest.store.commits import recording_columns
 from restock.ingest.store.damaged_files import drop_damaged
@@ -73,7 +72,7 @@ WHOLE = expected((1, "a", 0), (2, "b", 7), (3, "a", 0))
 @pytest.mark.parametrize(
     "names", one_in(3, [[TRANSITIONS, RECORDINGS], [TRANSITIONS], [RECORDINGS]])
 )
-def test_a_damaged_file_is_joined_again_from_those_it_was_made_of(tmp_path, names, how):
+def test_a_damaged_file_is_joined_again_from_its_sources(tmp_path, names, how):
     writer = joined(tmp_path / "s")
     before = writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist()
     damaged = [one for name in names for one in active(tmp_path / "s", name) if "compacted" in one]
@@ -92,7 +91,7 @@ def test_a_damaged_file_is_joined_again_from_those_it_was_made_of(tmp_path, name
 @pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
 @pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
 @pytest.mark.parametrize("how", one_in(2, DAMAGES[:2]))
-def test_what_is_lost_with_a_damaged_file_is_named_and_comes_back_by_ingest(place, name, how):
+def test_what_a_damaged_file_loses_is_named_and_ingested_again(place, name, how):
     writer = joined(place)
     writer.clean(retention_hours=0)  # the files that it was made of
     damage(place, next(one for one in active(place, name) if "compacted" in one), how)
@@ -111,9 +110,7 @@ def test_what_is_lost_with_a_damaged_file_is_named_and_comes_back_by_ingest(plac
 
 
 @pytest.mark.parametrize("how", ["cut", "missing"])
-def test_a_manifest_of_its_own_that_is_damaged_is_named_and_dropped(tmp_path, how):
-    writer = StoreWriter(tmp_path / "s")
-    writer.write_all([one(1), one(2)])
+def test_a_damaged_manifest_is_named_and_dropped(writer, tmp_path, how):
     file = f"{RECORDINGS}/{1:016x}/{1:016x}-a.parquet"
     damage(tmp_path / "s", file, how)
     with pytest.raises(StoreError, match=file) as said:
@@ -129,7 +126,7 @@ def test_a_manifest_of_its_own_that_is_damaged_is_named_and_dropped(tmp_path, ho
     assert shown(tmp_path / "s") == expected((1, "b", 0), (2, "a", 0))
 
 
-def test_of_damaged_rows_of_its_own_the_remedy_is_to_ingest_with_force(tmp_path):
+def test_damaged_rows_are_ingested_with_force(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))
     file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
@@ -161,17 +158,6 @@ def test_a_file_that_only_now_cannot_be_read_is_not_dropped(tmp_path, monkeypatc
     assert shown(tmp_path / "s") == WHOLE
 
 
-def test_memory_that_does_not_suffice_is_no_damage(tmp_path, monkeypatch):
-    writer = joined(tmp_path / "s")
-
-    def full(*_: object) -> None:
-        raise pa.ArrowMemoryError("malloc of size 1 failed")
-
-    monkeypatch.setattr("restock.ingest.store.damaged_files.open_parquet", full)
-    with pytest.raises(MemoryError):
-        drop_damaged(writer)
-
-
 def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
     place = tmp_path / "s"
     writer = StoreWriter(place)
@@ -192,55 +178,23 @@ def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
     assert shown(place) == expected((2, "a", 0))
 
 
-def test_files_without_checksums_are_read_as_before(tmp_path, monkeypatch):
-    """Another tool may write them."""
-    options = commits.parquet_options
-    without = {"write_page_checksum": False}
-    for module in (commits, writer_module):
-        monkeypatch.setattr(module, "parquet_options", lambda schema: options(schema) | without)
-    writer = StoreWriter(tmp_path / "s")
-    writer.write_all([one(1), one(2)])
-    monkeypatch.undo()
-    assert drop_damaged(writer).dropped == []
-    compact(writer)
-    assert drop_damaged(writer).dropped == []
-    damage(tmp_path / "s", active(tmp_path / "s", TRANSITIONS)[0], "numbers")
-    assert drop_damaged(writer).joined_again  # a compaction gave its file checksums
-    assert shown(tmp_path / "s") == expected((1, "a", 0), (2, "a", 0))
-
-
-def test_two_that_drop_the_same_file_drop_it_once(tmp_path, monkeypatch):
+def test_two_that_drop_the_same_file_drop_it_once(tmp_path, before_commit):
     writer = joined(tmp_path / "s")
     file = next(one for one in active(tmp_path / "s", TRANSITIONS) if "compacted" in one)
     damage(tmp_path / "s", file, "cut")
-    transact = StoreWriter.transact
 
-    def overtaken(self, *args, **given):
-        monkeypatch.setattr(StoreWriter, "transact", transact)
+    def dropped_meanwhile():
         assert drop_damaged(StoreWriter(tmp_path / "s")).joined_again == [file]
-        transact(self, *args, **given)
 
-    monkeypatch.setattr(StoreWriter, "transact", overtaken)
+    before_commit(dropped_meanwhile)
     done = drop_damaged(writer)
     assert (done.joined_again, done.dropped, done.lost) == ([], [], [])
     assert shown(tmp_path / "s") == WHOLE
     assert len([one for one in files_of(tmp_path / "s") if "transitions/compacted" in one]) == 3
 
 
-def test_of_a_version_whose_manifests_are_gone_no_recording_is_left_out(tmp_path):
-    writer = StoreWriter(tmp_path / "s")
-    version = writer.write_all([one(1), one(2)])
-    writer.write(*one(1, "b"))
-    assert len(writer.live(version=version)) == 2
-    writer.clean(retention_hours=0)
-    with pytest.raises(StoreError, match="can no longer be read"):
-        writer.live(version=version)
-
-
-def test_an_ingest_is_not_failed_by_a_damaged_manifest_of_another_recording(tmp_path, monkeypatch):
+def test_an_ingest_survives_a_damaged_manifest_of_another(writer, tmp_path, monkeypatch):
     """In what it does at its end; frames that the manifest may name are kept."""
-    writer = StoreWriter(tmp_path / "s")
-    writer.write_all([one(1), one(2)])
     damage(tmp_path / "s", f"{RECORDINGS}/{1:016x}/{1:016x}-a.parquet", "cut")
     frames = tmp_path / "s/frames" / f"{1:016x}" / f"{1:016x}-a.parquet"
     frames.parent.mkdir(parents=True)
@@ -286,7 +240,7 @@ def test_the_command_names_what_is_lost_and_exits_3(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("gone", [TRANSITIONS, RECORDINGS])
-def test_a_store_without_one_of_its_tables_is_restored_and_not_made_again(tmp_path, capsys, gone):
+def test_a_store_without_one_table_is_not_made_again(tmp_path, capsys, gone):
     place, log = tmp_path / "s", tmp_path / "log.mcap"
     StoreWriter(place).write_all([one(1), one(2)])
     log.touch()
@@ -310,7 +264,7 @@ def test_a_store_without_one_of_its_tables_is_restored_and_not_made_again(tmp_pa
     assert files_of(place) == before
 
 
-def test_a_first_ingest_that_was_killed_between_its_tables_goes_on(tmp_path):
+def test_a_first_ingest_killed_between_its_tables_goes_on(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.create(RECORDINGS, recording_columns())
     with pytest.raises(StoreError, match="not a store"):
@@ -321,9 +275,7 @@ def test_a_first_ingest_that_was_killed_between_its_tables_goes_on(tmp_path):
 
 @pytest.mark.parametrize("how", ["cut", "missing"])
 @pytest.mark.parametrize("is_joined", [False, True])
-def test_verbs_that_need_a_damaged_file_of_rows_name_it_and_the_remedy(
-    tmp_path, capsys, how, is_joined
-):
+def test_verbs_name_a_damaged_file_and_the_remedy(tmp_path, capsys, how, is_joined):
     place = tmp_path / "s"
     writer = StoreWriter(place)
     writer.write_all([one(1), one(2)])
@@ -343,9 +295,7 @@ def test_verbs_that_need_a_damaged_file_of_rows_name_it_and_the_remedy(
         assert "its SQL does not run" not in said
 
 
-def test_damage_of_which_duckdb_names_no_file_has_a_remedy_too(tmp_path):
-    writer = StoreWriter(tmp_path / "s")
-    writer.write_all([one(1), one(2)])
+def test_damage_without_a_file_name_has_a_remedy_too(writer, tmp_path):
     damage(tmp_path / "s", active(tmp_path / "s", TRANSITIONS)[0], "a page")
     with Store(tmp_path / "s") as store:
         for text in ("SELECT nothing FROM transitions", "FROM read_csv('no.csv')"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -99,21 +100,20 @@ def test_an_exposure_takes_no_row_from_a_condition():
     assert labels_version(every) != labels_version(SHIPPED)
 
 
-@pytest.fixture
-def profile(tmp_path: Path) -> Path:
-    path = tmp_path / "amr.toml"
-    path.write_text(TEXT.replace(LISTED, 'exposures = ["closing_traffic"]') + OWN)
-    return path
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a store of one drive, beside the profile `amr.toml` of its rows."""
+    folder = tmp_path_factory.mktemp("exposures")
+    bag, profile = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "a"), folder / "amr.toml"
+    profile.write_text(TEXT.replace(LISTED, 'exposures = ["closing_traffic"]') + OWN)
+    command = ["ingest", str(bag), "--profile", str(profile), "--store", str(folder / "store")]
+    assert main(command) == 0
+    return folder / "store"
 
 
 @pytest.fixture
-def store(tmp_path: Path, profile: Path) -> Path:
-    write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), tmp_path / "a")
-    path = tmp_path / "store"
-    assert (
-        main(["ingest", str(tmp_path / "a"), "--store", str(path), "--profile", str(profile)]) == 0
-    )
-    return path
+def profile(store: Path) -> Path:
+    return store.parent / "amr.toml"
 
 
 def test_a_store_lists_exposures_beside_its_conditions(store, profile):
@@ -139,8 +139,10 @@ def test_a_store_lists_exposures_beside_its_conditions(store, profile):
     assert again.labels_version == load_profile(profile).labels_version
 
 
-def test_changed_exposures_are_told_again_from_the_store(store, profile):
-    profile.write_text(profile.read_text().replace("pose_x_m > 2", "pose_x_m > 2.2"))
+def test_changed_exposures_are_told_again_from_the_store(store, profile, tmp_path):
+    store, text = shutil.copytree(store, tmp_path / "store"), profile.read_text()
+    profile = tmp_path / "amr.toml"
+    profile.write_text(text.replace("pose_x_m > 2", "pose_x_m > 2.2"))
     assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
     with Store(store) as opened:
         assert opened.sql(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -23,17 +24,23 @@ SOON = '\n[[condition]]\nname = "soon"\ntiming = "post"\npriority = 1\nsql = "{}
 HALF_WAY = "lead(pose_x_m) OVER episode > 2.55"
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two recordings, one of which reaches its goal, read by a profile with a condition `soon`."""
-    profile = tmp_path / "amr.toml"
+    folder = tmp_path_factory.mktemp("label")
+    profile = folder / "amr.toml"
     profile.write_text(TEXT + SOON.format(HALF_WAY))
     for name, goal in (("a", 3.0), ("b", 11.0)):
-        write_bag(Drive(goals=[(0.0, goal, 1.0)], truth="soon"), tmp_path / name)
-    path = tmp_path / "store"
-    bags = [str(tmp_path / name) for name in "ab"]
-    assert main(["ingest", *bags, "--store", str(path), "--profile", str(profile)]) == 0
-    return path
+        write_bag(Drive(goals=[(0.0, goal, 1.0)], truth="soon"), folder / name)
+    bags, store = [str(folder / name) for name in "ab"], str(folder / "store")
+    assert main(["ingest", *bags, "--store", store, "--profile", str(profile)]) == 0
+    return folder
+
+
+@pytest.fixture
+def store(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "store"
 
 
 def rows(path: Path, columns: str = "*") -> list[tuple]:
@@ -117,6 +124,16 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
     with pytest.raises(StoreError, match="ingested again or removed in the meantime"):
         relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "primary_condition")} == {"nominal", "soon"}
+
+
+def test_what_cannot_be_labelled_again_is_refused(store, tmp_path, capsys):
+    assert main(["store", "label", str(tmp_path / "none")]) == 2
+    assert "there is no store, or it is empty" in capsys.readouterr().err
+    writer = StoreWriter(store)
+    original = writer.rows
+    writer.rows = lambda *key: original(*key).replace_schema_metadata(None)
+    with pytest.raises(StoreError, match="lack the ends of their episodes"):
+        relabel_store(writer, lambda name: [Condition("always", "pre", "true")])
 
 
 def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from deltalake import DeltaTable
 from support.long import one_in
 from support.stores import one, shown
 
@@ -97,9 +96,7 @@ def test_after_the_retention_its_files_are_deleted(tmp_path):
 
 
 @pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
-def test_all_may_be_removed_of_a_store_that_is_older_than_the_retention(
-    tmp_path, joined, monkeypatch
-):
+def test_all_may_be_removed_of_an_old_store(tmp_path, joined, monkeypatch):
     """The file of their manifests is old by then, and is of no recording that is there."""
     place = tmp_path / "s"
     then_ns = time.time_ns() - 30 * 86400 * 10**9
@@ -154,83 +151,24 @@ def test_a_recording_is_named_by_its_id_a_prefix_or_its_path(tmp_path, monkeypat
     assert len(shown(tmp_path / "s")) == 3
 
 
-def test_a_prefix_of_several_names_them(tmp_path):
-    writer = three(tmp_path / "s")
-    with pytest.raises(StoreError, match="'00000000' is the name of 3 recordings") as error:
-        remove_recordings(writer, ["00000000"])
-    assert all(f"{name_of(n)} (logs/{n}.mcap)" in str(error.value) for n in (1, 2, 3))
-
-
-def overtake(
-    monkeypatch: pytest.MonkeyPatch, place: Path, *recordings: tuple[pa.Table, pa.Table]
-) -> None:
-    """Another writer writes these just before the next commit of any writer."""
-    transact = StoreWriter.transact
-
-    def overtaken(self, *args, **given):
-        monkeypatch.setattr(StoreWriter, "transact", transact)
-        StoreWriter(place).write_all(recordings)
-        transact(self, *args, **given)
-
-    monkeypatch.setattr(StoreWriter, "transact", overtaken)
-
-
-def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkeypatch, capsys):
-    """Root, who may run the tests, may write all: this is what delta-rs says to others."""
-    three(tmp_path / "s")
-    said = (
-        "Generic LocalFileSystem error\n \x1b[31m↳\x1b[0m Unable to open file /s/3.json#1"
-        "\n \x1b[31m↳\x1b[0m Permission denied (os error 13)"
-    )
-
-    def denied(self, *args, **given):
-        raise OSError(said)
-
-    monkeypatch.setattr(DeltaTable, "create_write_transaction", denied)
-    assert main(["store", "remove", str(tmp_path / "s"), name_of(1)]) == 2
-    reported = capsys.readouterr().err
-    assert "cannot be written: " in reported
-    assert "Permission denied" in reported
-    assert "read" not in reported
-    assert len(shown(tmp_path / "s")) == 3
-
-
 @pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
-def test_another_writer_may_be_faster(tmp_path, monkeypatch, joined):
+def test_another_writer_may_be_faster(tmp_path, before_commit, joined):
     writer = three(tmp_path / "s", joined=joined)
-    overtake(monkeypatch, tmp_path / "s", one(1, "b"), one(4))
+    before_commit(lambda: StoreWriter(tmp_path / "s").write_all([one(1, "b"), one(4)]))
     remove_recordings(writer, [name_of(2)])
     assert shown(tmp_path / "s") == expected((1, "b"), (3, "a"), (4, "a"))
 
 
 @pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
-def test_what_another_writer_ingests_again_meanwhile_is_not_removed(tmp_path, monkeypatch, joined):
+def test_what_is_ingested_again_meanwhile_is_not_removed(tmp_path, before_commit, joined):
     writer = three(tmp_path / "s", joined=joined)
-    overtake(monkeypatch, tmp_path / "s", one(2, "b"))
+    before_commit(lambda: StoreWriter(tmp_path / "s").write(*one(2, "b")))
     with pytest.raises(StoreError, match=f"{name_of(2)} was ingested again or removed in the mean"):
         remove_recordings(writer, [name_of(1), name_of(2)])
     assert shown(tmp_path / "s") == expected((1, "a"), (2, "b"), (3, "a"))
 
 
-@pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
-def test_a_commit_whose_answer_is_lost_is_not_done_twice(tmp_path, monkeypatch, joined):
-    from deltalake.exceptions import CommitFailedError
-
-    writer = three(tmp_path / "s", joined=joined)
-    transact = StoreWriter.transact
-
-    def lost(self, *args, **given):
-        transact(self, *args, **given)
-        monkeypatch.setattr(StoreWriter, "transact", transact)
-        raise CommitFailedError("timeout")
-
-    monkeypatch.setattr(StoreWriter, "transact", lost)
-    done = remove_recordings(writer, [name_of(2)])
-    assert done.version == done.version_before + 1
-    assert shown(tmp_path / "s") == expected((1, "a"), (3, "a"))
-
-
-def test_the_command_says_what_was_removed_and_how_to_get_it_back(tmp_path, capsys):
+def test_the_command_says_what_it_removed(tmp_path, capsys):
     place = str(tmp_path / "s")
     three(place)
     assert main(["store", "remove", place, "logs/2.mcap", "--dry-run"]) == 0
@@ -252,26 +190,11 @@ def test_the_command_says_what_was_removed_and_how_to_get_it_back(tmp_path, caps
     document = json.loads(capsys.readouterr().out)
     assert document["recordings"][0]["source_file"] == "logs/1.mcap"
     assert (document["left"], document["dry_run"]) == (0, False)
-
-
-def test_what_names_no_recording_exits_2(tmp_path, capsys):
-    place = str(tmp_path / "s")
-    three(place)
-    for names in (["logs/9.mcap"], ["00000000"], []):
-        assert (
-            main(
-                ["store", "remove", place, name_of(1), *names]
-                if names
-                else ["store", "remove", place]
-            )
-            == 2
-        )
-    assert "names no recording" in capsys.readouterr().err
+    assert main(["store", "remove", place]) == 2  # names no recording
     assert main(["store", "remove", str(tmp_path / "none"), name_of(1)]) == 2
-    assert len(shown(place)) == 3
 
 
-def test_corrected_labels_of_a_removed_recording_are_in_no_ones_way(tmp_path, capsys):
+def test_labels_corrected_in_a_removed_recording_go_with_it(tmp_path, capsys):
     writer = three(tmp_path / "s")
     (first, second, _) = writer.live().sort_by("recording_id").to_pylist()
     stamps = [int(one(n)[1]["stamp_ns"][0].as_py()) for n in (1, 2)]

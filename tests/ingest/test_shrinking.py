@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import zstandard
 from mcap.writer import CompressionType
 from support.bag_samples import write_bag, write_mcap
 
@@ -84,6 +85,14 @@ def test_a_tail_of_zeros_is_damage(tmp_path: Path) -> None:
         open_recording(path)
     with open_recording(path, salvage=True) as recording:
         assert 20 < recording.messages < 140
+
+
+def test_zeros_in_a_compressed_file_are_damage(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap.zstd"
+    head = b"\x89MCAP0\r\n" + b"\x01" + (8).to_bytes(8, "little") + bytes(8)
+    path.write_bytes(zstandard.ZstdCompressor().compress(head + bytes(1 << 20)))
+    with pytest.raises(RecordingError, match="opcode 0"):
+        open_recording(path)
 
 
 @pytest.mark.long
