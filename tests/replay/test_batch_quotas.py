@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.mixture.share_controller import (
-    PlannedDraws,
-    SampledStratum,
-    ShareController,
-)
+from restock.replay.mixture.share_controller import PlannedDraws, SampledStratum, ShareController
 from restock.replay.plan.strata import rules_of
 from restock.replay.sampling.ring import FreshRing
 
@@ -67,7 +63,7 @@ def drive(
 
 
 @pytest.mark.parametrize("env_steps", [48_000, 128_000, 200_000, 288_000, 1_800_000])
-def test_a_quota_holds_at_every_budget(env_steps: int) -> None:
+def test_a_quota_holds_at_every_budget(env_steps):
     """It was redistributed to nominal: from 288,000 steps on quotas were natural rates."""
     shares = controller(env_steps)
     np.testing.assert_allclose(shares.shares, [0.4, 0.3, 0.3])  # offline, whatever the budget
@@ -82,14 +78,14 @@ def test_a_quota_holds_at_every_budget(env_steps: int) -> None:
     assert near["logs_share"] + near["fresh_share"] == pytest.approx(0.3)
 
 
-def test_half_of_a_quota_is_logged_where_the_rows_bear_it() -> None:
+def test_half_of_a_quota_is_logged_where_the_rows_bear_it():
     shares = controller(20_000)
     shares.at(2_000, PLENTY)
     assert shares.logs_share == pytest.approx(0.5)
     np.testing.assert_allclose(shares.fresh_shares, [0.2, 0.15, 0.15, 0], atol=1e-12)
 
 
-def test_logged_rows_fill_in_while_the_ring_is_empty() -> None:
+def test_logged_rows_fill_in_while_the_ring_is_empty():
     shares = controller(20_000)
     shares.at(2_000, np.zeros(3))
     np.testing.assert_allclose(shares.shares * shares.logs_share, [0.4, 0.3, 0.3])
@@ -99,7 +95,7 @@ def test_logged_rows_fill_in_while_the_ring_is_empty() -> None:
     np.testing.assert_allclose(shares.shares * shares.logs_share, [0.3, 0.25, 0.3], atol=0.01)
 
 
-def test_what_neither_has_is_short_and_nominal_does_not_take_it() -> None:
+def test_what_neither_has_is_short_and_nominal_does_not_take_it():
     shares = controller(1_800_000, known=(True, True, False))
     fed = drive(shares, 1_800_000, PLENTY)
     nominal, slip, near, anything = fed.sum(axis=1) / fed.sum()
@@ -116,7 +112,7 @@ def test_what_neither_has_is_short_and_nominal_does_not_take_it() -> None:
     controller(1_800_000, text="shortfall = 'refuse'\n" + QUOTAS)  # the ring fills it
 
 
-def test_logged_rows_alone_fill_a_quota_that_fresh_rows_cannot_be_in() -> None:
+def test_logged_rows_alone_fill_a_quota_without_fresh_rows():
     """They gave half of it, and the rest was short, whatever they could bear."""
     for hindered in ({"known": (True, True, False)}, {"corrected": (False, False, True)}):
         shares = controller(10_000, **hindered)
@@ -124,16 +120,14 @@ def test_logged_rows_alone_fill_a_quota_that_fresh_rows_cannot_be_in() -> None:
         assert (shares.shares * shares.logs_share)[2] == pytest.approx(0.3)
         assert shares.fresh_shares[3] == pytest.approx(0, abs=1e-12)
         assert shares.forecast()[2]["short_share"] == 0
-
-
-def test_fresh_rows_are_not_boosted_where_weights_would_take_it_away() -> None:
+    # Weights would take away what a boost of fresh rows gives.
     shares = controller(1_800_000, corrected=(False, False, True))
     shares.at(2_000, PLENTY)
     assert shares.fresh_shares[2] == 0
     assert "importance weights" in str(shares.forecast()[2]["reason"])
 
 
-def test_without_quotas_the_ring_is_drawn_from_as_it_is() -> None:
+def test_without_quotas_the_ring_is_drawn_from_as_it_is():
     shares = controller(48_000, text="[each_condition]\nshare = 'natural'\n")
     shares.at(2_000, PLENTY)
     np.testing.assert_array_equal(shares.fresh_shares, [0, 0, 0, 0.5])
@@ -147,9 +141,7 @@ def test_without_quotas_the_ring_is_drawn_from_as_it_is() -> None:
     st.integers(10_000, 3_000_000),
     st.tuples(*[st.booleans()] * 3),
 )
-def test_no_stratum_gets_more_than_its_quota(
-    rows: tuple[int, int, int], stock: list[float], env_steps: int, known: tuple[bool, bool, bool]
-) -> None:
+def test_no_stratum_gets_more_than_its_quota(rows, stock, env_steps, known):
     shares = controller(env_steps, rows=rows, known=known)
     shares.at(2_000, np.array(stock))
     logs, fresh = shares.shares * shares.logs_share, shares.fresh_shares
@@ -161,7 +153,7 @@ def test_no_stratum_gets_more_than_its_quota(
     assert (logs * shares.planned.online <= left * 1.0001).all()
 
 
-def test_another_plan_changes_what_logged_rows_give() -> None:
+def test_another_plan_changes_what_logged_rows_give():
     shares = controller(288_000)
     shares.at(2_000, PLENTY)
     before = shares.logs_share
@@ -190,7 +182,7 @@ def ring_of(strata: list[int], rows: int = 40) -> FreshRing:
     return ring
 
 
-def test_a_ring_gives_rows_of_a_stratum_and_none_too_often() -> None:
+def test_a_ring_gives_rows_of_a_stratum_and_none_too_often():
     ring, rng = ring_of([0, 0, 1, -1, 1]), np.random.default_rng(0)
     assert ring.stratum_rows.tolist() == [2, 2]
     drawn = np.concatenate([ring.draw(np.array([1, 0]), rng, limit=3) for _ in range(20)])
@@ -202,7 +194,7 @@ def test_a_ring_gives_rows_of_a_stratum_and_none_too_often() -> None:
     assert set(ring.draw(np.array([0, 9]), rng, since=3).tolist()) == {4}
 
 
-def test_a_row_that_is_overwritten_leaves_its_stratum() -> None:
+def test_a_row_that_is_overwritten_leaves_its_stratum():
     ring = ring_of([0, 0, 1, 1], rows=4)
     ring.draw(np.array([5, 5]), np.random.default_rng(0))
     state = ring.state_dict()

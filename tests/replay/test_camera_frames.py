@@ -33,7 +33,7 @@ FRONT_ONLY = CAMERAS.split("[cameras.rear]")[0]
 
 
 @pytest.fixture(scope="module")
-def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def store_path(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("frames")
     ingest(camera_bag(folder / "bag"), profile_with(), store=StoreWriter(folder / "store"))
     return folder / "store"
@@ -44,7 +44,7 @@ def stored(folder: Path, cameras: dict, text: str = FRONT_ONLY) -> Path:  # type
     return folder / "s"
 
 
-def test_frames_are_views_of_the_store(store_path: Path) -> None:
+def test_frames_are_views_of_the_store(store_path):
     with Store(store_path) as store:
         rows = store.sql(
             "SELECT camera, count(*), min(age_s), max(age_s) FROM transition_frames"
@@ -60,7 +60,7 @@ def test_frames_are_views_of_the_store(store_path: Path) -> None:
         assert documented == [(0,)]
 
 
-def test_frames_of_rows_are_decoded_when_asked(store_path: Path) -> None:
+def test_frames_of_rows_are_decoded_when_asked(store_path):
     with Store(store_path) as store:
         found = list(camera_frames(store, "FROM transitions WHERE step_index < 3", "rear"))
         for step, frame in enumerate(found):
@@ -76,7 +76,7 @@ def test_frames_of_rows_are_decoded_when_asked(store_path: Path) -> None:
             list(camera_frames(store, "SELECT 1 AS x"))
 
 
-def test_a_frame_whose_bytes_changed_is_not_shown(store_path: Path) -> None:
+def test_a_frame_whose_bytes_changed_is_not_shown(store_path):
     import dataclasses
 
     with Store(store_path) as store:
@@ -86,7 +86,7 @@ def test_a_frame_whose_bytes_changed_is_not_shown(store_path: Path) -> None:
         changed.image()
 
 
-def test_lerobot_has_the_frames_as_they_were_recorded(store_path: Path, tmp_path: Path) -> None:
+def test_lerobot_has_the_frames_as_they_were_recorded(store_path, tmp_path):
     document = export_dataset(store_path, "lerobot", tmp_path / "a")
     assert (document["transitions"], document["left_out"]) == (29, {})
     info = json.loads((tmp_path / "a/meta/info.json").read_text())
@@ -110,7 +110,7 @@ def test_lerobot_has_the_frames_as_they_were_recorded(store_path: Path, tmp_path
 
 
 @pytest.mark.long  # another Python starts
-def test_lerobot_itself_reads_the_images(store_path: Path, tmp_path: Path) -> None:
+def test_lerobot_itself_reads_the_images(store_path, tmp_path):
     export_dataset(store_path, "lerobot", tmp_path / "a")
     images = read_with("lerobot", tmp_path / "a")["images"]
     assert images.keys() == {"observation.images.front", "observation.images.rear"}
@@ -121,7 +121,7 @@ def test_lerobot_itself_reads_the_images(store_path: Path, tmp_path: Path) -> No
     np.testing.assert_allclose(images["observation.images.front"]["corner"], expected, atol=0.05)
 
 
-def test_steps_without_a_frame_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_steps_without_a_frame_are_left_out_and_counted(tmp_path):
     times = 2 + np.arange(40) * 0.1  # the camera is late by two seconds
     files = [file_of(picture(number)) for number in range(40)]
     store = stored(tmp_path, {FRONT: compressed(files, times)})
@@ -132,7 +132,7 @@ def test_steps_without_a_frame_are_left_out_and_counted(tmp_path: Path) -> None:
     assert "images" not in (tmp_path / "b/meta/info.json").read_text()
 
 
-def test_grey_frames_become_three_channels_and_deep_ones_are_refused(tmp_path: Path) -> None:
+def test_grey_frames_get_three_channels_deep_ones_are_refused(tmp_path):
     grey = [file_of(picture(number, 1)) for number in range(60)]
     depth = [np.full((4, 6), number * 500, np.uint16) for number in range(60)]
     store = stored(tmp_path, {FRONT: compressed(grey), REAR: raw(depth, "16UC1")}, CAMERAS)
@@ -149,16 +149,14 @@ def test_grey_frames_become_three_channels_and_deep_ones_are_refused(tmp_path: P
         assert frame.image()[0, 0] == 2000
 
 
-def test_frames_of_two_sizes_are_refused(tmp_path: Path) -> None:
+def test_frames_of_two_sizes_are_refused(tmp_path):
     files = [file_of(picture(number)[: 32 if number < 30 else 16]) for number in range(60)]
     store = stored(tmp_path, {FRONT: compressed(files)})
     with pytest.raises(StoreError, match="48 x 16 and of 48 x 32 pixels"):
         export_dataset(store, "lerobot", tmp_path / "a")
 
 
-def test_the_command_line_names_cameras(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_names_cameras(store_path, tmp_path, capsys):
     export = ["export", str(store_path), "--out", str(tmp_path / "a"), "--to"]
     assert cli.main([*export, "lerobot", "--cameras", "front"]) == ExitCode.OK
     assert "observation.images.front: 29 pictures as they were recorded" in capsys.readouterr().out
@@ -167,9 +165,7 @@ def test_the_command_line_names_cameras(
     assert "holds no images" in capsys.readouterr().err
 
 
-def test_a_trace_names_the_frames_of_its_row(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_trace_names_the_frames_of_its_row(store_path, tmp_path, capsys):
     with Store(store_path) as store:
         (front, *_) = camera_frames(store, "FROM transitions WHERE step_index = 2", "front")
     argv = ["trace", str(store_path), str(front.transition_id)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from pathlib import Path
 
 import pyarrow as pa
 import pytest
@@ -14,6 +13,7 @@ from restock import cli
 from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
@@ -26,7 +26,7 @@ MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\
 
 
 @pytest.fixture(scope="module")
-def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
+def panel(tmp_path_factory) -> Panel:
     """Of rows of the twin's task."""
     task = load_profile("warehouse_amr").task
     rows = recording_transitions(1, episodes=10, task=task)
@@ -44,9 +44,7 @@ def cells(rows: list[dict[str, object]]) -> int:
     return len({(row["condition"], row["zone"], row["action"]) for row in rows})
 
 
-def test_the_curve_and_the_recommendation_are_those_of_a_naive_count(
-    store_path: Path, transitions: pa.Table
-) -> None:
+def test_the_recommendation_is_that_of_a_naive_count(store_path, transitions):
     rows = newest_first(transitions)
     with Store(store_path) as store:
         found = recommend_capacity(store.connection, 0.9, effective_episodes=0)
@@ -67,9 +65,7 @@ def effective(rows: list[dict[str, object]]) -> float:
     return sum(counts.values()) ** 2 / sum(n * n for n in counts.values())
 
 
-def test_the_rows_must_be_worth_so_many_episodes_too(
-    store_path: Path, transitions: pa.Table
-) -> None:
+def test_the_rows_must_be_worth_so_many_episodes_too(store_path, transitions):
     rows = newest_first(transitions)
     half = effective(rows) / 2
     with Store(store_path) as store:
@@ -84,9 +80,7 @@ def test_the_rows_must_be_worth_so_many_episodes_too(
     assert "all of them are worth less than 1e+06" in too_many.reason
 
 
-def test_whether_coverage_is_saturated_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_whether_coverage_is_saturated_is_said(tmp_path, capsys):
     growing = write_store(tmp_path / "growing", [recording_transitions(1)])
     with Store(growing) as store:
         found = recommend_capacity(store.connection)
@@ -95,15 +89,13 @@ def test_whether_coverage_is_saturated_is_said(
     assert cli.main(["audit", str(growing), "--capacity"]) == 0
     assert "more recordings will add more" in capsys.readouterr().out
     rows = recording_transitions(1)
-    for name, value in (("condition", "nominal"), ("zone", "cross"), ("action", 1)):
-        place = rows.schema.get_field_index(name)
-        same = pa.array([value] * len(rows), rows.schema.field(place).type)
-        rows = rows.set_column(place, rows.schema.field(place), same)
+    alike = {"condition": "nominal", "zone": "cross", "action": 1}
+    rows = replaced(rows, {name: [value] * len(rows) for name, value in alike.items()})
     with Store(write_store(tmp_path / "flat", [rows])) as store:
         assert recommend_capacity(store.connection).saturated
 
 
-def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_recommends(store_path, capsys):
     assert cli.main(["audit", str(store_path), "--capacity", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)["capacity"]
     assert document["curve"][-1]["capacity"] == document["rows"]
@@ -112,7 +104,7 @@ def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str
     assert f"{document['recommended']:,} rows: " in capsys.readouterr().out
 
 
-def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> None:
+def test_a_run_takes_the_number_and_says_why(panel, tmp_path):
     auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
     prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
     chosen = prepared.document["ring_capacity"]
@@ -130,9 +122,7 @@ def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> No
         prepare_new(tmp_path / "run", None, None, auto)
 
 
-def test_a_ring_that_is_chosen_stays_in_memory(
-    panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_ring_that_is_chosen_stays_in_memory(panel, tmp_path, monkeypatch):
     size = resolve.row_bytes(panel.observation_size)
     monkeypatch.setattr(resolve, "MAX_BYTES", 40 * size)
     auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
@@ -142,8 +132,6 @@ def test_a_ring_that_is_chosen_stays_in_memory(
 
 
 @pytest.mark.parametrize(("share", "episodes"), [(2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)])
-def test_wrong_shares_and_numbers_of_episodes_are_refused(
-    store_path: Path, share: float, episodes: float
-) -> None:
+def test_wrong_shares_and_numbers_of_episodes_are_refused(store_path, share, episodes):
     with Store(store_path) as store, pytest.raises(ConfigError, match=r"cells_share must be in"):
         recommend_capacity(store.connection, share, episodes)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
 from support.stores import CONDITIONS, TASK, recording_transitions, write_store
@@ -41,7 +38,7 @@ def strata(correction: str) -> list[ResolvedStratum]:
     ]
 
 
-def test_the_estimate_is_the_true_ratio() -> None:
+def test_the_estimate_is_the_true_ratio():
     x, chance, slipped = slippery()
     share = 0.5
     boost = np.array([share / slipped.mean(), (1 - share) / (1 - slipped.mean())])
@@ -57,7 +54,7 @@ def test_the_estimate_is_the_true_ratio() -> None:
     np.testing.assert_allclose(clipped, np.minimum(ratio, 2.0))
 
 
-def test_a_fit_on_a_part_of_the_common_outcome_stands_for_all_of_it() -> None:
+def test_a_fit_on_part_of_the_common_outcome_is_of_all():
     x, chance, slipped = slippery()
     rng = np.random.default_rng(1)
     kept = slipped | (rng.random(COUNT) < 0.2)
@@ -67,7 +64,7 @@ def test_a_fit_on_a_part_of_the_common_outcome_stands_for_all_of_it() -> None:
 
 
 @pytest.mark.parametrize("estimate", ["true", "useless"])
-def test_outcomes_stay_as_they_are_however_good_the_fit(estimate: str) -> None:
+def test_outcomes_stay_as_they_are_however_good_the_fit(estimate):
     """P(slip | state) after weights is what it was, in every part of the state space."""
     _, chance, slipped = slippery()
     code = np.where(slipped, 0, 1).astype(np.int16)
@@ -90,7 +87,7 @@ def test_outcomes_stay_as_they_are_however_good_the_fit(estimate: str) -> None:
     assert raw > 4 * slipped[risk == 2].mean()
 
 
-def test_risky_states_stay_boosted_where_full_correction_takes_the_boost_away() -> None:
+def test_risky_states_stay_boosted_unlike_with_full_correction():
     _, chance, slipped = slippery()
     code = np.where(slipped, 0, 1).astype(np.int16)
     state, shares = np.ones(COUNT, np.int16), np.array([0.5, 0.5])
@@ -130,9 +127,7 @@ share = "equal"
 """
 
 
-def test_a_plan_estimates_the_ratio_and_the_panel_keeps_what_new_shares_need(
-    transitions: pa.Table, tmp_path: object
-) -> None:
+def test_a_panel_keeps_the_estimates_that_new_shares_need(transitions, tmp_path):
     mixture = parse_mixture(TEXT)
     with open_source(transitions, mixture, task=TASK, conditions=CONDITIONS) as source:
         plan = plan_panel(source.connection, mixture, source.conditions)
@@ -155,7 +150,7 @@ def test_a_plan_estimates_the_ratio_and_the_panel_keeps_what_new_shares_need(
     assert panel.header.ratios == [fit]
 
 
-def test_rows_of_another_task_beside_those_of_the_plan_change_no_estimate(tmp_path: Path) -> None:
+def test_rows_of_another_task_change_no_estimate(tmp_path):
     """Their observations are of another size, and may lie in the same batch."""
     other = Task(body=TASK.body, actions=TASK.actions, sectors=6)
     mine = recording_transitions(2)

@@ -83,7 +83,7 @@ def correlated(
 
 
 @pytest.mark.parametrize("df", [1, 2, 3, 4, 7, 20, 51, 200])
-def test_students_t_is_scipys(df: int) -> None:
+def test_students_t_is_scipys(df):
     connection = of_samples(samples({("a", "x", 0): [np.ones(1)]}))
     for t in (0.0, 0.4, -2.0, 5.0, 12.0):
         p = connection.sql(f"SELECT student_p({t}::DOUBLE, {df})").fetchall()[0][0]
@@ -93,7 +93,7 @@ def test_students_t_is_scipys(df: int) -> None:
         assert quantile == pytest.approx(stats.t.ppf(0.975, df), rel=2e-3)
 
 
-def test_the_test_and_its_sizes_are_scipys() -> None:
+def test_the_test_and_its_sizes_are_scipys():
     rng = np.random.default_rng(3)
     early, late = rng.normal(0, 1, 24), rng.normal(0.9, 1, 31)
     table = samples({("a", "x", 0): [early], ("a", "x", 1): [late]})
@@ -108,7 +108,7 @@ def test_the_test_and_its_sizes_are_scipys() -> None:
     assert (row["n"], row["n_reference"], row["samples"]) == (31, 24, "episodes")
 
 
-def test_p_is_corrected_as_scipy_does() -> None:
+def test_p_is_corrected_as_scipy_does():
     rng = np.random.default_rng(4)
     values = {
         (f"r{robot}", f"r{robot}", week): [rng.normal(0.2 * robot * (week == 2), 1, 12)]
@@ -122,9 +122,7 @@ def test_p_is_corrected_as_scipy_does() -> None:
 
 
 @pytest.mark.parametrize("seed", one_in(2, [0, 1]))
-def test_false_alarms_keep_their_level_though_steps_and_recordings_are_correlated(
-    seed: int,
-) -> None:
+def test_false_alarms_of_correlated_steps_keep_their_level(seed):
     rng, robots = np.random.default_rng(seed), 300
     values = {
         (f"r{robot}", f"r{robot}", week): correlated(rng, 3, 5)
@@ -152,7 +150,7 @@ def test_false_alarms_keep_their_level_though_steps_and_recordings_are_correlate
     assert corrected[0]["n"] <= 2
 
 
-def test_false_alarms_of_rates_keep_their_level() -> None:
+def test_false_alarms_of_rates_keep_their_level():
     rng, lines = np.random.default_rng(5), []
     for robot in range(300):
         for week in range(4):
@@ -189,7 +187,7 @@ def worn() -> duckdb.DuckDBPyConnection:
     return fleet([SyntheticRobot("a"), WORN, SyntheticRobot("c")], recordings=3)
 
 
-def test_a_worn_wheel_is_named_and_nothing_else(worn: duckdb.DuckDBPyConnection) -> None:
+def test_a_worn_wheel_is_named_and_nothing_else(worn):
     [found] = rows(worn, "FROM drift_findings WHERE part <> 'driving'")
     assert (found["robot"], found["part"], found["signal"]) == ("b", "wheels", "odometry_scale")
     assert (str(found["since"]), found["periods"], found["periods_tested"]) == (WEEKS[2], 2, 2)
@@ -198,7 +196,7 @@ def test_a_worn_wheel_is_named_and_nothing_else(worn: duckdb.DuckDBPyConnection)
     assert "0 of 2 other robots at this site changed alike" in found["finding"]
 
 
-def test_it_also_differs_from_the_other_robots(worn: duckdb.DuckDBPyConnection) -> None:
+def test_it_also_differs_from_the_other_robots(worn):
     query = (
         "SELECT period::VARCHAR AS period, verdict FROM drift WHERE against = 'other robots'"
         " AND robot = 'b' AND signal = 'odometry_scale' ORDER BY period"
@@ -208,20 +206,20 @@ def test_it_also_differs_from_the_other_robots(worn: duckdb.DuckDBPyConnection) 
     assert "differs" not in [verdicts[week] for week in WEEKS[:2]]
 
 
-def test_where_all_robots_of_a_site_change_it_is_the_site() -> None:
+def test_where_all_robots_of_a_site_change_it_is_the_site():
     slippery = {"odometry_scale": 0.92}
     robots = [SyntheticRobot(name, changes=slippery) for name in "abc"]
     found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE signal = 'odometry_scale'")
     assert {(row["robot"], row["scope"]) for row in found} == {(name, "site") for name in "abc"}
 
 
-def test_robots_of_another_site_are_not_compared_with() -> None:
+def test_robots_of_another_site_are_not_compared_with():
     robots = [WORN, SyntheticRobot("a", site="other")]
     found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE part = 'wheels'")
     assert [(row["robot"], row["scope"]) for row in found] == [("b", "alone")]
 
 
-def test_lidar_and_floor_are_told_apart() -> None:
+def test_lidar_and_floor_are_told_apart():
     robots = [
         SyntheticRobot("a", changes={"lidar_noise_m": 3.0}),
         SyntheticRobot("b", changes={"slips_per_step": 8.0}),
@@ -238,7 +236,7 @@ def test_lidar_and_floor_are_told_apart() -> None:
     }
 
 
-def test_too_few_episodes_is_a_verdict() -> None:
+def test_too_few_episodes_is_a_verdict():
     lone = fleet([SyntheticRobot("a")], recordings=1, episodes=3)
     verdicts = rows(lone, "SELECT DISTINCT verdict, p FROM drift WHERE part = 'wheels'")
     assert verdicts == [{"verdict": "too few", "p": None}]
@@ -247,13 +245,13 @@ def test_too_few_episodes_is_a_verdict() -> None:
     assert verdicts == [{"verdict": "too few"}]
 
 
-def test_recordings_without_tags_are_one_robot_that_is_called_so() -> None:
+def test_recordings_without_tags_are_one_robot_that_is_called_so():
     mute = SyntheticRobot(None, site=None, changes={"odometry_scale": 0.9})
     [found] = rows(fleet([mute], recordings=3), "FROM drift_findings WHERE part = 'wheels'")
     assert (found["robot"], found["site"], found["scope"]) == ("untagged", "untagged", "alone")
 
 
-def test_signals_that_a_robot_lacks_are_not_made_up() -> None:
+def test_signals_that_a_robot_lacks_are_not_made_up():
     blind = SyntheticRobot("a", localiser=False, gyro=False)
     found = rows(fleet([blind], recordings=3), "SELECT DISTINCT signal FROM drift")
     signals = {row["signal"] for row in found}
@@ -262,7 +260,7 @@ def test_signals_that_a_robot_lacks_are_not_made_up() -> None:
     assert not signals & (lacking | {"localised_speed_mps", "gyro_yaw_rate_radps"})
 
 
-def test_the_signals_of_a_profile_are_compared_too() -> None:
+def test_the_signals_of_a_profile_are_compared_too():
     connection = fleet([SyntheticRobot("a"), SyntheticRobot("b")], recordings=3)
     install_named(connection, "transitions, recordings")
     # A battery of robot b that is weaker from week three on.
@@ -282,7 +280,7 @@ def test_the_signals_of_a_profile_are_compared_too() -> None:
     assert lit == [{"value": 1.0}]
 
 
-def test_values_that_never_vary_are_believed_to_a_tenth_of_what_matters() -> None:
+def test_constant_values_are_believed_to_a_tenth_of_what_matters():
     table = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.ones(5)]})
     [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
     t = 1 / np.sqrt(0.01**2 * (1 / 6 + 1 / 5))
@@ -293,7 +291,7 @@ def test_values_that_never_vary_are_believed_to_a_tenth_of_what_matters() -> Non
     assert (row["p"], row["verdict"]) == (1, "unchanged")
 
 
-def test_other_periods_than_weeks(worn: duckdb.DuckDBPyConnection) -> None:
+def test_other_periods_than_weeks(worn):
     monthly = rows(worn, "FROM drift_by('month') WHERE against = 'own reference'")
     assert {row["verdict"] for row in monthly} == {"too few"}  # a month with nothing before it
     first = rows(

@@ -16,6 +16,7 @@ from support.stores import START_NS, TASK, manifest, recording_transitions, writ
 
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.version import FORMAT
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
@@ -90,7 +91,7 @@ def compare(store: Store) -> None:
         assert {key: seen[name][key] for key in row} == row, name
 
 
-def test_events_of_the_sample_logs_are_those_of_a_plain_loop(tmp_path: Path) -> None:
+def test_events_of_the_sample_logs_are_those_of_a_plain_loop(tmp_path):
     store, profile = tmp_path / "store", load_profile("warehouse_amr")
     ingest(
         ROOT / "sample_logs" / "amr_tuesday",
@@ -103,7 +104,7 @@ def test_events_of_the_sample_logs_are_those_of_a_plain_loop(tmp_path: Path) -> 
         assert {row["condition"] for row in events_of(opened).values()} > {"wheel_slip"}
 
 
-def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path: Path) -> None:
+def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path):
     """Rows are missing in the middle of episodes and at their ends, and log time is not stamps."""
     tables = []
     for number in (1, 2, 3):
@@ -148,12 +149,10 @@ CASES = [
     Case(".ss", [("wheel_slip", 1, 2, "open", None)], ended=""),
     # Another condition takes over: nominal is where no condition holds.
     Case(
-        "sxb.",
-        [("blocked_aisle", 1, 2, "recovered", 0.4), ("wheel_slip", 0, 1, "recovered", 0.6)],
+        "sxb.", [("blocked_aisle", 1, 2, "recovered", 0.4), ("wheel_slip", 0, 1, "recovered", 0.6)]
     ),
     Case(
-        "s.s",
-        [("wheel_slip", 0, 0, "recovered", 0.2), ("wheel_slip", 2, 2, "not recovered", None)],
+        "s.s", [("wheel_slip", 0, 0, "recovered", 0.2), ("wheel_slip", 2, 2, "not recovered", None)]
     ),
     Case("....", []),
 ]
@@ -179,20 +178,13 @@ def write_case(path: Path, number: int, case: Case, policies: str = "") -> None:
         "truncated": last & (case.ended == "truncated"),
         "reward": last * (TASK.rewards.goal if case.reached else 0.0),
     }
-    for name, column in values.items():
-        table = replaced(table, name, column)
-    row = replaced(manifest(table), "end_stamp_ns", [int(stamps[-1] + case.more_s * 1e9)])
+    table = replaced(table, values)
+    row = replaced(manifest(table), {"end_stamp_ns": [int(stamps[-1] + case.more_s * 1e9)]})
     write_deltalake(str(path / "recordings"), row, mode="append", description=FORMAT)
     write_deltalake(str(path / "transitions"), table, mode="append", description=FORMAT)
 
 
-def replaced(table: pa.Table, name: str, values: object) -> pa.Table:
-    place = table.schema.get_field_index(name)
-    field = table.schema.field(place)
-    return table.set_column(place, field, pa.array(values, field.type))
-
-
-def test_what_came_of_events(tmp_path: Path) -> None:
+def test_what_came_of_events(tmp_path):
     for number, case in enumerate(CASES, 1):
         write_case(tmp_path / "store", number, case)
     with Store(tmp_path / "store") as store:
@@ -204,7 +196,7 @@ def test_what_came_of_events(tmp_path: Path) -> None:
             assert found == [pytest.approx(event) for event in case.events], case
 
 
-def test_who_drove_before_and_after(tmp_path: Path) -> None:
+def test_who_drove_before_and_after(tmp_path):
     write_case(tmp_path / "store", 1, Case("s.ss.s", []), policies="pppooo")
     with Store(tmp_path / "store") as store:
         found = store.sql(

@@ -87,7 +87,7 @@ def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
     assert success_in(outcome, "nominal", rows) == success_in(exposure, "nominal", rows) == 1
 
 
-def test_rows_without_an_exposure_are_not_told_to_add_what_is_there(tmp_path):
+def test_no_advice_is_to_add_what_is_there(tmp_path):
     rows = planted(lambda number: NEAR[number])
     store = store_of(replaced(rows, {"exposures": [[]] * len(rows)}), tmp_path / "store")
     with pytest.raises(MixtureError, match="belong to no stratum") as refused:
@@ -95,7 +95,7 @@ def test_rows_without_an_exposure_are_not_told_to_add_what_is_there(tmp_path):
     assert "each_condition" not in str(refused.value)
 
 
-def test_an_exposure_beside_a_condition_by_name_takes_its_rows_by_priority(tmp_path):
+def test_an_exposure_beside_a_condition_goes_by_priority(tmp_path):
     """Of steps: a condition goes first, as its priority number is lower."""
     store = store_of(planted(lambda number: False), tmp_path / "store")
     text = "[evaluation_split]\nby = 'none'\n[correction]\npost = 'none'\n" + "".join(
@@ -139,9 +139,7 @@ def audited(store: Path) -> tuple[str, list[dict[str, object]]]:
     return finding.status, finding.sample
 
 
-def test_the_audit_names_the_condition_that_is_chosen_on_its_outcome_and_the_exposure(
-    tmp_path, capsys
-):
+def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, capsys):
     store = store_of(planted(lambda number: NEAR[number]), tmp_path / "store")
     status, sample = audited(store)
     assert status == "warn"
@@ -170,6 +168,6 @@ def test_the_audit_names_the_condition_that_is_chosen_on_its_outcome_and_the_exp
         (lambda number: NEAR[number], EXPOSED),  # the condition is the situation
     ],
 )
-def test_the_audit_passes_where_the_condition_is_no_choice_of_failures(tmp_path, failed, near):
+def test_the_audit_passes_conditions_that_choose_no_failures(tmp_path, failed, near):
     store = store_of(planted(failed, near), tmp_path / "store")
     assert audited(store) == ("pass", [])

@@ -22,7 +22,7 @@ TAGS = [{"robot": robot, "site": site} for robot, site in zip("abacd", "ooool", 
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fleet(tmp_path_factory) -> Path:
     """Five recordings of four robots, of which one drives at another site."""
     tables = [recording_transitions(number) for number in range(1, 6)]
     return write_store(tmp_path_factory.mktemp("fleet") / "store", tables, tags=TAGS)
@@ -72,7 +72,7 @@ def test_robots_that_cannot_be_held_out_are_refused(fleet, robots, message):
         parse_mixture(text.replace("'robot'", "'site'"))
 
 
-def test_a_panel_with_rows_of_a_robot_that_is_held_out_fails_its_audit(fleet, tmp_path):
+def test_a_panel_with_rows_of_a_held_out_robot_fails(fleet, tmp_path):
     text = "[evaluation_split]\nby = 'robot'\n" + EVERY
     panel = panel_of(fleet, text, tmp_path / "panel")
     chosen = [audit for audit in shipped_audits() if audit.name == "leakage"]
@@ -113,7 +113,7 @@ def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
         planned(tables[0], text)
 
 
-def test_a_split_that_holds_out_far_more_than_was_asked_says_so(tmp_path: Path) -> None:
+def test_a_split_that_holds_out_far_more_than_was_asked_says_so(tmp_path):
     two = pa.concat_tables([recording_transitions(1), recording_transitions(2)])
     text = EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.1"
     plan = planned(two, text)

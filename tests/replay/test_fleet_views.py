@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import pyarrow as pa
 import pytest
 from support.stores import recording_transitions, write_store
 
+from restock.ingest.store.transitions import replaced
 from restock.replay.store.store import Store
 
 WEEK_NS = 7 * 86_400 * 10**9
@@ -17,14 +17,12 @@ LATER = [0, 3, 0, 1]
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def fleet(tmp_path_factory) -> Store:
     tables = []
     for number, weeks in enumerate(LATER, 1):
         table = recording_transitions(number)
-        place = table.schema.get_field_index("stamp_ns")
-        stamps = pa.array(table["stamp_ns"].to_numpy() + weeks * WEEK_NS)
-        table = table.set_column(place, table.schema.field(place), stamps)
-        tables.append(table)
+        stamps = table["stamp_ns"].to_numpy() + weeks * WEEK_NS
+        tables.append(replaced(table, {"stamp_ns": stamps}))
     path = tmp_path_factory.mktemp("fleet") / "store"
     return Store(write_store(path, tables, tags=TAGS))
 
@@ -103,7 +101,7 @@ def test_weeks_add_up_to_robots(fleet):
     )
 
 
-def test_successes_are_of_episodes_in_which_the_condition_was_seen(fleet):
+def test_successes_are_of_episodes_with_the_condition(fleet):
     for row in requested(fleet, "FROM coverage_by_robot WHERE robot = 'a'"):
         (found,) = requested(
             fleet,

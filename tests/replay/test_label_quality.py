@@ -12,6 +12,7 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import QueryError
+from restock.ingest.store.transitions import replaced
 from restock.replay.review import label_quality
 from restock.replay.store.store import Store
 
@@ -22,20 +23,16 @@ def with_truth(table: pa.Table, missed: float) -> pa.Table:
     named = table["conditions"].to_pylist()
     truth = [",".join(sorted(names)) or "nominal" for names in named]
     held = [[name for name in names if rng.random() > missed] for names in named]
-    for name, values in (("true_condition", truth), ("conditions", held)):
-        field = table.schema.field(name)
-        at = table.column_names.index(name)
-        table = table.set_column(at, field, pa.array(values, field.type))
-    return table
+    return replaced(table, {"true_condition": truth, "conditions": held})
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def store(tmp_path_factory) -> Path:
     tables = [with_truth(recording_transitions(number), 0.1 * number) for number in (1, 5)]
     return write_store(tmp_path_factory.mktemp("quality") / "store", tables)
 
 
-def test_the_scores_of_a_store_say_how_sure_they_are(store: Path) -> None:
+def test_the_scores_of_a_store_say_how_sure_they_are(store):
     with Store(store) as opened:
         found = {one.score.condition: one for one in label_quality(opened)}
         for one in found.values():
@@ -52,9 +49,7 @@ def test_the_scores_of_a_store_say_how_sure_they_are(store: Path) -> None:
             label_quality(opened, "colour")
 
 
-def test_the_command_prints_scores_and_reliability(
-    store: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_scores_and_reliability(store, capsys):
     assert main(["store", "label", str(store), "--score"]) == 0
     said = capsys.readouterr().out
     assert "event recall" in said
@@ -67,9 +62,7 @@ def test_the_command_prints_scores_and_reliability(
     assert main(["store", "label", str(store), "--score", "--corrections", "none"]) == 2
 
 
-def test_a_store_without_truth_has_nothing_to_score(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_without_truth_has_nothing_to_score(tmp_path, capsys):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     assert main(["store", "label", str(path), "--score"]) == 0
     assert "nothing to score" in capsys.readouterr().out

@@ -75,16 +75,14 @@ PROFILES = {
 
 
 @pytest.mark.parametrize("name", one_in(3, PROFILES))
-def test_a_row_was_made_of_the_messages_at_its_tick(name: str, tmp_path: Path) -> None:
+def test_a_row_was_made_of_the_messages_at_its_tick(name, tmp_path):
     check(SAMPLE, PROFILES[name], tmp_path)
 
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason="../shared/bags is absent")
 @pytest.mark.parametrize("steps", ["command", "rate"])
 @pytest.mark.parametrize("from_frames", [False, True])
-def test_a_row_of_a_turtlebot_was_made_of_the_messages_at_its_tick(
-    steps: str, from_frames: bool, tmp_path: Path
-) -> None:
+def test_a_turtlebots_row_was_made_of_the_messages_at_its_tick(steps, from_frames, tmp_path):
     with open_recording(TURTLEBOT) as recording:
         text = propose_profile(recording, "turtlebot").toml
     text = re.sub('steps = "[a-z]+"', f'steps = "{steps}"', text)
@@ -108,7 +106,7 @@ class Battery(Drive):
 
 
 @pytest.mark.parametrize("rate", [False, True])
-def test_topics_of_custom_signals_are_aligned_as_in_ingest(rate: bool, tmp_path: Path) -> None:
+def test_topics_of_custom_signals_are_aligned_as_in_ingest(rate, tmp_path):
     """By them commands, which have no stamp, lie 1.5 ms later, and a fixed rate ticks on."""
     signal = '[signals.volts]\ntopic = "/battery"\ntype = "sensor_msgs/msg/BatteryState"\n'
     text = TEXT + signal + 'path = "voltage"\nunit = "V"\n'
@@ -183,7 +181,7 @@ def pose_of(profile: Profile, way: dict[str, MessageAtTick]) -> list[float]:
     return [float(part) for part in point[:2]]
 
 
-def test_what_does_not_fit_the_recording_is_refused() -> None:
+def test_what_does_not_fit_the_recording_is_refused():
     with open_recording(SAMPLE) as recording:
         right = recording.recording_id
     where = {"recording_id": right, "tick": 3, "stamp_ns": 5}

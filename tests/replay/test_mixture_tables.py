@@ -34,7 +34,7 @@ MIXTURES = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """`store`, whose first recording has no labels in some rows, and `other`."""
     path = tmp_path_factory.mktemp("stores")
     first = recording_transitions(1)
@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", one_in(2, MIXTURES))
-def test_mix_packs_exactly_what_the_tables_say(folder: Path, tmp_path: Path, name: str) -> None:
+def test_mix_packs_exactly_what_the_tables_say(folder, tmp_path, name):
     text, mixture = MIXTURES[name], name
     if text is not None:
         mixture = str(folder / "mixture.toml")
@@ -78,7 +78,7 @@ def test_mix_packs_exactly_what_the_tables_say(folder: Path, tmp_path: Path, nam
     assert counted == {line["stratum"]: line["count_all"] for line in rows_of}
 
 
-def test_a_file_that_changed_is_planned_again(folder: Path, tmp_path: Path) -> None:
+def test_a_file_that_changed_is_planned_again(folder, tmp_path):
     path = tmp_path / "m.toml"
     path.write_text("seed = 1\n" + EVERY)
     with Store(folder / "store") as store:
@@ -90,9 +90,7 @@ def test_a_file_that_changed_is_planned_again(folder: Path, tmp_path: Path) -> N
         assert store.sql(query).fetchall() != first
 
 
-def test_the_verb_answers_of_a_version_and_joins(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_answers_of_a_version_and_joins(folder, capsys):
     store = str(folder / "store")
     query = (
         "SELECT stratum, any_value(m.rows) AS rows, count(*) AS packed"
@@ -117,9 +115,7 @@ def test_the_verb_answers_of_a_version_and_joins(
         ("{folder}/refused.toml", "of the gradient after weights"),
     ],
 )
-def test_what_cannot_be_mixed_is_refused_as_by_mix(
-    folder: Path, name: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_mixed_is_refused_as_by_mix(folder, name, message, capsys):
     (folder / "wrong.toml").write_text("seeed = 1\n" + EVERY)
     (folder / "refused.toml").write_text(
         "[correction]\npost = 'full'\n[each_condition]\nshare = 'equal'\n"

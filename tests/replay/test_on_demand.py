@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 from support.long import one_in
@@ -24,7 +23,7 @@ def made(store: Store) -> set[str]:
 
 
 @pytest.mark.parametrize("every", one_in(2, [8, 1]))
-def test_every_view_and_macro_can_be_named_alone(tmp_path: Path, every: int) -> None:
+def test_every_view_and_macro_can_be_named_alone(tmp_path, every):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     text = definitions(names=[*VIEWS, *MACROS])
     views = re.findall(r"CREATE OR REPLACE VIEW (\w+)", text)
@@ -39,7 +38,7 @@ def test_every_view_and_macro_can_be_named_alone(tmp_path: Path, every: int) -> 
         store.sql("FROM drift_by('month')").fetchall()
 
 
-def test_a_query_has_made_what_it_names_and_no_more(tmp_path: Path) -> None:
+def test_a_query_has_made_what_it_names_and_no_more(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     with Store(path) as store:
         assert not made(store) & {"transitions", "recordings", "coverage"}
@@ -53,7 +52,7 @@ def test_a_query_has_made_what_it_names_and_no_more(tmp_path: Path) -> None:
         assert common <= {name for (name,) in store.connection.execute(_LISTED).fetchall()}
 
 
-def test_a_name_that_is_put_together_is_found_and_a_misspelt_one_corrected(tmp_path: Path) -> None:
+def test_a_computed_name_is_found_and_a_misspelt_one_corrected(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     with Store(path) as store:
         rows = store.sql("FROM query_table('cover' || 'age')").fetchall()
@@ -62,7 +61,7 @@ def test_a_name_that_is_put_together_is_found_and_a_misspelt_one_corrected(tmp_p
         store.sql("FROM rewardmix")
 
 
-def test_what_a_query_makes_itself_is_left_as_it_is(tmp_path: Path) -> None:
+def test_what_a_query_makes_itself_is_left_as_it_is(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     with Store(path) as store:
         store.sql("CREATE OR REPLACE VIEW drops AS SELECT 'mine' AS reason; FROM drops")
@@ -70,7 +69,7 @@ def test_what_a_query_makes_itself_is_left_as_it_is(tmp_path: Path) -> None:
         assert query(store.connection, "FROM drops", where="").fetchall() == [("mine",)]
 
 
-def test_audits_leave_views_as_they_found_them(tmp_path: Path) -> None:
+def test_audits_leave_views_as_they_found_them(tmp_path):
     """Few rows are held in memory while they run."""
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     names = "SELECT table_name FROM duckdb_tables()"
@@ -99,7 +98,7 @@ def test_audits_leave_views_as_they_found_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_lists_of_views_have_all_of_them(tmp_path: Path) -> None:
+def test_lists_of_views_have_all_of_them(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     for text in (
         "SELECT DISTINCT view FROM columns",

@@ -14,7 +14,6 @@ from restock.errors import MixtureError
 from restock.replay.sampling.rules import (
     BETA_BATCHES,
     CHUNK,
-    EPSILON,
     Per,
     Prioritised,
     StratumRows,
@@ -58,15 +57,8 @@ def now(drawing: QuotaSampler) -> list[np.ndarray]:
     return [draws.priority.astype(float) for draws in drawing.draws if isinstance(draws, Per)]
 
 
-def test_priorities_are_those_of_the_paper() -> None:
-    td = np.array([0.0, 0.5, 4.0], np.float32)
-    draws = priorities(3, per_alpha=0.5)
-    draws.update(np.arange(3), td)
-    np.testing.assert_allclose(draws.priority, (td + np.float32(EPSILON)) ** 0.5)
-
-
 @pytest.mark.parametrize("beta", [0.4, 0.8, 1.0])
-def test_weights_are_those_of_the_distribution_drawn_from(beta: float) -> None:
+def test_weights_are_those_of_the_distribution_drawn_from(beta):
     drawing = sampler(block=4, per_alpha=0.6, per_beta=beta)
     td = errors()
     for rows in STRATA:
@@ -92,7 +84,7 @@ def test_weights_are_those_of_the_distribution_drawn_from(beta: float) -> None:
     assert seen == 400
 
 
-def test_weighted_draws_have_the_mean_of_uniform_ones() -> None:
+def test_weighted_draws_have_the_mean_of_uniform_ones():
     drawing, value = sampler(per_alpha=1.0, per_beta=1.0), errors(9)
     for rows in STRATA:
         drawing.update(rows, value[rows])  # the value itself decides what is drawn
@@ -107,13 +99,13 @@ def test_weighted_draws_have_the_mean_of_uniform_ones() -> None:
     assert (plain / count > 1.5 * truth).all()
 
 
-def test_beta_grows_to_one() -> None:
+def test_beta_grows_to_one():
     numbers = Prioritised(per_beta=0.4)
     grown = [numbers.beta_after(part * BETA_BATCHES // 2) for part in (0, 1, 2, 9)]
     assert grown == pytest.approx([0.4, 0.7, 1.0, 1.0])
 
 
-def test_rows_not_drawn_yet_have_the_largest_priority() -> None:
+def test_rows_not_drawn_yet_have_the_largest_priority():
     draws = priorities(4, per_alpha=1.0)
     draws.update(np.array([0, 1]), np.array([7.0, 0.1], np.float32))
     draws.draw(1, np.random.default_rng(0), 0)
@@ -122,9 +114,7 @@ def test_rows_not_drawn_yet_have_the_largest_priority() -> None:
 
 @settings(max_examples=60)
 @given(size=st.integers(1, 70), count=st.integers(1, 40), seed=st.integers(0, 2**32))
-def test_places_are_of_the_stratum_whatever_the_priorities(
-    size: int, count: int, seed: int
-) -> None:
+def test_places_are_of_the_stratum_whatever_the_priorities(size, count, seed):
     rng, draws = np.random.default_rng(seed), priorities(size, per_alpha=1.0)
     for _ in range(12):
         places, weights = draws.draw(count, rng, 0)
@@ -137,9 +127,7 @@ def test_places_are_of_the_stratum_whatever_the_priorities(
 
 @settings(max_examples=80)
 @given(st.integers(0, 2**32), st.integers(1, 200), st.integers(0, 300), st.booleans())
-def test_compiled_places_are_those_of_numpy(
-    seed: int, chunks: int, draws: int, some_empty: bool
-) -> None:
+def test_compiled_places_are_those_of_numpy(seed, chunks, draws, some_empty):
     if not native.IS_THERE:
         pytest.skip(f"native code is {native.state()}")
     rng = np.random.default_rng(seed)
@@ -160,7 +148,7 @@ def test_compiled_places_are_those_of_numpy(
     np.testing.assert_array_equal(places[0], places[1])
 
 
-def test_draws_are_the_same_without_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_draws_are_the_same_without_compiled_code(monkeypatch):
     drawn: dict[str, list[Any]] = {}
     for switch in ("1", "0"):
         monkeypatch.setenv(native.SWITCH, switch)
@@ -170,7 +158,7 @@ def test_draws_are_the_same_without_compiled_code(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_equal(drawn["0"], drawn["1"])
 
 
-def test_the_mean_weight_of_many_rows_is_that_of_some() -> None:
+def test_the_mean_weight_of_many_rows_is_that_of_some():
     """Of strata with more rows than are raised to a power: 1, to within a percent."""
     rows = np.arange(200_000)
     rng = np.random.default_rng(0)
@@ -193,6 +181,6 @@ def test_the_mean_weight_of_many_rows_is_that_of_some() -> None:
         (np.ones((2, 1)), r"for rows of shape \(2,\)"),
     ],
 )
-def test_what_cannot_be_a_priority_is_refused(td_abs: np.ndarray, message: str) -> None:
+def test_what_cannot_be_a_priority_is_refused(td_abs, message):
     with pytest.raises(MixtureError, match=message):
         sampler().update(np.array([0, 2]), td_abs)

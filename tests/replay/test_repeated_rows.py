@@ -15,6 +15,7 @@ from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import MixtureError
+from restock.ingest.store.transitions import replaced
 from restock.replay.store.store import Store
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 
@@ -52,17 +53,11 @@ def copy_of(
         "source_file": [f"logs/{recording}.mcap"] * rows,
         "stamp_ns": part["stamp_ns"].to_numpy() + moved,
     }
-    for column, value in values.items():
-        place = part.schema.get_field_index(column)
-        field = part.schema.field(place)
-        part = part.set_column(place, field, pa.array(value, field.type))
-    return part
+    return replaced(part, values)
 
 
 @pytest.mark.long
-def test_a_salvaged_part_and_the_whole_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_salvaged_part_and_the_whole_recording(tmp_path, capsys):
     content = MONDAY.read_bytes()
     (tmp_path / "part.mcap").write_bytes(content[: len(content) // 5])
     store = str(tmp_path / "store")
@@ -80,9 +75,7 @@ def test_a_salvaged_part_and_the_whole_recording(
 
 @pytest.mark.long
 @pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
-def test_a_drive_that_was_replayed_and_recorded_again_a_year_later(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_that_was_replayed_a_year_later(tmp_path, capsys):
     profile, store = str(tmp_path / "neato.toml"), str(tmp_path / "store")
     (original,) = (NEATO / "2022-original").iterdir()
     assert main(["profile", "new", str(original), "--out", profile]) == 0
@@ -96,7 +89,7 @@ def test_a_drive_that_was_replayed_and_recorded_again_a_year_later(
 
 
 @pytest.mark.parametrize("later_s", [0, 33_194_320, -3600])
-def test_a_constant_shift_and_a_jitter_of_the_clocks(tmp_path: Path, later_s: int) -> None:
+def test_a_constant_shift_and_a_jitter_of_the_clocks(tmp_path, later_s):
     one = recording_transitions(1)
     copy = copy_of(one, 5, later_ns=later_s * 10**9, jitter_ns=90_000_000, first=100)
     with Store(write_store(tmp_path / "store", [one, copy])) as store:
@@ -104,31 +97,28 @@ def test_a_constant_shift_and_a_jitter_of_the_clocks(tmp_path: Path, later_s: in
     assert len(rows) == len(one) - 100
 
 
-def test_steps_at_other_times_of_the_drive_do_not_count(tmp_path: Path) -> None:
+def test_steps_at_other_times_of_the_drive_do_not_count(tmp_path):
     """Steps 1 s apart from where the rest of the copy puts them are a chance, not a copy."""
     one = recording_transitions(1)
     copy = copy_of(one, 5)
     stamps = copy["stamp_ns"].to_numpy().copy()
     stamps[:40] += 10**9
-    copy = copy.set_column(copy.schema.get_field_index("stamp_ns"), "stamp_ns", pa.array(stamps))
+    copy = replaced(copy, {"stamp_ns": stamps})
     with Store(write_store(tmp_path / "store", [one, copy])) as store:
         assert len(store.sql("FROM repeated_rows(3)").fetchall()) == len(one) - 40
 
 
-def test_robots_that_stand_still_alike_are_two(tmp_path: Path) -> None:
+def test_robots_that_stand_still_alike_are_two(tmp_path):
     def standing(recording: int) -> pa.Table:
-        table = recording_transitions(recording)
-        for name in ("observation", "action", "pose_x_m", "pose_y_m"):
-            place = table.schema.get_field_index(name)
-            same = pa.array([recording_transitions(1)[name][0].as_py()] * len(table))
-            table = table.set_column(place, name, same.cast(table.schema.field(place).type))
-        return table
+        table, names = recording_transitions(recording), ("action", "pose_x_m", "pose_y_m")
+        first = recording_transitions(1).select(["observation", *names]).to_pylist()[0]
+        return replaced(table, {name: [value] * len(table) for name, value in first.items()})
 
     with Store(write_store(tmp_path / "store", [standing(1), standing(2)])) as store:
         assert store.sql("FROM repeated_rows(1)").fetchall() == []
 
 
-def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path: Path) -> None:
+def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path):
     one, other = recording_transitions(1), recording_transitions(2)
     copy = copy_of(one, 5, later_ns=10**15, jitter_ns=2000)
     store = write_store(tmp_path / "store", [one, other, copy])
@@ -155,20 +145,20 @@ def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path: Path) -> N
     assert panel.header.left_out["same steps as the evaluation split"] == len(shown)
 
 
-def test_a_panel_of_one_drive_twice_is_refused() -> None:
+def test_a_panel_of_one_drive_twice_is_refused():
     one = recording_transitions(1)
     both = pa.concat_tables([one, copy_of(one, 5)])
     with pytest.raises(MixtureError, match="the same drive is in the store more than once"):
         planned(both, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4")
 
 
-def test_without_an_evaluation_split_copies_stay() -> None:
+def test_without_an_evaluation_split_copies_stay():
     one = recording_transitions(1)
     plan = planned(pa.concat_tables([one, copy_of(one, 5)]), EVERY + NO_SPLIT)
     assert len(plan.panel_rows) == 2 * len(one)
 
 
-def test_episodes_that_a_run_learnt_under_another_id_are_not_held_out(tmp_path: Path) -> None:
+def test_episodes_learnt_under_another_id_are_not_held_out(tmp_path):
     one, other = recording_transitions(1), recording_transitions(2)
     learnt = panel_of(write_store(tmp_path / "learnt", [one]), EVERY + NO_SPLIT, tmp_path / "p")
     logs = write_store(tmp_path / "logs", [one, other, copy_of(one, 5, later_ns=10**12)])

@@ -10,7 +10,6 @@ import shutil
 import sys
 from pathlib import Path
 
-import pyarrow as pa
 import pytest
 from support.paths import ROOT
 from support.stores import one, recording_transitions, write_store
@@ -18,6 +17,7 @@ from support.stores import one, recording_transitions, write_store
 from restock.cli import main
 from restock.errors import LabelError
 from restock.ingest.relabel import correct_store
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import true_names
 from restock.replay.review import (
@@ -34,14 +34,14 @@ MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
 
 
 @pytest.fixture(scope="module")
-def monday(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def monday(tmp_path_factory) -> Path:
     store = tmp_path_factory.mktemp("review") / "store"
     assert main(["ingest", str(MONDAY), "--store", str(store)]) == 0
     return store
 
 
 @pytest.fixture(scope="module")
-def reviewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[DoubtfulEvent]]:
+def reviewed(tmp_path_factory) -> tuple[Path, list[DoubtfulEvent]]:
     """Return two synthetic recordings, and all that is doubtful in them.
 
     `recovery` has a probability, the other conditions have none.
@@ -81,9 +81,7 @@ def true_verdict(event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]
 
 
 @pytest.mark.long
-def test_doubtful_events_are_wrong_more_often_and_their_verdicts_mend_the_labels(
-    monday: Path, tmp_path: Path
-) -> None:
+def test_doubtful_events_are_wrong_more_often(monday, tmp_path):
     with Store(monday) as store:
         truth, events = truly(store), doubtful_events(store, 100_000)
     wrong = [is_wrong(event, truth) for event in events]
@@ -122,9 +120,7 @@ def test_doubtful_events_are_wrong_more_often_and_their_verdicts_mend_the_labels
     sys.stdout.write("\n".join(said) + "\n")  # the figures of docs/ingest.md, by pytest -s
 
 
-def test_the_list_is_a_file_whose_commands_open_the_moment(
-    monday: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_is_a_file_whose_commands_open_the_moment(monday, tmp_path, capsys):
     file = tmp_path / "my review.csv"
     assert main(["store", "label", str(monday), "--review", "3", "--out", str(file)]) == 0
     shown, said = capsys.readouterr()
@@ -150,14 +146,10 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(
     assert "may contain verdicts" in capsys.readouterr().err
 
 
-def test_a_list_without_events_is_a_header_and_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_list_without_events_is_a_header_and_says_so(tmp_path, capsys):
     rows = recording_transitions(1, episodes=2)
-    for name, value in (("condition", "nominal"), ("conditions", []), ("probabilities", [])):
-        field = rows.schema.field(name)
-        values = pa.array([value] * len(rows), field.type)
-        rows = rows.set_column(rows.column_names.index(name), field, values)
+    nothing = {"condition": "nominal", "conditions": [], "probabilities": []}
+    rows = replaced(rows, {name: [value] * len(rows) for name, value in nothing.items()})
     store, file = write_store(tmp_path / "store", [rows]), tmp_path / "review.csv"
     for more in ([], ["--json"]):
         assert main(["store", "label", str(store), "--review", "3", "--out", str(file), *more]) == 0
@@ -184,11 +176,7 @@ def fill(
     return file
 
 
-def test_verdicts_of_a_review_change_the_labels_and_a_dry_run_does_not(
-    reviewed: tuple[Path, list[DoubtfulEvent]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_verdicts_change_the_labels_and_a_dry_run_does_not(reviewed, tmp_path, capsys):
     small, events = tmp_path / "store", reviewed[1]
     shutil.copytree(reviewed[0], small)
     assert events == sorted(events, key=lambda event: event.margin)
@@ -234,13 +222,7 @@ def test_verdicts_of_a_review_change_the_labels_and_a_dry_run_does_not(
         ("yes", {"last_step": "9" * 5000}, "line 2: first_step and last_step must be"),
     ],
 )
-def test_a_line_that_does_not_fit_is_named(
-    reviewed: tuple[Path, list[DoubtfulEvent]],
-    tmp_path: Path,
-    verdict: str,
-    changed: dict[str, str],
-    problem: str,
-) -> None:
+def test_a_line_that_does_not_fit_is_named(reviewed, tmp_path, verdict, changed, problem):
     small, events = reviewed
     file = fill(small, events, tmp_path / "review.csv", {0: verdict, 3: "yes"}, **changed)
     with Store(small) as store, pytest.raises(LabelError, match=re.escape(problem)) as error:
@@ -271,9 +253,7 @@ def test_a_line_that_does_not_fit_is_named(
         (HEADER + '"{episode},wheel_slip', "is not CSV"),
     ],
 )
-def test_a_file_that_cannot_be_taken_is_refused(
-    reviewed: tuple[Path, list[DoubtfulEvent]], tmp_path: Path, text: str, problem: str
-) -> None:
+def test_a_file_that_cannot_be_taken_is_refused(reviewed, tmp_path, text, problem):
     recording, file = f"{1:016x}", tmp_path / "file.csv"
     text = text.format(recording=recording, episode=f"{recording}/0")
     file.write_bytes(text.encode("latin-1"))
@@ -281,9 +261,7 @@ def test_a_file_that_cannot_be_taken_is_refused(
         read_verdicts(file, store)
 
 
-def test_wrong_usage_writes_nothing(
-    reviewed: tuple[Path, list[DoubtfulEvent]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_usage_writes_nothing(reviewed, capsys):
     before = sorted(reviewed[0].rglob("*"))
     for words, problem in (
         (

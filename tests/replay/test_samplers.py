@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,17 +51,17 @@ Make = Callable[..., Drawing]  # seed, batch_size
 
 
 @pytest.fixture(params=["memory", "chunks"])
-def kind(request: pytest.FixtureRequest) -> str:
+def kind(request) -> str:
     return str(request.param)
 
 
 @pytest.fixture(params=RULES)
-def way(request: pytest.FixtureRequest) -> str:
+def way(request) -> str:
     return str(request.param)
 
 
 @pytest.fixture
-def make(kind: str, way: str, tmp_path: Path) -> Iterator[Make]:
+def make(kind: str, way: str, tmp_path) -> Iterator[Make]:
     if kind == "chunks" and way != "in turns":
         pytest.skip("rows read in chunks have their turns")
     opened: list[ChunkedSampler] = []
@@ -103,7 +102,7 @@ def priority(rule: str, td_abs: np.ndarray) -> np.ndarray:
     return (td_abs + EPSILON) ** PER.per_alpha if rule == "per" else np.ones_like(td_abs)
 
 
-def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make: Make, way: str) -> None:
+def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make, way):
     drawing, td = make(batch_size=40), errors()  # 28 and 12
     for rows in STRATA:
         drawing.update(rows, td[rows])
@@ -123,7 +122,7 @@ def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make: Make, way: str) 
     assert counts.sum() == 160_000
 
 
-def test_shares_and_batch_size_may_change_between_batches(make: Make, way: str) -> None:
+def test_shares_and_batch_size_may_change_between_batches(make, way):
     """What was drawn ahead goes back: it is owed, and is no turn."""
     drawing, counts = make(batch_size=16), np.zeros(400)
     for index in range(300):
@@ -140,7 +139,7 @@ def test_shares_and_batch_size_may_change_between_batches(make: Make, way: str) 
 
 
 @pytest.mark.parametrize("before", [0, 3, 107])  # on the way, what was drawn ahead is given back
-def test_a_restored_sampler_goes_on_exactly(make: Make, tmp_path: Path, before: int) -> None:
+def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
     def go_on(drawing: Drawing, batches: int, seed: int) -> list[Any]:
         seen: list[Any] = []
         rng = np.random.default_rng(seed)
@@ -171,13 +170,13 @@ def test_a_restored_sampler_goes_on_exactly(make: Make, tmp_path: Path, before: 
     assert go_on(third, 250, seed=2) == expected
 
 
-def test_a_state_of_other_strata_is_refused() -> None:
+def test_a_state_of_other_strata_is_refused():
     state = uniform_sampler(10, 4, np.random.default_rng(0)).state_dict()
     with pytest.raises(MixtureError, match="other strata"):
         uniform_sampler(11, 4, np.random.default_rng(0)).load_state_dict(state)
 
 
-def test_a_state_of_another_rule_is_refused() -> None:
+def test_a_state_of_another_rule_is_refused():
     def sampler(within: str) -> QuotaSampler:
         return QuotaSampler(STRATA, SHARES, 50, np.random.default_rng(0), within=within)
 
@@ -189,9 +188,7 @@ def test_a_state_of_another_rule_is_refused() -> None:
 
 @settings(max_examples=150)
 @given(parts=PARTS, batch_size=st.integers(1, 300), draws=st.integers(1, 200))
-def test_every_batch_is_full_and_every_share_is_met_over_time(
-    parts: list[int], batch_size: int, draws: int
-) -> None:
+def test_every_batch_is_full_and_every_share_is_met_over_time(parts, batch_size, draws):
     shares = np.array(parts) / sum(parts)
     quotas = Quotas(shares, batch_size)
     total = np.zeros(len(shares))
@@ -205,7 +202,7 @@ def test_every_batch_is_full_and_every_share_is_met_over_time(
         assert np.abs(total - index * batch_size * shares).max() < 2.0
 
 
-def test_a_share_too_small_for_one_batch_is_met_exactly_over_time() -> None:
+def test_a_share_too_small_for_one_batch_is_met_over_time():
     quotas = Quotas([0.997, 0.003], 128)
     assert sum(int(quotas.next()[1]) for _ in range(1000)) == 384  # 0.003 * 128 * 1000
 
@@ -216,9 +213,7 @@ def test_a_share_too_small_for_one_batch_is_met_exactly_over_time() -> None:
     batch_size=st.integers(1, 90),
     seed=st.integers(0, 2**32),
 )
-def test_without_replacement_no_row_is_drawn_twice_more_than_another(
-    sizes: list[int], batch_size: int, seed: int
-) -> None:
+def test_without_replacement_rows_have_their_turns(sizes, batch_size, seed):
     starts = np.cumsum([0, *sizes])
     rows = [np.arange(a, b) for a, b in pairwise(starts)]
     shares = np.full(len(sizes), 1 / len(sizes))
@@ -240,9 +235,7 @@ def test_without_replacement_no_row_is_drawn_twice_more_than_another(
     within=st.sampled_from(["uniform", "without_replacement"]),
     seed=st.integers(0, 2**32),
 )
-def test_what_is_owed_stays_within_rows_when_shares_change(
-    steps: list[tuple[int, int, int]], within: str, seed: int
-) -> None:
+def test_what_is_owed_stays_within_rows_when_shares_change(steps, within, seed):
     rows = [np.arange(0, 30), np.arange(30, 41), np.arange(41, 60)]
     sampler = QuotaSampler(rows, [0.5, 0.3, 0.2], 16, np.random.default_rng(seed), within=within)
     counts, wanted, total = np.zeros(60), np.zeros(3), np.zeros(3)
@@ -268,6 +261,6 @@ def test_what_is_owed_stays_within_rows_when_shares_change(
     ("shares", "message"),
     [([0.5, 0.4], "sum to 1"), ([1.5, -0.5], "not negative"), ([1.0, np.nan], "finite")],
 )
-def test_shares_that_are_no_distribution_are_refused(shares: list[float], message: str) -> None:
+def test_shares_that_are_no_distribution_are_refused(shares, message):
     with pytest.raises(MixtureError, match=message):
         Quotas(shares, 8)

@@ -8,13 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import (
-    Linear,
-    Piecewise,
-    StratumRule,
-    mean_over,
-    value_at,
-)
+from restock.replay.mixture.mixture import Linear, Piecewise, StratumRule, mean_over, value_at
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.replay.plan.strata import ResolvedStratum, assign
 
@@ -36,9 +30,7 @@ def rules(draw: st.DrawFn) -> list[StratumRule]:
 
 @settings(max_examples=300)
 @given(rules(), st.data())
-def test_wanted_shares_sum_to_one_within_floors_and_caps_or_are_refused(
-    given_rules: list[StratumRule], data: st.DataObject
-) -> None:
+def test_wanted_shares_sum_to_one_within_floors_and_caps(given_rules, data):
     rows = np.array([data.draw(st.integers(0, 10_000)) for _ in given_rules])
     fixed = sum(rule.share for rule in given_rules if isinstance(rule.share, float))
     flexible = [rule for rule in given_rules if isinstance(rule.share, str)]
@@ -65,7 +57,7 @@ def test_wanted_shares_sum_to_one_within_floors_and_caps_or_are_refused(
 
 @settings(max_examples=300)
 @given(st.data())
-def test_no_stratum_gives_more_than_its_rows_can_bear(data: st.DataObject) -> None:
+def test_no_stratum_gives_more_than_its_rows_can_bear(data):
     count = data.draw(st.integers(1, 7))
     parts = [np.array([data.draw(PARTS) for _ in range(count)]) for _ in range(3)]
     wanted, limit, caps = parts
@@ -96,7 +88,7 @@ def test_no_stratum_gives_more_than_its_rows_can_bear(data: st.DataObject) -> No
 
 @settings(max_examples=200)
 @given(st.data())
-def test_priorities_part_the_rows(data: st.DataObject) -> None:
+def test_priorities_part_the_rows(data):
     count, size = data.draw(st.integers(0, 30)), data.draw(st.integers(1, 5))
     flags = data.draw(st.lists(st.booleans(), min_size=count * size, max_size=count * size))
     member = np.array(flags, np.bool_).reshape(count, size)
@@ -111,7 +103,7 @@ def test_priorities_part_the_rows(data: st.DataObject) -> None:
         assert code[row] == (min(holds)[1] if holds else -1)
 
 
-def test_schedules_pass_through_their_points() -> None:
+def test_schedules_pass_through_their_points():
     linear = Linear(start=0.8, end=0.2, from_env_steps=100, to_env_steps=300)
     assert [linear.at(step) for step in (0, 100, 200, 300, 900)] == pytest.approx(
         [0.8, 0.8, 0.5, 0.2, 0.2]
@@ -132,7 +124,7 @@ def test_schedules_pass_through_their_points() -> None:
         Piecewise(points=((0, 0.2), (30, 0.8), (31, 0.1))),
     ],
 )
-def test_the_mean_of_a_schedule_is_the_mean_of_its_values(portion: object) -> None:
+def test_the_mean_of_a_schedule_is_the_mean_of_its_values(portion):
     steps = (np.arange(200_000) + 0.5) / 1000
     values = np.mean([value_at(portion, step) for step in steps])  # type: ignore[arg-type]
     assert mean_over(portion, 0, 200) == pytest.approx(values, abs=2e-4)  # type: ignore[arg-type]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +28,7 @@ def drive(steps: int) -> pa.Table:
 
 
 @pytest.mark.parametrize("name", shipped_mixtures())
-def test_every_shipped_mixture_packs_one_episode(name: str, tmp_path: Path, capsys) -> None:
+def test_every_shipped_mixture_packs_one_episode(name, tmp_path, capsys):
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
     options = ["--mixture", name, "--out", str(tmp_path / "panel")]
     assert cli.main(["mix", str(store), *options]) == 0
@@ -45,9 +44,7 @@ def test_every_shipped_mixture_packs_one_episode(name: str, tmp_path: Path, caps
     assert found["leakage"]["status"] == "pass"
 
 
-def test_wanted_is_a_share_of_a_batch_in_the_table_and_nowhere_another_one(
-    tmp_path: Path, capsys
-) -> None:
+def test_wanted_is_a_share_of_a_batch_in_the_table(tmp_path, capsys):
     """Of few rows a stratum may be short, and yet more of the logged rows than was wanted."""
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
     assert cli.main(["mix", str(store), "--dry-run"]) == 0
@@ -64,7 +61,7 @@ def test_wanted_is_a_share_of_a_batch_in_the_table_and_nowhere_another_one(
     assert not any("%" in line for line in short)
 
 
-def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, capsys) -> None:
+def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path, capsys):
     store = write_store(tmp_path / "store", [drive(20)], task=TASK)
     options = ["--mixture", "uniform", "--out", str(tmp_path / "panel"), "--json"]
     assert cli.main(["mix", str(store), *options]) == 0
@@ -81,7 +78,7 @@ def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, caps
     share=st.floats(0.05, 0.5),
     n_step=st.integers(1, 8),
 )
-def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, n_step) -> None:
+def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, n_step):
     table = table_of(*lengths)
     step, names = table["step_index"].to_numpy(), table["episode_id"].to_pylist()
     split = f'by = "within_episode", share = {share}'
@@ -109,7 +106,7 @@ def table_of(*lengths: int) -> pa.Table:
     return pa.table({"episode_id": pa.array(names).dictionary_encode(), **columns})
 
 
-def test_of_few_episodes_the_end_of_the_longest_is_held_out() -> None:
+def test_of_few_episodes_the_end_of_the_longest_is_held_out():
     """A whole one of two was half of the rows, and all there was of its conditions."""
     mixture = parse_mixture("[each_condition]\nshare = 'natural'", where="test")
     table = table_of(180, 205)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -22,6 +21,7 @@ from restock import cli
 from restock.errors import PanelError, RecordingError, RunError, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.version import FORMAT
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.mixture.mixture import parse_mixture
@@ -51,7 +51,7 @@ class Places:
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory: pytest.TempPathFactory) -> Places:
+def places(tmp_path_factory) -> Places:
     folder = tmp_path_factory.mktemp("trace")
     ingest(RECORDING, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     panel = panel_of(folder / "store", MIXTURE, folder / "panel")
@@ -102,7 +102,7 @@ def write_run(path: Path, panel: Panel) -> None:
     )
 
 
-def test_an_audited_row_leads_to_the_messages_it_was_made_of(places: Places) -> None:
+def test_an_audited_row_leads_to_the_messages_it_was_made_of(places):
     found = trace_row(places.run, "7/1", TracePlaces(recording=RECORDING))
     assert found.panel is not None
     assert found.panel["row"] == 100
@@ -134,7 +134,7 @@ def test_an_audited_row_leads_to_the_messages_it_was_made_of(places: Places) -> 
     assert {name for topic in found.origin.topics for name in topic["fills"]} >= {"command", "scan"}
 
 
-def test_the_parts_of_a_reward_sum_to_it(places: Places) -> None:
+def test_the_parts_of_a_reward_sum_to_it(places):
     steps = places.rows("FROM transitions ORDER BY transition_id")
     whole = 0
     for row in steps[::80]:
@@ -148,7 +148,7 @@ def test_the_parts_of_a_reward_sum_to_it(places: Places) -> None:
     assert whole > 5
 
 
-def test_every_row_of_the_recording_finds_its_tick(places: Places) -> None:
+def test_every_row_of_the_recording_finds_its_tick(places):
     for row in places.rows("FROM transitions ORDER BY hash(transition_id) LIMIT 3"):
         where = TracePlaces(recording=RECORDING)
         origin = trace_row(places.store, str(row["transition_id"]), where).origin
@@ -157,7 +157,7 @@ def test_every_row_of_the_recording_finds_its_tick(places: Places) -> None:
         assert imu.fields["angular_velocity.z"] == pytest.approx(row["gyro_yaw_rate_radps"])
 
 
-def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places: Places) -> None:
+def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places):
     found = trace_row(places.run, "7/3")
     assert found.origin is None
     assert found.episode == {
@@ -173,16 +173,16 @@ def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places: Places) ->
     assert found.audit["episode_step"] == 4
 
 
-def test_audited_rows_are_listed_by_their_error(places: Places) -> None:
+def test_audited_rows_are_listed_by_their_error(places):
     assert [row["row"] for row in audited_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
 
 
-def test_rows_are_listed_of_runs_alone(places: Places, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_are_listed_of_runs_alone(places, capsys):
     assert cli.main(["trace", str(places.panel)]) == 2
     assert "give ROW" in capsys.readouterr().err
 
 
-def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
+def test_a_row_of_the_panel_can_be_followed_too(places):
     found = trace_row(places.panel, "5")
     assert found.panel is not None
     assert found.origin is not None
@@ -192,7 +192,7 @@ def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
         trace_row(places.panel, "1000000")
 
 
-def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
+def test_what_is_not_there_is_said(places, tmp_path):
     with pytest.raises(RunError, match="is not an audited row"):
         trace_row(places.run, "12")
     with pytest.raises(RunError, match="was not audited"):
@@ -212,7 +212,7 @@ def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
         trace_row(tmp_path / "nowhere", "1")
 
 
-def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path: Path) -> None:
+def test_places_that_were_moved_are_asked_for_and_taken(places, tmp_path):
     store, panel = tmp_path / "store", tmp_path / "panel"
     shutil.copytree(places.store, store)
     panel_of(store, MIXTURE, panel)
@@ -232,21 +232,20 @@ def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path
         trace_row(tmp_path / "run", "7/0", TracePlaces(panel=tmp_path / "other"))
 
 
-def test_another_recording_is_refused(places: Places) -> None:
+def test_another_recording_is_refused(places):
     (row,) = places.rows("SELECT transition_id FROM transitions LIMIT 1")
     other = RECORDING.with_name("amr_monday.mcap")
     with pytest.raises(RecordingError, match="the row is of"):
         trace_row(places.store, str(row["transition_id"]), TracePlaces(recording=other))
 
 
-def test_a_row_that_was_labelled_again_since_says_so(tmp_path: Path) -> None:
+def test_a_row_that_was_labelled_again_since_says_so(tmp_path):
     before = recording_transitions(1)
     writer = write_store(tmp_path / "store", [before, recording_transitions(2)])
     panel_of(writer, MIXTURE, tmp_path / "panel")
     later = recording_transitions(1, ingest="b")
-    place = later.schema.get_field_index("condition")
-    named = pa.array(np.where(np.arange(len(later)) == 0, "recovery", later["condition"]))
-    replace_recording(tmp_path / "store", later.set_column(place, later.schema.field(place), named))
+    named = ["recovery", *later["condition"].to_pylist()[1:]]
+    replace_recording(tmp_path / "store", replaced(later, {"condition": named}))
     found = trace_row(tmp_path / "panel", "0").origin
     assert found is not None
     assert found.transition["condition"] == before["condition"][0].as_py()
@@ -265,9 +264,7 @@ def replace_recording(store: Path, rows: pa.Table) -> None:
     write_deltalake(table, rows, mode="overwrite", predicate=predicate)
 
 
-def test_the_verb_prints_a_trace_and_its_document(
-    places: Places, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_prints_a_trace_and_its_document(places, capsys):
     assert cli.main(["trace", str(places.run)]) == 0
     assert "7/2" in capsys.readouterr().out
     arguments = ["trace", str(places.run), "7/2", "--recording", str(RECORDING)]

@@ -52,9 +52,7 @@ def write_recording(folder: Path, storage: str) -> Path:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_cut_return_sums_what_there_is_and_bootstraps_at_its_last_step(
-    tmp_path: Path, storage: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cut_return_bootstraps_at_its_last_step(tmp_path, storage, capsys):
     profile, mixture = tmp_path / "amr.toml", tmp_path / "three.toml"
     profile.write_text(WAREHOUSE.replace("time_limit_steps = 240", f"time_limit_steps = {LIMIT}"))
     mixture.write_text(MIXTURE)

@@ -29,7 +29,7 @@ LISTED = '[[strata]]\nname = "{}"\nunit = "{}"\nshare = "equal"\n'
 
 
 @pytest.fixture(scope="module")
-def braking(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def braking(tmp_path_factory) -> Path:
     """Return a real recording, labelled by a profile that calls every stop hard braking."""
     folder = tmp_path_factory.mktemp("braking")
     (folder / "amr.toml").write_text(WAREHOUSE + BRAKING.format(0.25))
@@ -62,13 +62,11 @@ class Mix:
 
 
 @pytest.fixture
-def mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Mix:
+def mix(tmp_path, capsys) -> Mix:
     return Mix(tmp_path, capsys)
 
 
-def test_a_condition_that_every_episode_meets_is_named_with_what_fills_nominal(
-    braking: Path, tmp_path: Path, mix: Mix
-) -> None:
+def test_a_condition_of_every_episode_is_named_with_remedies(braking, tmp_path, mix):
     store = braking / "store"
     strata, (warning,) = mix(store, NOMINAL + EACH)
     assert strata["nominal"]["rows"] == 0
@@ -104,9 +102,7 @@ def test_a_condition_that_every_episode_meets_is_named_with_what_fills_nominal(
     assert not [text for text in warnings if text.startswith("nominal")]
 
 
-def test_a_stratum_that_another_one_goes_before_is_told_its_priority(
-    tmp_path: Path, mix: Mix
-) -> None:
+def test_a_stratum_behind_another_one_is_advised_a_priority(tmp_path, mix):
     store = write_store(tmp_path / "store", [recording_transitions(n) for n in (1, 2)])
     before = '[[strata]]\nname = "moving"\nwhere = "step_index > 1"\npriority = 5\nshare = 0.5\n'
     each = '[each_condition]\nshare = "equal"\ncorrection = "none"\n[correction]\npost = "none"\n'
@@ -120,7 +116,7 @@ def test_a_stratum_that_another_one_goes_before_is_told_its_priority(
     assert not [text for text in warnings if text.startswith("wheel_slip")]
 
 
-def test_nothing_is_said_of_strata_with_what_they_want(store_path: Path, mix: Mix) -> None:
+def test_nothing_is_said_of_strata_with_what_they_want(store_path, mix):
     assert mix(store_path, "[each_condition]\nshare = 'natural'\n")[1] == []
     assert mix(store_path, "[each_condition]\nshare = 'equal'\n")[1] == []
     # Without a wanted share an empty stratum is no mistake.
@@ -129,9 +125,7 @@ def test_nothing_is_said_of_strata_with_what_they_want(store_path: Path, mix: Mi
     assert mix(store_path, never.format('"natural"'))[1] == []
 
 
-def test_a_quota_for_what_the_logs_lack_is_named_with_what_to_change(
-    braking: Path, mix: Mix
-) -> None:
+def test_a_quota_for_what_the_logs_lack_is_named(braking, mix):
     store = braking / "store"
     where = "where = \"NOT list_contains(conditions, 'wheel_slip')\"\n"
     strata, warnings = mix(store, where + "[each_condition]\nshare = 'equal'\n")
@@ -152,7 +146,7 @@ def test_a_quota_for_what_the_logs_lack_is_named_with_what_to_change(
     assert "or give it a `where`; or add it to the profile and run `restock store label`" in unknown
 
 
-def test_quotas_that_no_shelf_can_fill_are_each_named(store_path: Path, mix: Mix) -> None:
+def test_quotas_that_no_shelf_can_fill_are_each_named(store_path, mix):
     names = ("nominal", "recovery", "near_collision", "wheel_slip", "blocked_aisle")
     limit = "shortfall = 'refuse'\nmax_replays_per_row = 3\n[each_condition]\nshare = 'equal'\n"
     refused = mix.refused(store_path, limit)

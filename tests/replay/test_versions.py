@@ -87,7 +87,7 @@ def test_what_has_no_versions_says_so(
         restock.open(str(path), version="yesterday")
 
 
-def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path: Path) -> None:
+def test_a_version_whose_files_are_gone_names_the_retention(tmp_path: Path) -> None:
     writer = StoreWriter(tmp_path / "store")
     first = writer.write(*one(1))
     writer.write(*one(1, ingest="b"))
@@ -98,9 +98,7 @@ def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_version_of_one_file_or_of_joined_ones_is_said_to_be_gone_alike(
-    tmp_path: Path, version: int
-) -> None:
+def test_a_version_of_joined_files_is_gone_as_one_of_one_file(tmp_path: Path, version: int) -> None:
     writer = StoreWriter(tmp_path / "store")
     writer.write_all([one(1), one(2)])
     compact(writer)
