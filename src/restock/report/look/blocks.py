@@ -12,6 +12,7 @@ from typing import Any
 
 import duckdb
 
+from restock.errors import figure
 from restock.stats import interval_text
 
 Rows = list[dict[str, Any]]
@@ -134,7 +135,7 @@ def _cell(name: str, value: Any) -> str:
         return words(value or "") if name in _NAMES else value or ""
     if name.endswith("share") or name in _SHARES:
         return percent(value)
-    return count(value) if isinstance(value, int) else number(value)
+    return count(value) if isinstance(value, int) else figure(value)
 
 
 def listed(names: Sequence[str]) -> str:
