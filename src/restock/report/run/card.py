@@ -156,13 +156,13 @@ def as_markdown(card: dict[str, Any]) -> str:
     facts = {
         "Policy": card["policy"] and card["policy"]["text"],
         "Capacity": f"{count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
-        "Sampling rule": f"batches of {sampling['batch_size']},"
+        "Sampling rule": f"batches of {_words(sampling['batch_size'])},"
         f" {percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
         f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
         "Teacher": _teacher(teacher, card["behaviour_policies"]),
         "Practice": f"missions by the rule {card['practice']['rule']}",
-        "Returns": f"{sampling['n_step']['logs']}-step in the logs,"
-        f" {sampling['n_step']['fresh']}-step fresh",
+        "Returns": f"{_words(sampling['n_step']['logs'])}-step in the logs,"
+        f" {_words(sampling['n_step']['fresh'])}-step fresh",
         "Target rule": _words(card["target"]),
         "Corrections": f"{_words(moved['rules'])}; outcome strata:"
         f" {', '.join(moved['post_strata']) or 'none'}; weights moved"
@@ -196,7 +196,7 @@ def as_markdown(card: dict[str, Any]) -> str:
     return write.as_markdown(
         {
             "title": f"Replay card of {card['run']}",
-            "headline": f"Evaluation bias: {card['imbalance'] or _UNKNOWN}".removesuffix("."),
+            "headline": (card["imbalance"] or f"Evaluation bias: {_UNKNOWN}").removesuffix("."),
             "lead": "",
             "sections": [
                 Section("", title, tables=[Table(rows)]) for title, rows in tables.items() if rows
