@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
-from support.driven_robot import Drive, columns, scans, without, write_topics
+from support.driven_robot import Drive, columns, scans, transforms, without, write_topics
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
+from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.steps.episodes import Steps, steps_of
@@ -52,8 +52,9 @@ class Corridor(Drive):
         for index, (topic, place) in enumerate(self.mounted):
             hanging = self.roll_rad if index == len(self.mounted) - 1 else 0.0
             found[topic] = self.scan(times_s, place, f"laser{index}", upside_down=hanging != 0)
-        lidars = [(f"laser{index}", place) for index, (_, place) in enumerate(self.mounted)]
-        found["/tf_static"] = transforms(lidars, self.roll_rad)
+        edges = [("base_link", f"laser{n}", *place) for n, (_, place) in enumerate(self.mounted)]
+        edges[-1] += (self.roll_rad,)
+        found["/tf_static"] = transforms(np.zeros(1), *edges)[1]
         return found
 
     def scan(
@@ -104,26 +105,6 @@ def cast(moved_m: float, place: Place, bearing: Any) -> Any:
         hit = (half > 0) & (along > half)
         ranges = np.where(hit, np.minimum(ranges, along - half), ranges)
     return np.where(ranges < 8.0, ranges, np.inf)
-
-
-def transforms(lidars: list[tuple[str, Place]], roll_rad: float) -> TopicColumns:
-    """Of the lidars' frames in that of the base; the last is rolled first."""
-    rolls = np.zeros(len(lidars))
-    rolls[-1] = roll_rad
-    yaw = np.array([place[2] for _, place in lidars])
-    values: dict[str, Any] = {
-        "header.frame_id": np.full(len(lidars), "base_link", object),
-        "child_frame_id": np.array([frame for frame, _ in lidars], object),
-        "transform.translation.x": np.array([place[0] for _, place in lidars]),
-        "transform.translation.y": np.array([place[1] for _, place in lidars]),
-        "transform.rotation.x": np.cos(yaw / 2) * np.sin(rolls / 2),
-        "transform.rotation.y": np.sin(yaw / 2) * np.sin(rolls / 2),
-        "transform.rotation.z": np.sin(yaw / 2) * np.cos(rolls / 2),
-        "transform.rotation.w": np.cos(yaw / 2) * np.cos(rolls / 2),
-    }
-    ends = offsets_of(np.array([len(lidars)]))
-    fields = {f"transforms[].{path}": Ragged(column, ends) for path, column in values.items()}
-    return columns(np.zeros(1), fields, stamped=False)
 
 
 def two_lidars(front: str = "", rear: str = "") -> str:

@@ -23,6 +23,7 @@ from support.driven_robot import (
     pose,
     ragged,
     scans,
+    transforms,
     typed_topics,
     write_bag,
     write_topics,
@@ -220,24 +221,6 @@ def two_lidars() -> Topics:
     return topics
 
 
-def transforms(*edges: tuple[str, str, float], count: int = 1) -> tuple[str, TopicColumns]:
-    """Parent, child and angle of each edge, in every one of so many messages."""
-    parents, children, yaw = zip(*edges, strict=True)
-    values: dict[str, Any] = {
-        "header.frame_id": list(parents),
-        "child_frame_id": list(children),
-        "transform.rotation.z": np.sin(np.array(yaw) / 2),
-        "transform.rotation.w": np.cos(np.array(yaw) / 2),
-    }
-    fields = {
-        f"transforms[].{path}": ragged(
-            [np.array([one] * count, object if path.endswith("_id") else None) for one in column]
-        )
-        for path, column in values.items()
-    }
-    return "tf2_msgs/msg/TFMessage", columns(np.arange(count) * 0.1, fields, stamped=False)
-
-
 def with_laser(frame: str = "laser", **tf: tuple[str, TopicColumns]) -> Topics:
     topics = usual()
     scan = topics["/scan"][1]
@@ -247,8 +230,9 @@ def with_laser(frame: str = "laser", **tf: tuple[str, TopicColumns]) -> Topics:
     return topics | {f"/{name}": one for name, one in tf.items()}
 
 
-MOVING = transforms(("odom", "base_link", 0.0), count=60)
-STATIC = transforms(("base_link", "mast", 0.0), ("mast", "laser", np.pi / 2))
+TENTHS = np.arange(60) * 0.1
+MOVING = transforms(TENTHS, ("odom", "base_link"))
+STATIC = transforms(np.zeros(1), ("base_link", "mast"), ("mast", "laser", 0.0, 0.0, np.pi / 2))
 SECONDS = np.arange(0, 8, 0.1)
 RISING = np.clip(SECONDS, 0, 6)
 EMPTY = columns(SECONDS, {})
@@ -542,7 +526,7 @@ def test_ingest_names_a_lidar_that_nothing_places(tmp_path):
     shipped = load_profile("warehouse_amr")
     text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
     points_ahead = parse_profile(text.replace("[inputs.scan]", ahead), where="p")
-    leading = transforms(("odom", "base_link", 0.0), ("base_link", "/laser", 0.0), count=60)
+    leading = transforms(TENTHS, ("odom", "base_link"), ("base_link", "/laser"))
     for number, (topics, profile, named) in enumerate(
         [
             (with_laser(tf=MOVING), shipped, True),

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import BEAMS, Drive, columns, pose, scans, write_topics
+from support.driven_robot import BEAMS, Drive, columns, pose, scans, transforms, write_topics
 from support.paths import SHARED
 
 from restock.cli import main
-from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
+from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.replay.store.store import Store
 
-NAMES = ("base_link", "lidar")
 TYPES = {
     "/cmd_vel": "geometry_msgs/msg/Twist",
     "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -143,23 +142,7 @@ def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path, capsys):
 
 def lidar_at(x_m: float, y_m: float, yaw_rad: float, roll_rad: float = 0.0) -> TopicColumns:
     """Return the transform of the scans' frame, rolled and then turned."""
-    one = offsets_of(np.array([1]))
-    yaw, roll = yaw_rad / 2, roll_rad / 2
-    values: dict[str, Any] = {
-        "header.frame_id": "base_link",
-        "child_frame_id": "lidar",
-        "transform.translation.x": x_m,
-        "transform.translation.y": y_m,
-        "transform.rotation.x": np.cos(yaw) * np.sin(roll),
-        "transform.rotation.y": np.sin(yaw) * np.sin(roll),
-        "transform.rotation.z": np.sin(yaw) * np.cos(roll),
-        "transform.rotation.w": np.cos(yaw) * np.cos(roll),
-    }
-    fields = {
-        f"transforms[].{path}": Ragged(np.array([value], object if value in NAMES else None), one)
-        for path, value in values.items()
-    }
-    return columns(np.zeros(1), fields, stamped=False)
+    return transforms(np.zeros(1), ("base_link", "lidar", x_m, y_m, yaw_rad, roll_rad))[1]
 
 
 @dataclass

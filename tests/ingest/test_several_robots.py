@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from support.driven_robot import Drive, columns, typed_topics, up_to_the_panel, write_topics
+from support.driven_robot import Drive, transforms, typed_topics, up_to_the_panel, write_topics
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.roles import choose_robot
@@ -55,6 +52,7 @@ def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_pat
     assert f"`restock profile new --robot NAME` proposes another profile, for {other}," in said
 
 
+@pytest.mark.long
 def test_start_goes_the_way_of_the_robot_that_was_named(tmp_path, capsys):
     start = ["start", str(write_fleet(tmp_path)), "--out", str(tmp_path / "out")]
     assert main([*start, "--robot", "/robot1", *up_to_the_panel(tmp_path)]) == 3
@@ -75,26 +73,6 @@ def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path):
     assert (inputs.pose.topic, inputs.wheels.topic) == ("/robot1/amcl_pose", "/robot1/odom")
 
 
-def transforms(time_s: NDArray[Any], x_m: NDArray[Any]) -> TopicColumns:
-    """map -> odom, which is 5 m aside, and odom -> base_link, in each message."""
-    count = len(time_s)
-    stamp = columns(time_s, {}).fields["header.stamp"]
-    pairs: dict[str, tuple[Any, Any]] = {
-        "header.stamp": (stamp, stamp),
-        "header.frame_id": ("map", "odom"),
-        "child_frame_id": ("odom", "base_link"),
-        "transform.translation.x": (0.0, x_m),
-        "transform.translation.y": (5.0, 1.0),
-        "transform.rotation.w": (1.0, 1.0),
-    }
-    fields: dict[str, FieldColumn] = {}
-    for path, pair in pairs.items():
-        values = np.stack([np.broadcast_to(np.asarray(one), count) for one in pair], axis=1)
-        values = values.astype(object) if values.dtype.kind == "U" else values
-        fields[f"transforms[].{path}"] = Ragged(values.reshape(-1), np.arange(count + 1) * 2)
-    return columns(time_s, fields, stamped=False)
-
-
 @pytest.mark.parametrize("robots", [(1, 2), (2,)])
 def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_path, capsys):
     """As Nav2 has them where several robots are on one graph: `/robot2/tf`."""
@@ -103,8 +81,8 @@ def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_pat
     for n in robots:
         own = typed_topics(drive)
         topics |= {f"/robot{n}{name}": own[name] for name in ("/cmd_vel", "/odom")}
-        tf = transforms(at_s, drive.x_at(at_s) + n)
-        topics[f"/robot{n}/tf"] = ("tf2_msgs/msg/TFMessage", tf)
+        base = ("odom", "base_link", drive.x_at(at_s) + n, 1.0)
+        topics[f"/robot{n}/tf"] = transforms(at_s, ("map", "odom", 0.0, 5.0), base)
     bag, file, store = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml", tmp_path / "s"
     assert main(["profile", "new", str(bag), "--robot", "/robot2", "--out", str(file)]) == 0
     frames = parse_profile(file.read_text(), where="p").frames

@@ -143,6 +143,33 @@ def ragged(points: list[NDArray[Any]]) -> Ragged:
     return Ragged(values.reshape(-1), offsets_of(np.full(len(values), values.shape[1])))
 
 
+def transforms(time_s: NDArray[Any], *edges: tuple[Any, ...]) -> tuple[str, TopicColumns]:
+    """Return messages that each hold every edge: parent, child, x, y, yaw and roll.
+
+    What an edge leaves out is 0; numbers may be one for each message.
+    """
+    count, full = len(time_s), [(*edge, *(0.0,) * (6 - len(edge))) for edge in edges]
+    parent, child, x, y, yaw, roll = (
+        np.stack([np.broadcast_to(one, count) for one in values], axis=1).reshape(-1)
+        for values in zip(*full, strict=True)
+    )
+    yaw, roll = yaw / 2, roll / 2
+    values = {
+        "header.stamp": np.repeat(START_NS + np.rint(time_s * 1e9).astype(np.int64), len(edges)),
+        "header.frame_id": parent.astype(object),
+        "child_frame_id": child.astype(object),
+        "transform.translation.x": x,
+        "transform.translation.y": y,
+        "transform.rotation.x": np.cos(yaw) * np.sin(roll),
+        "transform.rotation.y": np.sin(yaw) * np.sin(roll),
+        "transform.rotation.z": np.sin(yaw) * np.cos(roll),
+        "transform.rotation.w": np.cos(yaw) * np.cos(roll),
+    }
+    each = offsets_of(np.full(count, len(edges)))
+    fields = {f"transforms[].{path}": Ragged(value, each) for path, value in values.items()}
+    return "tf2_msgs/msg/TFMessage", columns(time_s, fields, stamped=False)
+
+
 def without(topic: TopicColumns, keep: NDArray[np.bool_]) -> TopicColumns:
     """Only some of a topic's messages."""
     from restock.ingest.decoding.columns import take
