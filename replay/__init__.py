@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from restock.replay.store.audit import run_audits as run_audits
     from restock.replay.store.frames import camera_frames as camera_frames
     from restock.replay.store.store import Store as Store
-    from restock.replay.trace.trace import TracePlaces as TracePlaces
     from restock.replay.trace.trace import trace_row as trace_row
 else:
     __getattr__, __dir__, __all__ = lazy(__name__)

@@ -10,7 +10,6 @@ what was left out, and what its labels are worth. Paths of this machine are only
 from __future__ import annotations
 
 import importlib
-import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +31,6 @@ READ = {
 }
 _HUB_TAG = {"lerobot": "LeRobot", "minari": "minari"}
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-_IDENTIFIER = re.compile(r"[a-z0-9][a-z0-9.-]*")
 
 
 class Contents:
@@ -52,24 +50,11 @@ class Contents:
             yield trajectory
 
 
-def check_license(identifier: str | None) -> None:
-    """Raise StoreError where it is no identifier as hubs of data sets write them."""
-    if identifier is not None and not _IDENTIFIER.fullmatch(identifier):
-        raise StoreError(
-            f"{identifier!r} is not an identifier of a licence",
-            where="--license",
-            remedy="write it as hubs do, in small letters: cc-by-4.0, apache-2.0, other",
-        )
-
-
-def card(
-    selection: Selection, counts: Counts, contents: Contents, to: str, identifier: str | None
-) -> str:
-    """Return the text of the card; without an identifier it says that no licence was given."""
+def card(selection: Selection, counts: Counts, contents: Contents, to: str) -> str:
+    """Return the text of the card; it says that no licence was given."""
     reported, task = counts.describe(), selection.task
     size = next((name for most, name in _SIZES if reported["transitions"] < most), "1M<n<10M")
     front = [
-        *([f"license: {identifier}"] if identifier else []),
         "task_categories: [robotics, reinforcement-learning]",
         f"tags: [{_HUB_TAG[to]}, robotics, offline-rl, mobile-robots, restock]",
         f"size_categories: [{size}]",
@@ -119,9 +104,7 @@ def card(
         " occurs.",
         "- A trajectory that was cut goes on: bootstrap there.",
         "",
-        f"Licence: {identifier}."
-        if identifier
-        else "No licence was given: without one, nobody else may use it.",
+        "No licence was given: without one, nobody else may use it. Write `license:` above.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -149,7 +132,6 @@ def export_dataset(
     query: str | None = None,
     panel: str | Path | None = None,
     continuous: bool = False,
-    license: str | None = None,
     cameras: Sequence[str] | None = None,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
@@ -160,7 +142,6 @@ def export_dataset(
         to: one of FORMATS.
         out: a file or directory that must not exist yet.
         query, panel, continuous: see `open_selection`.
-        license: its identifier (`cc-by-4.0`), for the card of a data set that is a directory.
         cameras: whose frames go with the steps, of a store to lerobot; None: all that it has.
         advance: called with the number of steps written, as it goes on.
 
@@ -179,13 +160,6 @@ def export_dataset(
         raise StoreError(
             f"the format {to} needs {needs}, which is not installed",
             remedy=f"pip install {needs}, or {install_command('libraries')}",
-        )
-    check_license(license)
-    if license is not None and ending:
-        cards = ", ".join(name for name, (_, _, end) in FORMATS.items() if not end)
-        raise StoreError(
-            f"the format {to} has no card for a licence",
-            remedy=f"leave --license out, or export to {cards}",
         )
     if cameras and to not in WITH_IMAGES:
         raise StoreError(
@@ -231,7 +205,7 @@ def export_dataset(
             partial = folder / out.name
             notes = write(selection, several, partial, counts)
             if not ending:
-                text = card(selection, counts, contents, to, license)
+                text = card(selection, counts, contents, to)
                 (partial / "README.md").write_text(text, encoding="utf-8")
             partial.rename(out)
     return {

@@ -35,7 +35,7 @@ from restock.replay.store.store import Store
 BATCH_ROWS = 16_384
 EVERYTHING = "FROM transitions"
 FROM_THE_STORE = (
-    "export its rows from the store: --panel PANEL --query"
+    "export its rows from the store: restock export STORE PANEL --query"
     ' "FROM transitions SEMI JOIN panel.rows USING (transition_id)"'
 )
 
@@ -85,7 +85,7 @@ def open_selection(
     if (path / HEADER).is_file():
         if query is not None or panel is not None:
             raise QueryError("a panel is exported as it is, without a query", where=str(path),
-                             remedy="query its store, with --panel beside it")  # fmt: skip
+                             remedy="give its store first, then the panel")  # fmt: skip
         if cameras:
             raise PanelError(
                 "a panel keeps no frames of cameras", where=str(path), remedy=FROM_THE_STORE

@@ -179,7 +179,7 @@ def find_gaps(
     if isinstance(by, str) or unknown or len(set(by)) != len(by) or not by:
         raise ConfigError(
             f"{', '.join(unknown) or list(by)!r} cannot define a cell",
-            where="--by",
+            where="by",
             remedy=f"name one or more of {', '.join(CELL)}, each once",
         )
     expect("store", store, Store, 'open it as Store("store")')

@@ -194,7 +194,6 @@ def find_moment(
     before_s: float = 5.0,
     after_s: float = 5.0,
     recording: Path | str | None = None,
-    profile: str | None = None,
 ) -> Moment:
     """Return the seconds around a row of a store.
 
@@ -203,7 +202,6 @@ def find_moment(
         before_s: seconds before it.
         after_s: and after it.
         recording: the recording it is from: scans, plans and all other topics are read from it.
-        profile: the profile that read it, where the store keeps none.
 
     Raises:
         StoreError: the store has no manifest of the recording any more.
@@ -243,7 +241,7 @@ def find_moment(
             f" --recording {row['source_file']}"
         )
         return moment
-    known = profile_of(origin, manifest, profile)
+    known = profile_of(origin, manifest)
     with open_recording(recording, salvage=True) as opened:
         if opened.recording_id != row["recording_id"]:
             raise RecordingError(

@@ -18,7 +18,7 @@ from restock.errors import ConfigError, RecordingError, StoreError
 from restock.files import first_line
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
+from restock.ingest.profile.profile import Profile, read_profile_toml
 from restock.ingest.profile.signal_paths import AXES, TURN
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
@@ -85,7 +85,7 @@ def messages_at_tick(
         raise RecordingError(
             f"has no tick {tick} at {stamp_ns} ns with the profile {profile.name!r}",
             where=str(path),
-            remedy="give the profile with which it was ingested, with --profile",
+            remedy="ingest the recording again: its profile has changed",
         )
     messages = [*_of_inputs(aligned), *_of_transforms(aligned, stamp_ns), *_of_signals(aligned)]
     named = [
@@ -197,7 +197,6 @@ def find_origin(
     transition: int,
     *,
     recording: Path | str | None = None,
-    profile: str | None = None,
 ) -> Origin:
     """Look a transition up in the stores, first to last.
 
@@ -205,7 +204,6 @@ def find_origin(
         sources: the stores.
         transition: its id.
         recording: the recording, to read the messages that its tick was made of.
-        profile: the profile that read it, where it is not a shipped one.
 
     Raises:
         StoreError: a store is not there, or none has the row.
@@ -216,17 +214,17 @@ def find_origin(
             raise StoreError(
                 "the store does not exist (any more)",
                 where=source.path,
-                remedy="give its new path with --store",
+                remedy=f"trace the row where the store is now: `restock trace STORE {transition}`",
             )
         origin = _look_up(source, transition)
         if origin is not None:
-            _interpret(origin, recording, profile)
+            _interpret(origin, recording)
             return origin
     raise StoreError(
         f"no transition {transition} in it",
         where=", ".join(source.path for source in sources),
         remedy="its recording was removed, or ingested again with other steps: `restock sql STORE"
-        ' "FROM recordings"` lists what is there; `--store` names another store',
+        ' "FROM recordings"` lists what is there',
     )
 
 
@@ -345,7 +343,7 @@ def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
     return [f"ingested or labelled again since (version {now.store['version']}): {changes}"]
 
 
-def _interpret(origin: Origin, recording: Path | str | None, name: str | None) -> None:
+def _interpret(origin: Origin, recording: Path | str | None) -> None:
     """Add the topics that the profile read, and the messages of the row's tick.
 
     The messages need the recording.
@@ -354,7 +352,7 @@ def _interpret(origin: Origin, recording: Path | str | None, name: str | None) -
     if manifest is None:
         return
     topics = manifest["topics"] or []
-    profile = profile_of(origin, manifest, name)
+    profile = profile_of(origin, manifest)
     if profile is not None:
         fills: dict[str, list[str]] = {}
         for input_name, source in profile.inputs.items():
@@ -426,28 +424,13 @@ def _reward_parts(
     return {name: float(value[0]) + 0.0 for name, value in parts.items()}  # never -0
 
 
-def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
-    """Return the profile that read the recording; None if it cannot be read.
-
-    It is the given one, the manifest's own, or the shipped one of that name.
-    """
-    name, text = given or manifest["profile"], manifest.get("profile_toml")
+def profile_of(origin: Origin, manifest: Mapping[str, Any]) -> Profile | None:
+    """Return the profile that read the recording, as its manifest has it; None if it is damaged."""
+    name = manifest["profile"]
     try:
-        if given is None and text:
-            profile = read_profile_toml(text, where=f"profile {name!r}")
-        else:
-            profile = load_profile(name)
+        profile = read_profile_toml(manifest["profile_toml"], where=f"profile {name!r}")
     except ConfigError as error:
-        if given is not None:
-            raise
-        origin.notes.append(
-            (
-                f"profile {name!r} cannot be read from the store ({error.what})"
-                if text
-                else f"profile {name!r} is not a shipped one"
-            )
-            + ": give its file with --profile to see which topics were read"
-        )
+        origin.notes.append(f"profile {name!r} cannot be read from the store ({error.what})")
         return None
     if profile.hash != manifest["profile_hash"]:
         origin.notes.append(

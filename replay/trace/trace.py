@@ -36,17 +36,7 @@ class Trace:
     notes: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class TracePlaces:
-    """New places of what was moved, and the recording and profile to read."""
-
-    store: str | None = None
-    panel: Path | str | None = None
-    recording: Path | str | None = None
-    profile: str | None = None
-
-
-def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = None) -> Trace:
+def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None = None) -> Trace:
     """Follow one row of a run, a panel or a store down to its messages.
 
     Args:
@@ -60,19 +50,19 @@ def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = Non
             where it was.
         RecordingError: the recording given is not the one the row is of.
     """
-    path, row, where = Path(place), str(row), where or TracePlaces()
+    path, row = Path(place), str(row)
     trace = Trace()
     if (path / RUN_CONFIG).is_file():
-        _of_run(trace, path, row, where)
+        _of_run(trace, path, row, recording)
     elif (path / HEADER).is_file():
-        _of_panel(trace, Panel.open(path), _number(row, path, "row number of the panel"), where)
+        _of_panel(trace, Panel.open(path), _number(row, path, "row number of the panel"), recording)
     elif is_store(location := Location.of(place)):
         number = _number(row, path, "transition id")
         version = None
         if location.version is not None:
             with Store(location) as store:
                 version = store.version
-        trace.origin = _origin([StoreVersion(str(location), version)], number, where)
+        trace.origin = _origin([StoreVersion(str(location), version)], number, recording)
     else:
         raise StoreError(
             "it is not a run, a panel or a store" if path.exists() else "it does not exist",
@@ -94,35 +84,35 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
         return rows_of(connection, sql_file("trace_rows.sql"), {"limit": limit})
 
 
-def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
+def _of_run(trace: Trace, run: Path, row: str, recording: Path | str | None) -> None:
     document = read_json(run / RUN_CONFIG, error=RunError)
     trace.audit = audit = _audit_row(run, row)
     if audit["source"] == "fresh":
         _of_twin(trace, run, document, audit)
         return
     run_panel = document.get("panel") or {}
-    panel_path = Path(where.panel or run_panel.get("path", ""))
+    panel_path = Path(run_panel.get("path", ""))
     if not (panel_path / HEADER).is_file():
         raise PanelError(
             "the run's panel does not exist",
             where=str(panel_path),
-            remedy="give its new path with --panel",
+            remedy="trace its row where the panel is now: `restock trace PANEL ROW`",
         )
     panel = Panel.open(panel_path)
     if panel.id != run_panel.get("id"):
         raise PanelError(
             f"is panel {panel.id}, the run drew from {run_panel.get('id')}",
             where=str(panel_path),
-            remedy="give the path of that panel with --panel",
+            remedy="trace the row of that panel: `restock trace PANEL ROW`",
         )
     number = audit.get("panel_row")
     if number is None:  # a run from before audit rows had it
         ids = panel.meta_column("transition_id")
         number = int(np.flatnonzero(ids == audit["transition_id"])[0])
-    _of_panel(trace, panel, int(number), where)
+    _of_panel(trace, panel, int(number), recording)
 
 
-def _of_panel(trace: Trace, panel: Panel, number: int, where: TracePlaces) -> None:
+def _of_panel(trace: Trace, panel: Panel, number: int, recording: Path | str | None) -> None:
     if not 0 <= number < len(panel):
         raise PanelError(f"has rows 0 to {len(panel) - 1}, not {number}", where=str(panel.path))
     meta = panel.meta.slice(number, 1).to_pylist()[0]
@@ -137,9 +127,9 @@ def _of_panel(trace: Trace, panel: Panel, number: int, where: TracePlaces) -> No
     if header.store_version < 0:
         trace.notes.append("the panel was made from a table in memory: there is no store to search")
         return
-    sources = [StoreVersion(where.store or header.store, header.store_version)]
+    sources = [StoreVersion(header.store, header.store_version)]
     sources += [StoreVersion(other.path, other.version) for other in header.others]
-    trace.origin = _origin(sources, int(meta["transition_id"]), where)
+    trace.origin = _origin(sources, int(meta["transition_id"]), recording)
     stored = np.float32(trace.origin.transition["observation"])
     same = np.array_equal(packed[panel.columns["observation"]], stored)
     trace.panel["same_observation_as_stored"] = same
@@ -147,8 +137,8 @@ def _of_panel(trace: Trace, panel: Panel, number: int, where: TracePlaces) -> No
         trace.notes.append("the observation in the store is not the one that was packed")
 
 
-def _origin(sources: list[StoreVersion], transition: int, where: TracePlaces) -> Origin:
-    return find_origin(sources, transition, recording=where.recording, profile=where.profile)
+def _origin(sources: list[StoreVersion], transition: int, recording: Path | str | None) -> Origin:
+    return find_origin(sources, transition, recording=recording)
 
 
 def _of_twin(

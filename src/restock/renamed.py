@@ -105,5 +105,28 @@ VERBS = {  # what to type instead
 
 OPTIONS = {  # of one command, or of all; what to type instead
     "coverage drift --out": "the page of `restock coverage STORE --out FILE` has drift, too",
+    "coverage --every": "`restock coverage drift STORE --every month` prints other periods",
+    "coverage --figures": "print the page, or query the store for a figure of your own",
+    "demo --logs": "`restock start BAGS --out DIR` takes recordings of your own",
+    "demo --profile": "`restock start BAGS --out DIR` takes recordings of your own",
+    "demo --device": "leave it out: `restock train --device` takes a GPU",
+    "export --license": "write `license: ID` at the top of the card, README.md",
+    "export --panel": "give the panel after the store: restock export STORE PANEL",
+    "coverage gaps --by": "leave it out: a cell is a condition, zone, action and robot",
+    "ingest --engine": 'from Python: ingest_all(paths, job, engine="ray")',
+    "store label --all": "give the profile the name of the recordings' own",
+    "store label --by": "query the scores of each recording: FROM label_scores",
+    "trace --after": "leave it out: a view shows 5 s before and after the row",
+    "trace --before": "leave it out: a view shows 5 s before and after the row",
+    "trace --panel": "trace the row where the panel is now: restock trace PANEL ROW",
+    "trace --profile": "leave it out: the store has the profile",
+    "trace --store": "trace the row where the store is now: restock trace STORE ID",
+    **{
+        f"twin {job} --profile": "ingest again with that profile: it reads no recording"
+        for job in ("fit", "gap")
+    },
+    "twin fit --base": "leave it out: the other parameters are nominal",
+    "twin robot --friction": "leave it out: the floor's friction is 0.8",
+    "twin gap --fit": "run `restock twin fit STORE --out FILE`, and give --perturbation FILE",
     "--version": "write the version after the store: STORE@12 or STORE@2026-11-01T08:00Z",
 }

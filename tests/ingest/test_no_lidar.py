@@ -26,7 +26,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.plan.plan import plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
 from restock.replay.store.store import Store
-from restock.replay.trace.trace import TracePlaces, trace_row
+from restock.replay.trace.trace import trace_row
 from restock.train.view.write_view import write_view
 
 NEEDS_ONE = ["blocked_aisle", "closing_traffic", "near_collision", "plan_blocked", "recovery"]
@@ -110,7 +110,7 @@ def test_its_moments_are_viewed_without_what_a_lidar_sees(blind, tmp_path):
     with Store(path) as store:
         row, steps = store.sql("SELECT min(transition_id), count(*) FROM transitions").fetchall()[0]
     file = tmp_path / "moment.mcap"
-    trace = trace_row(path, str(row), TracePlaces())
+    trace = trace_row(path, str(row))
     assert trace.origin.reward_parts["tight"] == 0.0
     write_view(trace, file)
     with AnyReader([file]) as reader:

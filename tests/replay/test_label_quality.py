@@ -54,11 +54,9 @@ def test_the_command_prints_scores_and_reliability(store, capsys):
     said = capsys.readouterr().out
     assert "event recall" in said
     assert "wheel_slip" in said
-    assert main(["store", "label", str(store), "--score", "--by", "source_file", "--json"]) == 0
+    assert main(["store", "label", str(store), "--score", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert {row["group"] for row in document["scores"]} == {"logs/1.mcap", "logs/5.mcap"}
     assert {row["condition"] for row in document["reliability"]} == {"recovery"}
-    assert main(["store", "label", str(store), "--by", "source_file"]) == 2
     assert main(["store", "label", str(store), "--score", "--corrections", "none"]) == 2
 
 

@@ -28,7 +28,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
+from restock.replay.trace.trace import audited_rows, trace_row
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 MIXTURE = parse_mixture(
@@ -103,7 +103,7 @@ def write_run(path: Path, panel: Panel) -> None:
 
 
 def test_an_audited_row_leads_to_the_messages_it_was_made_of(places):
-    found = trace_row(places.run, "7/1", TracePlaces(recording=RECORDING))
+    found = trace_row(places.run, "7/1", recording=RECORDING)
     assert found.panel is not None
     assert found.panel["row"] == 100
     assert found.panel["same_bytes_as_sampled"]
@@ -150,8 +150,7 @@ def test_the_parts_of_a_reward_sum_to_it(places):
 
 def test_every_row_of_the_recording_finds_its_tick(places):
     for row in places.rows("FROM transitions ORDER BY hash(transition_id) LIMIT 3"):
-        where = TracePlaces(recording=RECORDING)
-        origin = trace_row(places.store, str(row["transition_id"]), where).origin
+        origin = trace_row(places.store, str(row["transition_id"]), recording=RECORDING).origin
         assert origin is not None
         imu = next(message for message in origin.messages if message.input == "imu")
         assert imu.fields["angular_velocity.z"] == pytest.approx(row["gyro_yaw_rate_radps"])
@@ -218,25 +217,21 @@ def test_places_that_were_moved_are_asked_for_and_taken(places, tmp_path):
     panel_of(store, MIXTURE, panel)
     write_run(tmp_path / "run", Panel.open(panel))
     store.rename(tmp_path / "elsewhere")
-    with pytest.raises(StoreError, match=r"--store"):
+    with pytest.raises(StoreError, match="restock trace STORE"):
         trace_row(tmp_path / "run", "7/0")
     panel.rename(tmp_path / "moved")
-    with pytest.raises(PanelError, match=r"--panel"):
+    with pytest.raises(PanelError, match="restock trace PANEL ROW"):
         trace_row(tmp_path / "run", "7/0")
-    moved = TracePlaces(store=str(tmp_path / "elsewhere"), panel=tmp_path / "moved")
-    found = trace_row(tmp_path / "run", "7/0", moved)
-    assert found.origin is not None
-    assert found.origin.store["path"] == str(tmp_path / "elsewhere")
-    build_panel(recording_transitions(1), MIXTURE, tmp_path / "other", task=TASK)
+    build_panel(recording_transitions(1), MIXTURE, panel, task=TASK)
     with pytest.raises(PanelError, match="the run drew from"):
-        trace_row(tmp_path / "run", "7/0", TracePlaces(panel=tmp_path / "other"))
+        trace_row(tmp_path / "run", "7/0")
 
 
 def test_another_recording_is_refused(places):
     (row,) = places.rows("SELECT transition_id FROM transitions LIMIT 1")
     other = RECORDING.with_name("amr_monday.mcap")
     with pytest.raises(RecordingError, match="the row is of"):
-        trace_row(places.store, str(row["transition_id"]), TracePlaces(recording=other))
+        trace_row(places.store, str(row["transition_id"]), recording=other)
 
 
 def test_a_row_that_was_labelled_again_since_says_so(tmp_path):

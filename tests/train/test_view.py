@@ -22,7 +22,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.replay.trace.moment import find_moment
-from restock.replay.trace.trace import Trace, TracePlaces, trace_row
+from restock.replay.trace.trace import Trace, trace_row
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
 from restock.train.run import checkpoint
@@ -45,7 +45,7 @@ class Event:
 
     @property
     def trace(self) -> Trace:
-        return trace_row(self.store, str(self.row["transition_id"]), TracePlaces())
+        return trace_row(self.store, str(self.row["transition_id"]))
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def test_the_command_names_the_file_and_its_layout(
     event: Event, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     row, path = str(event.row["transition_id"]), tmp_path / "m.mcap"
-    words = ["trace", str(event.store), row, "--view", str(path), "--before", "1", "--json"]
+    words = ["trace", str(event.store), row, "--view", str(path), "--json"]
     assert cli.main(words) == 0
     made = json.loads(capsys.readouterr().out)["view"]
     assert made["path"] == str(path)
@@ -219,5 +219,5 @@ def test_the_command_names_the_file_and_its_layout(
     assert Path(made["layout"]).exists()
     assert cli.main(["trace", str(event.run), "--view", str(tmp_path / "x.mcap")]) == 2
     assert "give ROW" in capsys.readouterr().err
-    assert cli.main(["trace", str(event.store), row, "--before", "1"]) == 2
-    assert "--before: has no effect without --view" in capsys.readouterr().err
+    assert cli.main(["trace", str(event.store), row, "--critic", "none"]) == 2
+    assert "--critic: has no effect without --view" in capsys.readouterr().err

@@ -22,7 +22,6 @@ class ViewOptions:
     before_s: float = 5.0
     after_s: float = 5.0
     recording: Path | str | None = None  # scans, plans and all other topics are in it
-    profile: str | None = None
     critic: str | None = None  # a run
 
 
@@ -52,7 +51,6 @@ def write_view(
         before_s=options.before_s,
         after_s=options.after_s,
         recording=options.recording,
-        profile=options.profile,
     )
     critic = critic_along(options.critic, moment) if options.critic is not None else None
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -29,6 +29,7 @@ _EXPLAINED: list[type[Any]] = []
 MIN_PROSE = 80  # columns that prose may take above narrower boxes, where the window has them
 MIN_COLUMNS = 30  # columns: in a few, tyro lays its boxes out without end
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_OPTIONS = re.compile(r"\[(?:OPTIONS|-(?:[^][]|\[[^][]*\])*)\] ?")  # in a line of usage
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
@@ -194,6 +195,8 @@ def fitted(text: str, columns: int) -> str:
     width = max(min(MIN_PROSE, columns), *boxes, 0)
     lines: list[str] = []
     for line, bare in given:
+        if bare.startswith("usage:"):  # the boxes below list the options
+            line = bare = f"{_OPTIONS.sub('', bare).rstrip()} [OPTIONS]"
         empty_in_box = bare.startswith("│") and not bare.strip("│ ")
         if empty_in_box or (not bare and lines and not lines[-1]):
             continue

@@ -58,7 +58,6 @@ def write_coverage_page(
     gaps: dict[str, Any],
     drift: Drift | str,
     out: Path | str,
-    figures: Path | str | None = None,
 ) -> Path:
     """Write the page of a store's coverage; returns its path.
 
@@ -66,7 +65,7 @@ def write_coverage_page(
         gaps: as `restock coverage gaps --json` prints them.
         drift: what `measure_drift` found, or why it could not be measured.
     """
-    return write_page(coverage_page(coverage_facts(store), gaps, drift), out, figures)
+    return write_page(coverage_page(coverage_facts(store), gaps, drift), out)
 
 
 def write_study_page(

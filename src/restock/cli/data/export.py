@@ -30,15 +30,13 @@ class ExportCommand:
     """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
+    panel: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
+    """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata."""
     query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
     """An SQL query that selects transitions of a store, with all columns. Default: all
     transitions."""
-    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """A panel whose tables the query may use, as panel.rows and panel.strata."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
-    license: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
-    """The licence for the card of a minari or lerobot data set: cc-by-4.0, apache-2.0, …"""
     cameras: Annotated[str, tyro.conf.arg(metavar="NAMES")] = "all"
     """From a store to lerobot: the cameras whose frames are exported, comma-separated, or all, or
     none. A step that lacks a frame of one of them is left out and counted."""
@@ -51,7 +49,7 @@ class ExportCommand:
         from restock.cli.command_line import refuse
 
         if self.to == "onnx":
-            of_rows = ("query", "panel", "version", "action", "license", "cameras")
+            of_rows = ("query", "panel", "action", "cameras")
             refuse(
                 self,
                 of_rows,
@@ -81,7 +79,6 @@ class ExportCommand:
                 query=self.query,
                 panel=self.panel,
                 continuous=self.action == "continuous",
-                license=self.license,
                 cameras=self._cameras(),
                 advance=lambda steps: advance(steps),
             )

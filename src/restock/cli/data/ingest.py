@@ -66,15 +66,12 @@ class IngestCommand:
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     workers: int = 1
     """How many processes read recordings at the same time."""
-    engine: Literal["processes", "ray"] = "processes"
-    """Where the processes run: on this machine, or on the Ray cluster at RAY_ADDRESS (if it is not
-    set, a local Ray is started). Ray is an extra: pip install 'restock[ray]'."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 
     def run(self) -> int:
         """Ingest each recording; return the exit code for all."""
-        if self.workers > 1 and self.engine == "processes":
+        if self.workers > 1:
             from restock.ingest.batch import warm_up
 
             warm_up()
@@ -105,9 +102,7 @@ class IngestCommand:
         outcomes: list[dict[str, Any]] = []
         lossy = False
         with output.progress("ingest", len(paths)) as advance:
-            for path, result in ingest_all(
-                paths, job, workers=self.workers, engine=self.engine, watch=advance.part
-            ):
+            for path, result in ingest_all(paths, job, workers=self.workers, watch=advance.part):
                 advance(1, path.name)
                 if isinstance(result, RestockError):
                     reported = str(result)

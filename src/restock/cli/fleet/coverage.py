@@ -36,13 +36,9 @@ class CoverageCommand:
     """The store."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write an HTML page that opens without a network. Replaces an existing file."""
-    figures: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """With --out: also write each figure of the page as SVG and PNG into this folder."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """The mixture whose planned draws say how much is needed of each stratum. See
     docs/mixture.md."""
-    every: str = "week"
-    """The length of a period for drift: day, week, month, year or decade."""
     json: bool = False
     """Print the table as JSON, one object per condition."""
 
@@ -55,11 +51,9 @@ class CoverageCommand:
         from restock.replay.store.store import Store
 
         if self.out is None:
-            options, why = ("figures", "mixture", "every"), "applies only to the page"
-            refuse(self, options, why, remedy="give --out FILE, too")
+            why = "applies only to the page"
+            refuse(self, ("mixture",), why, remedy="give --out FILE, too")
         expect_file_place(self.out, "--out")
-        if self.figures is not None:
-            expect_file_place(self.figures / "figure.svg", "--figures")
         with Store(self.store) as store:
             output.say_unverified(store)
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
@@ -78,7 +72,7 @@ class CoverageCommand:
                 output.stdout().print(said, markup=False, soft_wrap=True)
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
-        from restock.errors import ConfigError, RestockError
+        from restock.errors import RestockError
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.shopping_list import document, shopping_list
@@ -105,13 +99,11 @@ class CoverageCommand:
         advance(1, "drift")
         drift: Drift | str
         try:
-            drift = measure_drift(store, every=self.every)
-        except ConfigError:  # an option is wrong
-            raise
+            drift = measure_drift(store)
         except RestockError as error:  # the logs do not show it
             drift = str(error)
         advance(1, "charts")
-        return write_coverage_page(store, missing, drift, out, self.figures)
+        return write_coverage_page(store, missing, drift, out)
 
 
 def _line(row: dict[str, Any]) -> dict[str, Any]:
@@ -143,7 +135,7 @@ class GapsCommand:
 
         restock coverage gaps store/
         restock coverage gaps store/ --mixture my.toml --missions-out next.toml
-        restock coverage gaps store/ --min-rows 20 --by condition,zone
+        restock coverage gaps store/ --min-rows 20
 
     A gap is something that a mixture or an audit of coverage asks for and that the store lacks:
     rows of a stratum, rows or episodes of a condition, cells of condition x action; with --min-rows
@@ -165,8 +157,6 @@ class GapsCommand:
     """Use only the needs of the mixture, not those of the audits."""
     min_rows: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Also ask for at least this many rows of every cell."""
-    by: str = "condition,zone,action,robot"
-    """The columns that define a cell for --min-rows."""
     unit: Literal["missions", "hours"] | None = None
     """Count in missions or in hours of driving. Default: missions if a simulator made the
     recordings, hours if robots did."""
@@ -178,7 +168,6 @@ class GapsCommand:
     def run(self) -> None:
         """Find the gaps, plan what fills them, and print both."""
         from restock.cli import output
-        from restock.cli.command_line import refuse
         from restock.errors import ConfigError
         from restock.files import expect_file_place
         from restock.replay.fleet.gaps import find_gaps
@@ -191,8 +180,6 @@ class GapsCommand:
 
         if self.min_rows < 0:
             raise ConfigError(f"must be 0 or more, got {self.min_rows}", where="--min-rows")
-        if self.min_rows == 0:
-            refuse(self, ("by",), "has no effect without --min-rows", remedy="give --min-rows, too")
         mixture = load_mixture(self.mixture)
         thresholds = None if self.no_audits else load_thresholds(self.thresholds)
         if self.missions_out is not None:
@@ -207,7 +194,6 @@ class GapsCommand:
                 kinds=KINDS,
                 thresholds=thresholds,
                 min_rows=self.min_rows,
-                by=[name.strip() for name in self.by.split(",") if name.strip()],
             )
             place, version = str(store.path), store.version
         found = shopping_list(yields, gaps, unit=self.unit)
@@ -287,8 +273,8 @@ class DriftCommand:
     every: str = "week"
     """The length of a period: day, week, month, year or decade."""
     exit_code: bool = False
-    """Exit 1 if a robot, a site or a condition has changed. Changes in how a robot was driven do
-    not count."""
+    """Exit 1 if a robot, a site or a condition has changed; how a robot was driven does not
+    count."""
     json: bool = False
     """Print one JSON document: {"findings", "notes", "tests", …}."""
 

@@ -29,8 +29,8 @@ class LabelCommand:
     change in one commit. Each row stores the version of its labels.
 
     By default, a recording gets the conditions of the profile with which it was ingested: the
-    shipped profile of that name, or the copy in the store. `--profile` gives other conditions, for
-    the recordings ingested with a profile of the same name (or, with --all, for every recording).
+    shipped profile of that name, or the copy in the store. Another profile gives other conditions
+    to the recordings ingested with a profile of the same name.
 
     With --review, nothing is labelled: it lists the events whose label is most uncertain, each with
     its time, the command that opens it, and a column for a verdict. --corrections writes verdicts
@@ -40,14 +40,11 @@ class LabelCommand:
     store: Annotated[Path, tyro.conf.Positional]
     """The store's folder."""
     profile: str | None = None
-    """Use the conditions of this profile: the name of a shipped profile, or a TOML file."""
-    all: bool = False
-    """Also use that profile's conditions for recordings that were ingested with another profile."""
+    """Use the conditions of this profile, a shipped one or a TOML file, for the recordings that
+    were ingested with a profile of its name."""
     score: bool = False
     """Label nothing: compare the labels with the true conditions of simulated recordings, by step
     and by event, and print how reliable their probabilities are."""
-    by: Annotated[str | None, tyro.conf.arg(metavar="COLUMN")] = None
-    """With --score: one score for each value of a column of `recordings` (source_file, map, …)."""
     review: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """List the N most uncertain events."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -68,7 +65,7 @@ class LabelCommand:
 
         self._check_options()
         if self.score:
-            return print_scores(self.store, self.by, json=self.json)
+            return print_scores(self.store, json=self.json)
         store = open_for_relabel(self.store)
         if self.review is not None:
             return review(self.store, self.review, self.out, json=self.json)
@@ -117,7 +114,6 @@ class LabelCommand:
         """Raise ConfigError if options cannot be combined."""
         of_rules = {
             "--profile": self.profile is not None,
-            "--all": self.all,
         }
         for verb, given, others in (
             ("--score", self.score, {"--review": self.review is not None}),
@@ -128,10 +124,6 @@ class LabelCommand:
             clash = [name for name, there in (others | of_rules).items() if there]
             if given and clash:
                 raise ConfigError(f"{verb} cannot be combined with {clash[0]}")
-        if self.all and self.profile is None:
-            raise ConfigError("--all needs --profile FILE")
-        if self.by is not None and not self.score:
-            raise ConfigError("--by needs --score")
         if self.out is not None and self.review is None:
             raise ConfigError("--out needs --review N")
 
@@ -143,7 +135,7 @@ class LabelCommand:
         given = load_profile(self.profile) if self.profile is not None else None
 
         def conditions_of(name: str) -> Sequence[Condition]:
-            if given is not None and (self.all or given.name == name):
+            if given is not None and given.name == name:
                 return given.definitions
             try:
                 return load_profile(name).definitions
@@ -153,7 +145,7 @@ class LabelCommand:
                 raise ConfigError(
                     f"the store holds recordings of profile {name!r}, which cannot be found",
                     where=str(self.store),
-                    remedy="give its file: --profile FILE (with --all for every recording)",
+                    remedy="give its file: --profile FILE",
                 ) from error
 
         return conditions_of
@@ -175,14 +167,14 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
     }
 
 
-def print_scores(path: Path, by: str | None, *, json: bool) -> int:
+def print_scores(path: Path, *, json: bool) -> int:
     """Print precision and recall of each condition, and how reliable the probabilities are."""
     from restock.cli import output
     from restock.replay.review import label_quality, reliability
     from restock.replay.store.store import Store
 
     with Store(path) as store:
-        found = label_quality(store, by)
+        found = label_quality(store)
         bins = reliability(store).to_pylist()
     if json:
         rows = [quality_json(one) for one in found]
@@ -193,7 +185,7 @@ def print_scores(path: Path, by: str | None, *, json: bool) -> int:
             "no recording in the store contains the true conditions: nothing to score"
         )
         return ExitCode.OK
-    output.print_table(score_rows(found, by))
+    output.print_table(score_rows(found))
     reported = [row for row in bins if row["known"]]
     if reported:
         output.stdout().print(
@@ -203,11 +195,10 @@ def print_scores(path: Path, by: str | None, *, json: bool) -> int:
     return ExitCode.OK
 
 
-def score_rows(found: Sequence[LabelQuality], by: str | None) -> list[dict[str, Any]]:
-    """Return a table row for each condition and group."""
+def score_rows(found: Sequence[LabelQuality]) -> list[dict[str, Any]]:
+    """Return a table row for each condition."""
     return [
-        ({by: one.group} if by else {})
-        | {
+        {
             "condition": one.score.condition,
             "true steps": one.score.support,
             "precision": _interval(one.precision),

@@ -41,7 +41,7 @@ class ReportCommand:
     card: bool = False
     """Write the replay card instead of the page."""
     json: bool = False
-    """Print {"report": PATH, "bytes": N} instead of the path; with --card, the card as JSON."""
+    """Print {"report": PATH, "bytes": N} instead of the path, or the card as JSON."""
 
     def run(self) -> int | None:
         from restock.errors import ConfigError

@@ -28,13 +28,13 @@ class TraceCommand:
     For a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. Without
     ROW, the audited rows with the largest TD errors are listed. For a PANEL, ROW is a row number;
     for a STORE, a transition id. It shows the audited row, the row of the panel and of the store
-    from which it was drawn, the recording and the time in it, and, with --recording, the messages
+    from which it was drawn, the recording and the time in it, and the messages of a given recording
     that were held at that tick. For a fresh row, it shows the episode in the twin, and the spec
     that generates it again.
 
-    --view FILE.mcap writes the seconds around a row for Foxglove and Rerun: the
-    store's columns of each step, labels, the critic's value and TD error, and, with --recording,
-    scans, plans and every topic of the recording.
+    A view is an MCAP file of five seconds before and after the row: the store's columns of each
+    step, labels, the critic's value and TD error, and, if the recording is given, scans, plans and
+    every topic of it.
     """
 
     place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
@@ -44,19 +44,9 @@ class TraceCommand:
     store."""
     recording: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """The recording of the row: also show the messages from which the row was made."""
-    profile: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """The profile with which the recording was ingested, if it is not a shipped one."""
-    store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
-    """The new path of the store, if it was moved."""
-    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """The new path of the panel, if it was moved."""
     view: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write the seconds around the row: FILE.mcap for Foxglove, with a layout file beside it,
-    and for Rerun."""
-    before: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
-    """Seconds before the row that --view shows."""
-    after: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
-    """Seconds after the row that --view shows."""
+    """Also write the seconds around the row for Foxglove and Rerun: FILE.mcap, and a layout
+    beside it."""
     critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
     """The run whose critic --view shows, or none. Default for a row of a RUN: that run."""
     json: bool = False
@@ -65,7 +55,7 @@ class TraceCommand:
     def run(self) -> None:
         """Trace, and print what was found."""
         from restock.cli import output
-        from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
+        from restock.replay.trace.trace import audited_rows, trace_row
 
         self._check_view()
         if self.row is None:
@@ -85,8 +75,7 @@ class TraceCommand:
                     f"`restock trace {quoted(self.place)} {listed[0]['row']}` traces one of them"
                 )
             return
-        where = TracePlaces(self.store, self.panel, self.recording, self.profile)
-        trace = trace_row(self.place, self.row, where)
+        trace = trace_row(self.place, self.row, recording=self.recording)
         written = self._write_view(trace)
         if self.json:
             shown = {} if written is None else {"view": written}
@@ -101,8 +90,7 @@ class TraceCommand:
         from restock.errors import ConfigError
 
         if self.view is None:
-            without = ("before", "after", "critic")
-            refuse(self, without, "has no effect without --view", remedy="give --view FILE")
+            refuse(self, ("critic",), "has no effect without --view", remedy="give --view FILE")
             return
         from restock.train.view.write_view import check_view
 
@@ -113,11 +101,6 @@ class TraceCommand:
                 where="--view",
                 remedy=f"give ROW; for a run, `restock trace {quoted(self.place)}` lists some rows",
             )
-        for name in ("before", "after"):
-            if not 0 <= getattr(self, name) <= 3600:
-                raise ConfigError(
-                    f"must be from 0 to 3600 s, got {getattr(self, name):g} s", where=f"--{name}"
-                )
 
     def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:
         if self.view is None:
@@ -126,7 +109,7 @@ class TraceCommand:
 
         own = self.place if trace.audit is not None else None  # of a run
         critic = None if self.critic == "none" else self.critic or own
-        options = ViewOptions(self.before, self.after, self.recording, self.profile, critic)
+        options = ViewOptions(recording=self.recording, critic=critic)
         return write_view(trace, self.view, options)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from restock.cli.start import stages
 from restock.cli.start.stages import Settings, Stage, fed_uniformly, from_logs_alone
@@ -31,7 +31,7 @@ class DemoCommand:
     """Run every stage on sample_logs/, explain each one, and end with the results and a report.
 
     Runs info, ingest, sql, audit, mix, train, eval and report on the recordings: about five minutes
-    on two cores. Every stage shows its command, so that you can run it on your own recordings. The
+    on two cores. Every stage shows its command, and `restock start` takes your own recordings. The
     results compare the policy before and after fine-tuning with one that was fed uniformly, show
     what the critic was fed of each condition, and follow one rare event from its message to an
     update.
@@ -42,19 +42,11 @@ class DemoCommand:
     out: Path = Path("restock-demo")
     """The folder for store, panel, run and report. Stages that an earlier call finished there are
     kept."""
-    logs: Path | None = None
-    """Recordings to use. Default: sample_logs/ of the source tree; if it is missing, the demo
-    records some."""
-    profile: str | None = None
-    """How topics become signals: the name of a shipped profile, or a TOML file. Default: the
-    profile of the simulated robot (`restock start` proposes one for another robot)."""
     seconds: float = 200.0
     """Training time in seconds. Two policies train at the same time: one fed by quotas, one fed
     uniformly."""
     episodes: int = 20
     """Evaluation episodes per kind of episode, policy and perturbation."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network trains."""
     dry_run: bool = False
     """Print the commands that would run; run nothing."""
     json: bool = False
@@ -68,7 +60,6 @@ class DemoCommand:
             raise ConfigError(f"must be a number above 0, got {self.seconds:g}", where="--seconds")
         if self.episodes < 1:
             raise ConfigError(f"must be at least 1, got {self.episodes}", where="--episodes")
-        self._check()
         to, plan = self._plan()
         console = stderr() if self.json else stdout()
 
@@ -91,29 +82,17 @@ class DemoCommand:
             say(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
         return int(ExitCode.OK)
 
-    def _check(self) -> None:
-        """Raise RestockError if the user's recordings or profile cannot be found or read."""
-        from restock.ingest.containers.open_recording import recordings_in
-        from restock.ingest.profile.profile import load_profile
-
-        if self.logs is not None:
-            recordings_in(self.logs)
-        if self.profile is not None:
-            load_profile(self.profile)
-
     def _plan(self) -> tuple[Settings, list[Stage]]:
         """Return what the stages share, and the stages."""
-        logs, record = self.logs or find_logs(), []
+        logs, record = find_logs(), []
         if logs is None:
             logs = self.out / "logs"
             record.append(stages.record(logs))
         to = Settings(
             logs=(str(logs),),
             out=self.out,
-            profile=self.profile,
             seconds=self.seconds,
             episodes=self.episodes,
-            device=self.device,
             train=("practice.rule=success",),
         )
         return to, record + plan_of(to)
@@ -310,7 +289,7 @@ def rare_event(to: Settings) -> list[str]:
     if row is None:
         return []
     from restock.errors import RestockError
-    from restock.replay.trace.trace import TracePlaces, trace_row
+    from restock.replay.trace.trace import trace_row
 
     name = f"{row['gradient_step']}/{row['batch_row']}"
     trace = trace_row(to.run, name)
@@ -319,7 +298,7 @@ def rare_event(to: Settings) -> list[str]:
     if recording and Path(recording).exists():
         command += f" --recording {quoted(recording)}"
         with suppress(RestockError):  # one that changed since is no reason to end the demo
-            trace = trace_row(to.run, name, TracePlaces(recording=Path(recording)))
+            trace = trace_row(to.run, name, recording=Path(recording))
     return [*_told(trace, to), f"All of it: {command}"]
 
 

@@ -11,7 +11,6 @@ import tyro
 from restock.errors import counted
 
 if TYPE_CHECKING:
-    from restock.ingest.task.robot import Robot
     from restock.train.twin.calibration.fitted_twin import FittedTwin
 
 
@@ -31,25 +30,20 @@ class FitCommand:
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     out: Path | None = None
-    """The TOML file to write: a perturbation, or with --per-recording a schedule over the robots.
-    Default: print the fit alone. An existing file is not overwritten."""
+    """The TOML file to write: a perturbation, or a schedule over the robots if each recording is
+    fitted separately. Default: print the fit alone. An existing file is not overwritten."""
     parameters: str | None = None
     """The parameters to fit, e.g. latency_s,gain. Default: all except left_friction_scale."""
     recording: tuple[str, ...] = ()
     """Use only these recordings, by their ids."""
     per_recording: bool = False
     """Fit each recording separately, for robots that differ."""
-    base: Path | None = None
-    """A perturbation (TOML) with the values that are not fitted; also the reference. Fitted values
-    hold for its timestep, so use the one of training. Default: nominal."""
     horizon_s: float = 3.0
     """Length in seconds of the segments that are driven again."""
     segments: int = 200
     """The largest number of segments."""
     task: str | None = None
     """Hash of the task whose rows are used, if the store has several tasks."""
-    profile: str | None = None
-    """The profile whose [robot] is driven. Default: the one stored with the rows."""
     json: bool = False
     """Print one JSON document: {"fits": [{"estimates", "warnings", "held_out", …}], "out"}."""
 
@@ -91,43 +85,19 @@ class FitCommand:
         from restock.cli import output
         from restock.train.twin.calibration.fit import FitConfig, fit
         from restock.train.twin.calibration.fit_solver import DEFAULT
-        from restock.train.twin.physics.perturbation import Perturbation, load_perturbation
 
         name = "fitted" if self.out is None else self.out.stem
         names = [name.strip() for name in (self.parameters or "").split(",")]
         config = FitConfig(
             parameters=DEFAULT if self.parameters is None else tuple(dict.fromkeys(names)),
-            base=Perturbation() if self.base is None else load_perturbation(self.base),
             recordings=recordings,
             task_hash=self.task,
-            robot=robot_given(self.profile),
             horizon_s=self.horizon_s,
             max_segments=self.segments,
             nthread=0,
             name=f"{name} {recordings[0]}" if self.per_recording else name,
         )
         return fit(store, config, on_progress=output.say)
-
-
-def robot_given(profile: str | None) -> Robot | None:
-    """Return the robot of a named profile; None if no profile is named.
-
-    Raises:
-        ConfigError: no such profile, or it has no [robot].
-    """
-    from restock.errors import ConfigError
-    from restock.ingest.profile.profile import load_profile
-
-    if profile is None:
-        return None
-    robot = load_profile(profile).robot
-    if robot is None:
-        raise ConfigError(
-            "has no [robot]",
-            where=profile,
-            remedy="add one (docs/robot.md), or leave --profile out",
-        )
-    return robot
 
 
 def _show(fit: FittedTwin) -> None:

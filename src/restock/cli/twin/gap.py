@@ -11,11 +11,6 @@ import tyro
 if TYPE_CHECKING:
     from restock.train.twin.calibration.twin_gap import TwinGap
 
-_IN_SAMPLE = (
-    "The twin was calibrated on most of these logs. `restock twin fit` shows the remaining gap on "
-    "held-out logs."
-)
-
 
 @dataclass
 class GapCommand:
@@ -36,8 +31,6 @@ class GapCommand:
     """The store."""
     perturbation: Path | None = None
     """A perturbation that calibrates the twin, e.g. written by `restock twin fit`."""
-    fit: bool = False
-    """Calibrate the twin on this store first, as `restock twin fit STORE` does by default."""
     out: Path | None = None
     """A folder for gap.json, Parquet tables and a page (index.html). `restock report` shows a gap
     in RUN/gap or STORE/gap. An earlier gap in the folder is replaced."""
@@ -52,8 +45,6 @@ class GapCommand:
     """
     task: str | None = None
     """Hash of the task whose rows are used, if the store has several tasks."""
-    profile: str | None = None
-    """The profile whose [robot] is driven. Default: the one stored with the rows."""
     check: bool = False
     """Exit 1 if a condition is untrusted."""
     json: bool = False
@@ -63,8 +54,7 @@ class GapCommand:
     def run(self) -> int:
         """Measure, print, write."""
         from restock.cli import output
-        from restock.cli.twin.fit import robot_given
-        from restock.errors import ConfigError, ExitCode
+        from restock.errors import ExitCode
         from restock.replay.store.store import Store
         from restock.report import write_gap_page
         from restock.train.twin.calibration.gap import measure_gap
@@ -76,10 +66,7 @@ class GapCommand:
         )
         from restock.train.twin.physics.perturbation import load_perturbation
 
-        if self.fit and self.perturbation is not None:
-            raise ConfigError("give --fit or --perturbation, one of them", where="restock twin gap")
         calibrated = None if self.perturbation is None else load_perturbation(self.perturbation)
-        robot = robot_given(self.profile)
         limits = TrustLimits(
             horizon_s=3.0 if self.horizon_s is None else self.horizon_s,
             position_m=self.trust_position_m,
@@ -94,18 +81,9 @@ class GapCommand:
         if self.out is not None:
             check_place(self.out)
         with Store(self.store) as store:
-            notes: tuple[str, ...] = ()
-            if self.fit:
-                from restock.train.twin.calibration.fit import FitConfig, fit
-
-                fit_config = FitConfig(task_hash=self.task, robot=robot, nthread=0)
-                fitted = fit(store, fit_config, on_progress=output.say)
-                calibrated, notes = fitted.perturbation, (_IN_SAMPLE, *fitted.warnings)
             gap = measure_gap(
                 *(store, calibrated, config),
                 task_hash=self.task,
-                robot=robot,
-                notes=notes,
                 on_progress=output.say,
             )
         if self.out is not None:

@@ -42,9 +42,8 @@ class RecordCommand:
     minutes: float | None = None
     """Stop after the mission in which this much driving is recorded (default 5)."""
     missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
-    """Stop after this number of missions instead. Or drive the missions of a file that `restock
-    coverage gaps --missions-out` wrote, until the ordered number of missions has met each
-    condition."""
+    """Stop after this number of missions instead. Or drive the missions of a file by `restock
+    coverage gaps`, until the ordered number of missions has met each condition."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+FRICTION = 0.8  # of the floor
+
 
 @dataclass
 class RobotCommand:
@@ -21,8 +23,6 @@ class RobotCommand:
 
     profile: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROFILE")]
     """A profile: a TOML file, or the name of a shipped profile."""
-    friction: float = 0.8
-    """The floor's coefficient of friction, from 0.04 to 1.6."""
     json: bool = False
     """Print JSON: {"robot": {drive, wheel_radius_m, …}, "driven": [{action, friction,
     speed_mps, yaw_rate_radps, driven_mps, driven_radps}], "lidar_passes_over": […], "outside": […]
@@ -31,7 +31,6 @@ class RobotCommand:
     def run(self) -> int:
         """Build it and drive every action."""
         from restock.cli import output
-        from restock.errors import ConfigError
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.task.robot import refuse_beyond_steering
         from restock.train.twin.physics.model import (
@@ -45,10 +44,6 @@ class RobotCommand:
         )
         from restock.train.twin.physics.simulation import blocks_of
 
-        if not 0.04 <= self.friction <= 1.6:
-            raise ConfigError(
-                f"must be from 0.04 to 1.6, got {self.friction:g}", where="--friction"
-            )
         profile = load_profile(self.profile)
         refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
         blocks_of(profile.task, TIMESTEP_S)  # refuses a period that the twin cannot drive
@@ -56,10 +51,10 @@ class RobotCommand:
         facts = outlined(profile.task.body) + measured(model, profile.robot)
         beyond = outside(model, profile.task.body)
         driven = [
-            {"action": name, "friction": self.friction, **row}
+            {"action": name, "friction": FRICTION, **row}
             for name, row in zip(
                 profile.task.action_names,
-                driven_actions(model, profile.task.actions, self.friction),
+                driven_actions(model, profile.task.actions, FRICTION),
                 strict=True,
             )
         ]
