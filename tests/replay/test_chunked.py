@@ -33,7 +33,7 @@ def scattered(sizes: list[int], seed: int) -> list[np.ndarray]:
 
 
 @pytest.fixture
-def thousand(tmp_path: Path) -> np.memmap[Any, np.dtype[np.float32]]:
+def thousand(tmp_path) -> np.memmap[Any, np.dtype[np.float32]]:
     return panel(tmp_path / "rows.f32", 1000)
 
 
@@ -50,13 +50,8 @@ def memory_for(rows: int) -> int:
     seed=st.integers(0, 2**32),
 )
 def test_quotas_are_exact_and_rows_have_their_turns(
-    tmp_path_factory: pytest.TempPathFactory,
-    sizes: list[int],
-    batch_size: int,
-    chunk_rows: int,
-    room: int,
-    seed: int,
-) -> None:
+    tmp_path_factory, sizes, batch_size, chunk_rows, room, seed
+):
     rows = panel(tmp_path_factory.mktemp("panel") / "rows", sum(sizes))
     strata = scattered(sizes, seed)
     shares = np.full(len(sizes), 1 / len(sizes))
@@ -84,7 +79,7 @@ def test_quotas_are_exact_and_rows_have_their_turns(
     sampler.close()
 
 
-def test_draws_are_mixed_across_the_file(thousand: Any) -> None:
+def test_draws_are_mixed_across_the_file(thousand):
     sampler = ChunkedSampler(
         thousand,
         [np.arange(1000)],
@@ -101,7 +96,7 @@ def test_draws_are_mixed_across_the_file(thousand: Any) -> None:
     assert np.mean(chunks) > 3
 
 
-def test_a_state_of_other_chunks_is_refused(thousand: Any) -> None:
+def test_a_state_of_other_chunks_is_refused(thousand):
     def sampler(**reading: int) -> ChunkedSampler:
         rng = np.random.default_rng(0)
         return ChunkedSampler(thousand, [np.arange(1000)], [1.0], 4, rng, **reading)
@@ -115,16 +110,14 @@ def test_a_state_of_other_chunks_is_refused(thousand: Any) -> None:
 
 @pytest.fixture(scope="module")
 def fifty_thousand(
-    tmp_path_factory: pytest.TempPathFactory,
+    tmp_path_factory,
 ) -> np.memmap[Any, np.dtype[np.float32]]:
     return panel(tmp_path_factory.mktemp("panel") / "rows", 50_000)
 
 
 @settings(max_examples=60)
 @given(picked=st.lists(st.integers(0, 49_999), max_size=60), run=st.integers(0, 49_000))
-def test_rows_are_read_whatever_their_gaps(
-    fifty_thousand: Any, picked: list[int], run: int
-) -> None:
+def test_rows_are_read_whatever_their_gaps(fifty_thousand, picked, run):
     rows = fifty_thousand
     wanted = np.sort(np.array([*picked, *range(run, run + 900)], np.int64))  # repeats and gaps
     out = np.empty((len(wanted), WIDTH), np.float32)
@@ -133,14 +126,14 @@ def test_rows_are_read_whatever_their_gaps(
     np.testing.assert_array_equal(out, rows[wanted])
 
 
-def test_a_file_that_shrank_is_an_error(tmp_path: Path) -> None:
+def test_a_file_that_shrank_is_an_error(tmp_path):
     rows = panel(tmp_path / "rows", 100)
     os.truncate(tmp_path / "rows", 64 + 50 * 4 * WIDTH)
     with RowFile(rows) as file, pytest.raises(PanelError, match="ends before row 100 of 100"):
         file.read(np.arange(100), np.empty((100, WIDTH), np.float32))
 
 
-def test_what_cannot_be_read_in_chunks_is_refused(thousand: Any) -> None:
+def test_what_cannot_be_read_in_chunks_is_refused(thousand):
     rng = np.random.default_rng(0)
     with pytest.raises(PanelError, match="memory-mapped"):
         ChunkedSampler(np.zeros((9, 3), np.float32), [np.arange(9)], [1.0], 4, rng)
@@ -191,7 +184,7 @@ print(int(seen.mean() * 100), grown >> 20)
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="needs Linux's /proc")
-def test_a_panel_larger_than_a_memory_limit(tmp_path: Path) -> None:
+def test_a_panel_larger_than_a_memory_limit(tmp_path):
     count, width = 300_000, 189  # 216 MiB
     path = tmp_path / "rows.f32"
     rows = np.memmap(path, np.float32, "w+", shape=(count, width))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import pytest
 from support.panels import EVERY, NO_SPLIT, moment, panel_of
@@ -17,11 +16,11 @@ NOW_NS = START_NS + 264 * DAY_NS + 30 * 10**9  # the rows are 264 days old
 
 
 @pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+def clock(monkeypatch) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: NOW_NS)
 
 
-def test_old_rows_are_old_however_new_they_are_in_their_store(tmp_path: Path) -> None:
+def test_old_rows_are_old_however_new_they_are_in_their_store(tmp_path):
     rows = recording_transitions(0)
     with pytest.raises(MixtureError, match=r"older than max_age_days = 30: .* 26\d\.\d days old"):
         panel_of(rows, "max_age_days = 30\n" + NO_SPLIT + EVERY, tmp_path / "a")
@@ -35,9 +34,7 @@ def test_old_rows_are_old_however_new_they_are_in_their_store(tmp_path: Path) ->
     assert without.header.as_of_ns is None  # a panel that counts no ages depends on no clock
 
 
-def test_a_panel_is_mixed_again_at_the_moment_that_it_keeps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_panel_is_mixed_again_at_the_moment_that_it_keeps(tmp_path, monkeypatch):
     text = NO_SPLIT + EVERY
     first = panel_of(recording_transitions(0), "max_age_days = 264\n" + text, tmp_path / "a")
     assert 0 < len(first) < len(recording_transitions(0))

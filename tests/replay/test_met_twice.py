@@ -13,7 +13,7 @@ NUMBERS = st.integers(-(2**63), 2**63 - 1)
 
 @settings(max_examples=200)
 @given(st.lists(st.lists(st.one_of(NUMBERS, st.integers(0, 9)), max_size=40), max_size=6))
-def test_none_that_comes_again_is_missed(parts: list[list[int]]) -> None:
+def test_none_that_comes_again_is_missed(parts):
     arrays = [np.array(part, np.int64) for part in parts]
     observed = MetTwice(sum(map(len, parts)))
     for part in arrays:
@@ -25,7 +25,7 @@ def test_none_that_comes_again_is_missed(parts: list[list[int]]) -> None:
     assert not (exact & ~maybe).any()
 
 
-def test_of_many_that_come_once_few_are_taken_for_others() -> None:
+def test_of_many_that_come_once_few_are_taken_for_others():
     count = 20 * MARKED + 5
     values = np.random.default_rng(0).integers(-(2**63), 2**63 - 1, count)
     copies = np.concatenate([values, values[:100], values[MARKED - 3 : MARKED + 3]])

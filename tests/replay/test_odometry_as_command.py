@@ -25,7 +25,7 @@ fields = { speed_mps = "twist.twist.linear.x", yaw_rate_radps = "twist.twist.ang
 
 
 @pytest.fixture(scope="module")
-def profiles(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+def profiles(tmp_path_factory) -> tuple[Path, Path, Path]:
     """Return the bags' folder, a profile by commands, and the same task by odometry."""
     folder = tmp_path_factory.mktemp("odometry")
     write_bag(Drive(), folder / "commanded")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from support.library_buffers import make_store
@@ -34,12 +32,12 @@ class Recent(StratumDraws):
 
 
 @pytest.fixture
-def recent_panel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Panel:
+def recent_panel(tmp_path, monkeypatch) -> Panel:
     monkeypatch.setitem(RULES, "recent", Rule(Recent, "the newest tenth"))
     return panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")
 
 
-def test_a_sampler_draws_by_it(recent_panel: Panel) -> None:
+def test_a_sampler_draws_by_it(recent_panel):
     sampler, stamps = sampler_for(recent_panel, 64, seed=0), recent_panel.meta_column("stamp_ns")
     drawn = [sampler.draw() for _ in range(50)]
     rows = np.concatenate([one.rows for one in drawn])
@@ -51,7 +49,7 @@ def test_a_sampler_draws_by_it(recent_panel: Panel) -> None:
             assert stamps[of_stratum].min() >= newest.min()
 
 
-def test_stable_baselines3_draws_by_it(recent_panel: Panel, tmp_path: Path) -> None:
+def test_stable_baselines3_draws_by_it(recent_panel, tmp_path):
     pytest.importorskip("stable_baselines3")
     from support.library_buffers import sb3_envs
 
@@ -79,6 +77,6 @@ def newest_rows(panel: Panel, stratum: np.ndarray) -> np.ndarray:
     return stratum[newest[: max(len(stratum) // 10, 1)]]
 
 
-def test_a_rule_that_nobody_made_is_refused(tmp_path: Path) -> None:
+def test_a_rule_that_nobody_made_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="the rules are uniform, without_replacement, per"):
         panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,9 +28,7 @@ def small_blocks(patch: pytest.MonkeyPatch, held_blocks: int) -> None:
 
 @settings(max_examples=40)
 @given(st.integers(1, 90), st.integers(0, 4), st.integers(0, 2**32), st.integers(1, 40))
-def test_parts_in_any_order_make_the_same_file(
-    tmp_path_factory: pytest.TempPathFactory, count: int, held: int, seed: int, at_once: int
-) -> None:
+def test_parts_in_any_order_make_the_same_file(tmp_path_factory, count, held, seed, at_once):
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(count, WIDTH)).astype("<f4")
     path = tmp_path_factory.mktemp("packed") / "rows"
@@ -54,7 +51,7 @@ def test_parts_in_any_order_make_the_same_file(
     record.check(path, verify=True)
 
 
-def test_every_changed_byte_is_found(tmp_path: Path) -> None:
+def test_every_changed_byte_is_found(tmp_path):
     content = np.random.default_rng(0).bytes(4 * 100 + 7)
     path = tmp_path / "file"
     path.write_bytes(content)
@@ -66,7 +63,7 @@ def test_every_changed_byte_is_found(tmp_path: Path) -> None:
             record.check(path, verify=True)
 
 
-def test_the_checksum_is_that_of_its_leaves(tmp_path: Path) -> None:
+def test_the_checksum_is_that_of_its_leaves(tmp_path):
     path, content = tmp_path / "file", bytes(range(250))
     path.write_bytes(content)
     leaves = [blake3(content[at : at + 100]).digest(16) for at in (0, 100, 200)]
@@ -78,7 +75,7 @@ def test_the_checksum_is_that_of_its_leaves(tmp_path: Path) -> None:
     assert found.root() == root
 
 
-def test_a_row_that_never_came_is_an_error(tmp_path: Path) -> None:
+def test_a_row_that_never_came_is_an_error(tmp_path):
     rows = np.zeros((20, WIDTH), np.float32)
     with PackedFile(tmp_path / "rows", 20, WIDTH, parts=2) as file:
         file.put(np.arange(20), Values(HALVES[0], rows[:, HALVES[0]]))
@@ -87,9 +84,7 @@ def test_a_row_that_never_came_is_an_error(tmp_path: Path) -> None:
             file.finish()
 
 
-def test_a_full_disk_is_said_by_whoever_fills_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_said_by_whoever_fills_it(tmp_path, monkeypatch):
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -16,9 +15,7 @@ from restock.replay.fleet.panel_difference import key_differences
 HALF = "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\n" + EVERY + NO_SPLIT
 
 
-def test_rows_shares_and_keys_that_differ(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_shares_and_keys_that_differ(tmp_path, capsys):
     store = write_store(tmp_path / "store", [recording_transitions(1), recording_transitions(2)])
     panel_of(store, EVERY + NO_SPLIT, tmp_path / "a")
     panel_of(store, "where = \"zone = 'cross'\"\n" + HALF, tmp_path / "b")
@@ -40,9 +37,7 @@ def test_rows_shares_and_keys_that_differ(
     assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "a"), "--exit-code"]) == 0
 
 
-def test_two_tasks_and_two_kinds_of_places_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_tasks_and_two_kinds_of_places_are_refused(tmp_path, capsys):
     other = msgspec.structs.replace(TASK, actions=TASK.actions[:3])
     first = write_store(tmp_path / "first", [recording_transitions(1)])
     second = write_store(tmp_path / "second", [recording_transitions(1, task=other)], task=other)
@@ -58,7 +53,7 @@ def test_two_tasks_and_two_kinds_of_places_are_refused(
     assert "no such store" in capsys.readouterr().err
 
 
-def test_keys_are_compared_below_lists_by_name() -> None:
+def test_keys_are_compared_below_lists_by_name():
     a = {"strata": [{"name": "x", "share": 1}], "seed": 1, "same": [1]}
     b = {"strata": [{"name": "y"}, {"name": "x", "share": 2}], "seed": 1, "same": [1]}
     assert key_differences(a, b) == [

@@ -74,14 +74,8 @@ def check(found: pa.Table, table: pa.Table) -> None:
     st.booleans(),
 )
 def test_any_batches_in_any_order_give_the_same_table(
-    recordings: int,
-    episodes: int,
-    steps: int,
-    cuts: list[int],
-    random: object,
-    mixed: str,
-    few: bool,
-) -> None:
+    recordings, episodes, steps, cuts, random, mixed, few
+):
     table = rows_of(recordings, episodes, steps)
     if mixed == "rows":
         order = list(range(len(table)))
@@ -101,7 +95,7 @@ def test_any_batches_in_any_order_give_the_same_table(
         check(in_order(batches, table.schema), table)
 
 
-def test_stretches_that_overlap_are_sorted() -> None:
+def test_stretches_that_overlap_are_sorted():
     table = rows_of(2, 2, 6)
     odd, even = (table.take(pa.array(range(begin, len(table), 2))) for begin in (1, 0))
     batches = [part.combine_chunks().to_batches()[0] for part in (odd, even)]
@@ -109,7 +103,7 @@ def test_stretches_that_overlap_are_sorted() -> None:
 
 
 @pytest.mark.parametrize("names", [1, 127, 128, 129, 32_768, 32_769])
-def test_codes_are_as_wide_as_their_dictionary_needs(names: int) -> None:
+def test_codes_are_as_wide_as_their_dictionary_needs(names):
     count = names + 3
     table = pa.table(
         {
@@ -128,6 +122,6 @@ def test_codes_are_as_wide_as_their_dictionary_needs(names: int) -> None:
     assert found["episode_id"].type.index_type.bit_width == bits
 
 
-def test_no_rows() -> None:
+def test_no_rows():
     table = rows_of(1, 1, 1).slice(0, 0)
     assert in_order([], table.schema).num_rows == 0

@@ -56,7 +56,7 @@ def looped(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
         max_size=60,
     )
 )
-def test_they_are_those_of_the_definition(rows: list[Row]) -> None:
+def test_they_are_those_of_the_definition(rows):
     recording, content, stamp = np.array(rows, np.int64).reshape(-1, 3).T
     table = same_drives(
         MovingRows(

@@ -151,7 +151,7 @@ NO_STEPS = {"PanelDataset", "PanelDataset, 2 workers", "a library's buffer"}
 
 
 @pytest.fixture(scope="module")
-def panels(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Panel]:
+def panels(tmp_path_factory) -> Callable[[str], Panel]:
     table = pa.concat_tables(
         [recording_transitions(index, episodes=6, task=TASK) for index in (1, 2)]
     )
@@ -169,9 +169,7 @@ def panels(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Panel]:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", MIXTURES)
-def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(
-    panels: Callable[[str], Panel], name: str, way: str
-) -> None:
+def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(panels, name, way):
     panel = panels(name)
     limit = panel.header.mixture.max_replays_per_row
     batches: list[Drawn] = []
@@ -235,7 +233,7 @@ def _check_shares(panel: Panel, name: str, way: str, batches: list[Drawn]) -> No
         assert np.abs(owed).max() < 2
 
 
-def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels: Callable[[str], Panel]) -> None:
+def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels):
     for workers in (0, 2):
         dataset = PanelDataset(panels("limited"), BATCH, batches=3, seed=0)
         context = "fork" if workers else None
@@ -253,7 +251,7 @@ def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels: Callable[[str],
         next(iter(endless))
 
 
-def test_draws_of_a_panel_go_on_where_they_were_saved(panels: Callable[[str], Panel]) -> None:
+def test_draws_of_a_panel_go_on_where_they_were_saved(panels):
     for name in ("limited per", "chunked"):
         panel = panels(name)
         one, other = sampler_for(panel, BATCH, seed=1), sampler_for(panel, BATCH, seed=2)
@@ -272,9 +270,7 @@ def test_draws_of_a_panel_go_on_where_they_were_saved(panels: Callable[[str], Pa
 
 
 @pytest.mark.parametrize("name", sorted(FOLLOW_TD))
-def test_signed_errors_and_those_of_other_rows_are_refused(
-    panels: Callable[[str], Panel], name: str
-) -> None:
+def test_signed_errors_and_those_of_other_rows_are_refused(panels, name):
     sampler = sampler_for(panels(name), BATCH, seed=0)
     batch = sampler.draw()
     with pytest.raises(MixtureError, match="are negative, the least -1\n  give their absolute"):

@@ -176,39 +176,29 @@ def test_audited_rows_are_listed_by_their_error(places):
     assert [row["row"] for row in audited_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
 
 
-def test_rows_are_listed_of_runs_alone(places, capsys):
-    assert cli.main(["trace", str(places.panel)]) == 2
-    assert "give ROW" in capsys.readouterr().err
-
-
 def test_a_row_of_the_panel_can_be_followed_too(places):
     found = trace_row(places.panel, "5")
     assert found.panel is not None
     assert found.origin is not None
     assert found.panel["transition_id"] == found.origin.transition["transition_id"]
     assert trace_row(places.panel, 5) == found
-    with pytest.raises(PanelError, match="has rows 0 to"):
-        trace_row(places.panel, "1000000")
 
 
-def test_what_is_not_there_is_said(places, tmp_path):
-    with pytest.raises(RunError, match="is not an audited row"):
-        trace_row(places.run, "12")
-    with pytest.raises(RunError, match="was not audited"):
-        trace_row(places.run, "8/0")
-    with pytest.raises(StoreError, match="no transition 5"):
-        trace_row(places.store, "5")
-    with pytest.raises(StoreError, match="is not a transition id\n  give a whole number"):
-        trace_row(places.store, "seven")
-    for row in ("²", -1):
-        with pytest.raises(StoreError, match=f"'{row}' is not a transition id"):
-            trace_row(places.store, row)
-    with pytest.raises(RunError, match="is not an audited row"):
-        trace_row(places.run, "8/²")
-    with pytest.raises(StoreError, match="it is not a run, a panel or a store"):
-        trace_row(tmp_path, "1")
-    with pytest.raises(StoreError, match="it does not exist"):
-        trace_row(tmp_path / "nowhere", "1")
+def test_rows_that_are_not_there_are_refused(places, tmp_path):
+    for place, row, error, problem in (
+        (places.run, "12", RunError, "is not an audited row"),
+        (places.run, "8/0", RunError, "was not audited"),
+        (places.run, "8/²", RunError, "is not an audited row"),
+        (places.panel, "1000000", PanelError, "has rows 0 to"),
+        (places.store, "5", StoreError, "no transition 5"),
+        (places.store, "seven", StoreError, "'seven' is not a transition id"),
+        (places.store, "²", StoreError, "'²' is not a transition id"),
+        (places.store, -1, StoreError, "'-1' is not a transition id"),
+        (tmp_path, "1", StoreError, "it is not a run, a panel or a store"),
+        (tmp_path / "nowhere", "1", StoreError, "it does not exist"),
+    ):
+        with pytest.raises(error, match=problem):
+            trace_row(place, row)
 
 
 def test_places_that_were_moved_are_asked_for_and_taken(places, tmp_path):
@@ -272,5 +262,6 @@ def test_the_verb_prints_a_trace_and_its_document(places, capsys):
     assert document["messages"][0]["topic"] == "/cmd_vel"
     assert document["transition"]["recording_id"] == document["recording"]["recording_id"]
     assert document["notes"] == []
-    assert cli.main(["trace", str(places.run), "9/9"]) == 2
-    assert "was not audited" in capsys.readouterr().err
+    for words, problem in (([places.run, "9/9"], "was not audited"), ([places.panel], "give ROW")):
+        assert cli.main(["trace", *map(str, words)]) == 2
+        assert problem in capsys.readouterr().err

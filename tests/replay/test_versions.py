@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("summaries_once")
 
 
 @pytest.fixture(scope="module")
-def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+def versions(tmp_path_factory) -> tuple[Path, int]:
     """Return a store of two recordings, and the version that had one."""
     path = tmp_path_factory.mktemp("versions") / "store"
     writer = StoreWriter(path)
@@ -29,9 +29,7 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     return path, first
 
 
-def test_each_reads_what_was(
-    versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_reads_what_was(versions, tmp_path, capsys):
     path, first = versions
     store = f"{path}@{first}"
     rows = one(1)[1]
@@ -65,9 +63,7 @@ def test_each_reads_what_was(
         assert opened.version == first + 1
 
 
-def test_what_has_no_versions_says_so(
-    versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_has_no_versions_says_so(versions, tmp_path, capsys):
     path, first = versions
     assert main(["mix", str(path), "--out", str(tmp_path / "panel")]) == 0
     panel, out = f"{tmp_path / 'panel'}@1", str(tmp_path / "x.npz")
@@ -87,7 +83,7 @@ def test_what_has_no_versions_says_so(
         restock.open(str(path), version="yesterday")
 
 
-def test_a_version_whose_files_are_gone_names_the_retention(tmp_path: Path) -> None:
+def test_a_version_whose_files_are_gone_names_the_retention(tmp_path):
     writer = StoreWriter(tmp_path / "store")
     first = writer.write(*one(1))
     writer.write(*one(1, ingest="b"))
@@ -98,7 +94,7 @@ def test_a_version_whose_files_are_gone_names_the_retention(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_version_of_joined_files_is_gone_as_one_of_one_file(tmp_path: Path, version: int) -> None:
+def test_a_version_of_joined_files_is_gone_as_one_of_one_file(tmp_path, version):
     writer = StoreWriter(tmp_path / "store")
     writer.write_all([one(1), one(2)])
     compact(writer)
