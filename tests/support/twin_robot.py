@@ -91,7 +91,7 @@ def graph_qos() -> Any:
     return QoS(1, Reliability.BEST_EFFORT, Durability.VOLATILE)
 
 
-def follower_onnx(path: Path, profile: Profile) -> Path:
+def follower_onnx(path: Path, profile: Profile, **metadata: str) -> Path:
     """Return an exported policy that takes the task's action nearest to navigation's proposal."""
     import onnx
 
@@ -121,7 +121,7 @@ def follower_onnx(path: Path, profile: Profile) -> Path:
         opset_imports=[helper.make_opsetid("", 18)],
         ir_version=8,
     )
-    metadata = {
+    metadata |= {
         "format": FORMAT,
         "task_hash": task.hash,
         "observation": msgspec.json.encode(task.observation_names).decode(),

@@ -20,29 +20,36 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
+from restock.ingest.live.alarm import KEY as ALARM
 from restock.ingest.live.policy_file import FORMAT, OnnxFile, with_digest
 from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
 from restock.process import import_extra
+from restock.replay.panel.panel import Panel
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
 from restock.train.dqn.network import QNetwork
+from restock.train.evaluation.logged_alarm import logged_alarm
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
-from restock.train.run.run_profile import profile_of_run
+from restock.train.run.run_profile import profile_of_run, run_panel
 
 _OPSET = 18
 
 
-def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
+def export_onnx(
+    run_path: Path, out: Path, miss_rate: float | None = None, panel: Path | None = None
+) -> dict[str, Any]:
     """Write a run's policy to `out`: input `observation` (N, D), outputs `values` and `action`.
 
     `values` are (N, A), `action` is (N,). With a teacher's filter both networks are in it, and the
-    values of actions that are not plausible are -inf.
+    values of actions that are not plausible are -inf. With a `miss_rate` the file has an alarm,
+    fitted to the episodes of `panel`, or of the run's own.
 
     Raises:
         RunError: no such run, no policy yet, or there is something at `out` already.
-        ConfigError: the extra `onnx` is not installed, or `out` lies within a store, a panel or
-            another run.
+        ConfigError: the extra `onnx` is not installed, `out` lies within a store, a panel or
+            another run, or the panel is of another task or allows no alarm of this miss rate.
+        PanelError, StoreError: the panel of the alarm or its store is not there.
     """
     onnx = _onnx()
     run = Run.open(run_path)
@@ -65,6 +72,9 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
         "trained": "" if agent.origin is None else agent.origin.text,
         "restock_version": __version__,
     }
+    if miss_rate is not None:
+        alarm = logged_alarm(_panel(run, panel, profile.task), miss_rate)
+        metadata[ALARM] = msgspec.json.encode(alarm).decode()
     onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
     try:
@@ -73,6 +83,24 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
         raise RunError(f"its policy {error}", where=str(run.path)) from error
     write_bytes(out, content)
     return {"path": str(out), "bytes": out.stat().st_size, **metadata}
+
+
+def _panel(run: Run, given: Path | None, task: Task) -> Panel:
+    """Return the panel of an alarm; raise ConfigError for none, or one of another task."""
+    panel = run_panel(run.document) if given is None else Panel.open(given)
+    if panel is None:
+        raise ConfigError(
+            "the run did not learn from a panel",
+            where="--alarm",
+            remedy="name a panel after the run",
+        )
+    if panel.task_hash != task.hash:
+        raise ConfigError(
+            f"its rows are of task {panel.task_hash}, the run's is {task.hash}",
+            where=str(panel.path),
+            remedy="ingest the logs again with the run's profile, and mix them",
+        )
+    return panel
 
 
 def to_onnx(network: PolicyNetwork) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -31,7 +32,8 @@ class ExportCommand:
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
     panel: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
-    """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata."""
+    """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata. With
+    --alarm: the panel to take episodes from, in place of the run's."""
     query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
     """An SQL query that selects transitions of a store, with all columns. Default: all
     transitions."""
@@ -40,6 +42,9 @@ class ExportCommand:
     cameras: Annotated[str, tyro.conf.arg(metavar="NAMES")] = "all"
     """From a store to lerobot: the cameras whose frames are exported, comma-separated, or all, or
     none. A step that lacks a frame of one of them is left out and counted."""
+    alarm: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
+    """For onnx: add an alarm that is on where logged failures, takeovers and bumps began, and
+    misses at most this share of them, for example 0.1."""
     json: bool = False
     """Print what was written as one JSON document."""
 
@@ -49,7 +54,8 @@ class ExportCommand:
         from restock.cli.command_line import refuse
 
         if self.to == "onnx":
-            of_rows = ("query", "panel", "action", "cameras")
+            of_rows = ["query", "action", "cameras"]
+            of_rows += ["panel"] if self.alarm is None else []
             refuse(
                 self,
                 of_rows,
@@ -58,7 +64,7 @@ class ExportCommand:
             )
             from restock.train.evaluation.onnx_policy import export_onnx
 
-            made = export_onnx(self.source, self.out)
+            made = export_onnx(self.source, self.out, self.alarm, self.panel)
             if self.json:
                 output.print_json(made)
             else:
@@ -68,7 +74,10 @@ class ExportCommand:
                     f" ({made['bytes']:,} bytes)",
                     markup=False,
                 )
+                if "alarm" in made:
+                    output.stdout().print(_alarm_line(json.loads(made["alarm"])), markup=False)
             return
+        refuse(self, ["alarm"], "applies only to --to onnx", remedy="leave it out")
         from restock.replay.export.dataset import export_dataset
 
         with output.progress(f"writing {self.to}", None) as advance:
@@ -94,6 +103,15 @@ class ExportCommand:
             return None
         names = [name.strip() for name in self.cameras.split(",")]
         return [] if names == ["none"] else names
+
+
+def _alarm_line(alarm: dict[str, Any]) -> str:
+    failed = ", ".join(f"{count:,} {how}" for how, count in alarm["failures"].items())
+    return (
+        f"alarm: misses at most {alarm['miss_rate']:g} of episodes that fail like the logged ones"
+        f" ({failed}); without a failure {alarm['false_alarms_per_h']:,.0f} false alarms an hour,"
+        f" on {alarm['on_share']:.1%} of the time (in {alarm['safe_h']:.2f} h)"
+    )
 
 
 def _summary(document: dict[str, Any]) -> list[str]:
