@@ -159,11 +159,11 @@ def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str,
 
 
 def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
-    topics = logged_at(Drive(20.0), lambda time, place: 0 if place % 40 == 1 else time)
+    topics = logged_at(Drive(8.0), lambda time, place: 0 if place % 40 == 1 else time)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     assert main(["ingest", str(bag), "--dry-run", "--json"]) == 3
     (row,) = json.loads(capsys.readouterr().out)["recordings"]
-    assert row["transitions"] > 80
+    assert row["transitions"] > 25
     assert any(loss.startswith("/odom: left out, as their stamps") for loss in row["losses"])
     assert any("the alignment clock was set" in note for note in row["notes"])
     for steps in ("command", "rate"):
@@ -171,7 +171,7 @@ def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
             clock = Clock(alignment=alignment, steps=steps)
             profile = msgspec.structs.replace(load_profile("warehouse_amr"), clock=clock)
             if (steps, alignment) != ("rate", "log_time"):
-                assert ingest(bag, profile, store=None).manifest["transitions"] > 80
+                assert ingest(bag, profile, store=None).manifest["transitions"] > 25
                 continue
             with pytest.raises(RecordingError, match=r"19,676 days, .* some of its times are wro"):
                 ingest(bag, profile, store=None)
@@ -207,7 +207,7 @@ def test_stamps_that_a_driver_left_at_zero_are_named(names, tmp_path, capsys):
 
 @pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
 def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path, capsys):
-    topics = logged_at(Drive(20.0), lambda time, place: 0)
+    topics = logged_at(Drive(4.0), lambda time, place: 0)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     profile = msgspec.structs.replace(
         load_profile("warehouse_amr"), clock=Clock(alignment=alignment)

@@ -16,6 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from support.bag_samples import assert_same_columns, write_bag, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
+from support.long import one_in
 
 from restock.ingest.containers import mcap_file, sqlite_file
 from restock.ingest.containers import storage as reading
@@ -138,22 +139,21 @@ class Kept(StoreWriter):
         return super().stage(manifest, rows, **more)
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("storage", one_in(2, ["mcap", "sqlite3"]))
 def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None:
-    goals = [(0.0, 3.0, 1.0), (3.2, 11.0, 1.0), (9.0, 20.0, 1.0)]
-    drive = Drive(duration_s=15.0, goals=goals, truth="nominal")
+    goals = [(0.0, 3.0, 1.0), (3.2, 4.5, 1.0), (5.5, 20.0, 1.0)]
+    drive = Drive(duration_s=8.0, goals=goals, truth="nominal")
     bag = write_drive(drive, tmp_path / "drive", storage=storage)
     tables = []
-    for size, rows, group in ((WHOLE, 1, WHOLE), (1, 3, 1), (2000, 50, 20)):
+    for size, rows, group in ((WHOLE, 1, WHOLE), (2000, 3, 1)):
         store = Kept(tmp_path / f"store{len(tables)}")
         with pytest.MonkeyPatch.context() as patch:
             cut_by(patch, size, rows)
             patch.setattr(transitions_module, "GROUP_ROWS", group)
             ingest(bag, PROFILE, store=store)
         tables.append(store.rows.drop_columns(["ingest_id"]))
-    assert len(tables[0]) > 50
-    for other in tables[1:]:
-        assert tables[0].equals(other, check_metadata=True)
+    assert len(tables[0]) > 30
+    assert tables[0].equals(tables[1], check_metadata=True)
 
 
 @settings(max_examples=60)
