@@ -231,7 +231,6 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
             for topic in base.paces_s
         },
-        node_topics={name: kind for one in drives for name, kind in one.node_topics.items()},
         footprint=outlined.footprint,
         footprint_notes=outlined.footprint_notes,
         outline=outlined.outline,

@@ -31,7 +31,6 @@ from restock.ingest.propose.commands import (
     Commands,
     choose_command,
     how_it_turned,
-    leaves_the_floor,
     read_commands,
 )
 from restock.ingest.propose.footprint import (
@@ -68,7 +67,6 @@ from restock.ingest.propose.roles import (
     SPENT,
     Kind,
     Roles,
-    node_topics,
     other_robots_topics,
     sort_own_first,
     topics_for,
@@ -167,7 +165,6 @@ class Evidence:
     signals: list[Candidate]
     cameras: list[CameraTopic]
     robot: RobotProposal
-    node_topics: dict[str, str]  # of Restock's own node: name -> type
     unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
     origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
 
@@ -195,8 +192,6 @@ def gather(
     if not roles["command"] and odometry_as_command:
         roles["command"] = fitting(ODOMETRY_AS_COMMAND)
     else:
-        if len(roles["command"]) > 1:  # an arm on the robot may have its own
-            roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
         roles["command"], chosen = choose_command(recording, roles["command"])
     driven = {topic.name for topic, _ in roles["command"][:1]}
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
@@ -283,7 +278,6 @@ def gather(
         ),
         [one for one in camera_topics(recording, recorded_s) if one.topic.name not in others],
         robot,
-        node_topics(recording),
         unmeasured,
         None if poses is None else _origin_m(poses),
     )

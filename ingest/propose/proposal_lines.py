@@ -10,11 +10,10 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from restock.errors import ConfigError, visible
+from restock.errors import visible
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
-from restock.ingest.live.node import with_node_topics
-from restock.ingest.profile.profile import parse_profile
+from restock.ingest.live.node import TAKEOVER
 from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.profile.tables import FALLBACKS, Input
 from restock.ingest.propose.candidates import camera_lines
@@ -45,50 +44,20 @@ from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import Rewards, Task
-from restock.toml import toml_value
 
 
-def node_lines(seen: Evidence, lines: Sequence[str]) -> list[str]:
-    """Write the tables for the node's recorded topics that the proposal does not have yet.
-
-    Args:
-        seen: with the node's topics.
-        lines: the TOML of the proposal so far; where it lacks an input there is nothing to add to.
-    """
-    if not seen.node_topics:
+def _takeover_lines(recording: Recording, lines: Sequence[str]) -> list[str]:
+    """Write the button of whoever takes over, if it was recorded and nothing has its name yet."""
+    topic = recording.topics.get(TAKEOVER)
+    named = any(line.startswith('[command_sources."operator"]') for line in lines)
+    if named or topic is None or topic.type != "std_msgs/msg/Bool" or not topic.expected:
         return []
-    try:
-        profile = parse_profile("\n".join(lines), where="the proposal")
-    except ConfigError:
-        return []
-    full, heard = with_node_topics(profile), seen.node_topics.items()
-    tables: list[tuple[str, msgspec.Struct]] = [
-        (f"[command_sources.{name}]  # who drives while it is true", source)
-        for name, source in full.command_sources.items()
-        if name not in profile.command_sources and (source.topic, source.type) in heard
-    ]
-    signals = {
-        name: signal
-        for name, signal in full.signals.items()
-        if name not in profile.signals and (signal.topic, signal.type) in heard
-    }
-    tables += [(f"[signals.{name}]", signal) for name, signal in signals.items()]
-    tables += [
-        ("[[condition]]", condition)
-        for condition in full.own_conditions
-        if condition not in profile.own_conditions and "limiter_rule" in signals
-    ]
-    added = [line for header, table in tables for line in [header, *_given(table), ""]]
-    return ["# Published by Restock's node, or for it:", "", *added] if added else []
-
-
-def _given(table: msgspec.Struct) -> list[str]:
-    """Write the keys of a table that are not at their defaults."""
-    values = msgspec.to_builtins(table)
     return [
-        f"{one.name} = {toml_value(values[one.encode_name])}"
-        for one in msgspec.structs.fields(table)
-        if values[one.encode_name] not in (one.default, {})
+        "[command_sources.operator]  # who drives while it is true",
+        f'topic = "{TAKEOVER}"',
+        f'type = "{topic.type}"',
+        'fields = { pressed = "data" }',
+        "",
     ]
 
 
@@ -142,11 +111,11 @@ def profile_lines(
         else:
             lines += _input_lines(role, fitting, seen, trial)
     lines += seen.chosen.toml(seen.commands.wheelbase_m)
+    lines += _takeover_lines(recording, lines)
     if seen.frames is not None:
         lines += seen.frames.lines(used=seen.poses_from_frames)
     if seen.motion is not None and not seen.motion.problem:
         lines += seen.motion.lines()
-    lines += node_lines(seen, lines)
     if seen.signals:
         lines += [
             "# Custom signals: columns of the table, for conditions and queries. To use one,",
@@ -241,7 +210,7 @@ def _trial_lines(trial: Trial) -> list[str]:
 def _topic_lines(seen: Evidence) -> list[str]:
     """List every topic with its rate and its use, as a comment."""
     recording, seconds = seen.recording, seen.recorded_s
-    taken: dict[str, list[str]] = {name: ["Restock's node"] for name in seen.node_topics}
+    taken: dict[str, list[str]] = {}
     for role, found in seen.roles.items():
         if found:
             taken.setdefault(found[0][0].name, []).append(role)

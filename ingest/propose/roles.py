@@ -370,11 +370,6 @@ def shared(recording: Recording, place: str) -> str:
     return f"{robots[0]} has none of its own that can be used: CHECK THAT IT IS OF THIS ROBOT"
 
 
-def node_topics(recording: Recording) -> dict[str, str]:
-    """Return the topics of Restock's node that can be decoded and have messages: name -> type."""
-    return {name: topic.type for name, topic in _readable(recording) if name in NODE_TOPICS}
-
-
 def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
     for name, topic in recording.topics.items():
         if topic.skipped is None and topic.expected:

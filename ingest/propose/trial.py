@@ -6,7 +6,6 @@ recording: nothing is estimated.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -56,7 +55,6 @@ class Trial:
     seconds: float = 0.0  # that the transitions span
     even_s: float = 0.0  # of them, in stretches that a simulator can follow tick by tick
     dropped: dict[str, int] = field(default_factory=dict)  # ticks in no episode, by reason
-    endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     advice: list[Advice] = field(default_factory=list)
     problem: str = ""  # why there is nothing
     findings: list[Finding] = field(default_factory=list)  # what contradicts itself
@@ -78,7 +76,6 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     why = f"{why}; {remedy}" if remedy else why
     if not len(steps):
         return Trial(problem=why)
-    endings = Counter(episode.ended_by for episode in episodes.episodes)
     requested = _Advisor(profile, topics, steps, episodes)
     advice = [
         *requested.ages(),
@@ -96,7 +93,6 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
             for one in episodes.episodes
         ),
         dict(worst),
-        dict(endings.most_common()),
         advice,
         problem,
         steps.findings,

@@ -23,7 +23,6 @@ from restock.ingest.live.node import (
     PROPOSAL,
     SHADOW,
     TAKEOVER,
-    with_node_topics,
 )
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.store.store import Store
@@ -91,25 +90,6 @@ def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
 
 def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
     assert proposed(taken_over("std_msgs/msg/String"), tmp_path)[2].command_sources == {}
-
-
-def test_node_topics_are_proposed_as_its_own_profile_has_them(tmp_path):
-    plain = proposed(driven(), tmp_path, "plain")[2]
-    bag, file, profile = proposed(in_shadow() | taken_over(), tmp_path)
-    expected = with_node_topics(plain)
-    assert profile.signals == expected.signals
-    assert profile.command_sources == expected.command_sources
-    assert profile.own_conditions == expected.own_conditions
-    assert "= {}" not in file.read_text()
-    (found,) = rows(
-        bag,
-        file,
-        "SELECT count(*), count(*) FILTER (list_contains(exposures, 'limited')),"
-        " max(shadow_speed_mps), max(shadow_action) FROM transitions",
-    )
-    assert found[0] > 40
-    assert 0 < found[1] < found[0]
-    assert found[2:] == (pytest.approx(0.2), 1)
 
 
 def test_what_a_policy_would_have_driven_does_not_drive(tmp_path, capsys):
