@@ -27,10 +27,6 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import Gaps
-from restock.ingest.propose.robot_choice import (
-    DriveEvidence,
-    drive_evidence,
-)
 from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.signals import wrap_angle
@@ -417,25 +413,14 @@ def settled_at_most(
     return found[0], found[1]
 
 
-def how_it_turned(
-    recording: Recording, roles: Roles, poses: PoseSeries | None
-) -> tuple[DriveEvidence, float | None]:
-    """Return how the robot turned under its Twists.
-
-    Also return the sharpest of commands that are steering angles.
-    """
+def sharpest_steering_rad(recording: Recording, roles: Roles) -> float | None:
+    """Return the sharpest of commands that are steering angles; None if they are not."""
     if not roles["command"]:
-        return DriveEvidence(), None
+        return None
     topic, kind = roles["command"][0]
-    if (path := kind.fields.get("steering_rad")) is not None:
-        fields = recording.read({topic.name: [path]})[topic.name].fields
-        angles = np.abs(np.asarray(fields[path], np.float64))
-        angles = angles[np.isfinite(angles)]
-        return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
-    if is_motion(topic.type) or poses is None or len(poses) < 2:
-        return DriveEvidence(), None
-    _, times, speed, turn = commanded(recording, (topic, kind), None)
-    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
-    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
-    seconds = (times[order] - zero) * 1e-9
-    return drive_evidence(seconds, speed[order], turn[order], since), None
+    if (path := kind.fields.get("steering_rad")) is None:
+        return None
+    fields = recording.read({topic.name: [path]})[topic.name].fields
+    angles = np.abs(np.asarray(fields[path], np.float64))
+    angles = angles[np.isfinite(angles)]
+    return float(np.percentile(angles, 98)) if len(angles) else 0.0

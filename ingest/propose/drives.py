@@ -48,7 +48,6 @@ from restock.ingest.propose.propose import (
     propose_profile,
     tried,
 )
-from restock.ingest.propose.robot_choice import DriveEvidence
 from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.propose.trial import Advice, Trial
 from restock.ingest.steps.clocks import STAMP
@@ -215,12 +214,10 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
             one.footprint.length_m,
         ),
     )
-    turned = DriveEvidence.joined([one.turned for one in drives])
     described = base if len(base.robot.values) >= len(described.robot.values) else described
     return replace(
         base,
         commands=_commands(base.commands, driven),
-        turned=turned,
         hold=_hold([one.hold for one in driven]),
         clock=replace(
             base.clock,
@@ -236,7 +233,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         outline=outlined.outline,
         robot=(described if described.robot.described else base).robot  # of one wheelbase
         if base.commands.steered
-        else described.robot.driven(turned, outlined.footprint.length_m),
+        else described.robot,
     )
 
 

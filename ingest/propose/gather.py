@@ -30,8 +30,8 @@ from restock.ingest.propose.commands import (
     CommandHold,
     Commands,
     choose_command,
-    how_it_turned,
     read_commands,
+    sharpest_steering_rad,
 )
 from restock.ingest.propose.footprint import (
     GUESS,
@@ -53,7 +53,6 @@ from restock.ingest.propose.pose_choice import (
     transform_frames,
 )
 from restock.ingest.propose.robot_choice import (
-    DriveEvidence,
     RobotProposal,
     propose_robot,
     urdf_footprint,
@@ -152,7 +151,6 @@ class Evidence:
     commands: Commands
     chosen: CommandChoice
     hold: CommandHold
-    turned: DriveEvidence  # whether it steers as a car, if nothing describes it
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
@@ -233,8 +231,8 @@ def gather(
         upside_down=footprint.upside_down,
         lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
     )
-    turned, command_rad = how_it_turned(recording, roles, poses)
-    robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
+    if (sharpest_rad := sharpest_steering_rad(recording, roles)) is not None:
+        robot = robot.steered(footprint.length_m, sharpest_rad)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
     if wheelbase_m is not None and robot.described:
@@ -255,7 +253,6 @@ def gather(
         commands,
         chosen,
         hold,
-        turned,
         paces,
         choose_clock(
             recording,

@@ -144,8 +144,6 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs", in_one_recording(robots)))
     if steered := steered_by(seen):
         advice.append(Advice("inputs.command", steered))
-    if seen.robot.guessed_steering and not seen.commands.steered:
-        advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
     advice += _odd_commands(seen)
     advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
     if seen.origin_m is not None:
