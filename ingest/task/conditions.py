@@ -56,6 +56,7 @@ import threading
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -511,16 +512,20 @@ def shipped(
     with a profile's default noise.
     """
     constants = constants or Noise().constants | STAND_IN_LIMITS
+    return {one.name: one.with_constants(constants) for one in of_kind(_as_shipped(), kind)}
+
+
+@cache
+def _as_shipped() -> list[Condition]:
+    """Read the conditions of both kinds, sorted by name, without the constants of a robot."""
     folder = files("restock.ingest.task") / "conditions"
-    conditions = {}
-    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
-        if entry.name.endswith(".sql"):
-            name = entry.name.removesuffix(".sql")
-            text = entry.read_text(encoding="utf-8")
-            made = msgspec.convert({"name": name, **settings_of(text)}, Condition)
-            if made.kind == kind:
-                conditions[name] = made.with_constants(constants)
-    return conditions
+    texts = {
+        one.name: one.read_text("utf-8") for one in folder.iterdir() if one.name[-4:] == ".sql"
+    }
+    return [
+        msgspec.convert({"name": name.removesuffix(".sql"), **settings_of(text)}, Condition)
+        for name, text in sorted(texts.items())
+    ]
 
 
 def settings_of(text: str) -> dict[str, Any]:
