@@ -55,7 +55,7 @@ from restock.train.twin.survey.poses import candidate_poses
 
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 ROWS = sample_transitions("amr_tuesday")
-TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+TWIST = "geometry_msgs/msg/Twist"
 Topics = dict[str, tuple[str, TopicColumns]]
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 
