@@ -66,74 +66,39 @@ def make_run(
             here = gap.get(name, 1.2) if isinstance(gap, Mapping) else gap
             replay_td = 0.2 if share else None
             unseen = 0.2 * (here if ill else 1.2)
-            run.append(
+            share_of = explained.get(name, 0.8) if isinstance(explained, Mapping) else explained
+            append(
+                run,
                 "evaluation_buffer",
-                [
-                    {
-                        **clocks,
-                        "condition": name,
-                        "rows": (held_out or {}).get(name, 200),
-                        "rows_met": round(SHARES[name] * 1000),
-                        "td_abs_mean": unseen,
-                        "td_online_abs_mean": unseen * (clock if ill else 1.0),
-                        "explained": explained.get(name, 0.8)
-                        if isinstance(explained, Mapping)
-                        else explained,
-                        "q_abs_mean": 1.0,
-                        "q_lag": lag if ill else 0.05,
-                        "logs_agreement": (agreement or {}).get(name, 0.8),
-                        "logs_unexplained": (unexplained or {}).get(name, 0.45),
-                    }
-                ],
+                clocks,
+                condition=name,
+                rows=(held_out or {}).get(name, 200),
+                rows_met=round(SHARES[name] * 1000),
+                td_abs_mean=unseen,
+                td_online_abs_mean=unseen * (clock if ill else 1.0),
+                explained=share_of,
+                q_abs_mean=1.0,
+                q_lag=lag if ill else 0.05,
+                logs_agreement=(agreement or {}).get(name, 0.8),
+                logs_unexplained=(unexplained or {}).get(name, 0.45),
             )
             turn = (actions or {}).get(name)
             run.append("actions", action_rows(clocks, name, turn, logged, supplied))
             if share:
-                run.append(
-                    "conditions",
-                    [
-                        {
-                            **dict.fromkeys(run.table("conditions").schema.names),
-                            **clocks,
-                            "source": "logs",
-                            "condition": name,
-                            "drawn_rows": round(share * 10_000),
-                            "td_abs_mean": replay_td,
-                        }
-                    ],
-                )
-                run.append(
-                    "strata",
-                    [
-                        {
-                            **dict.fromkeys(run.table("strata").schema.names),
-                            **clocks,
-                            "source": "logs",
-                            "stratum": name if strata else "all",
-                            "quota_share": share / quota_met,
-                            "drawn_rows": round(share * 10_000),
-                            "td_abs_mean": replay_td,
-                        }
-                    ],
-                )
-        run.append(
-            "progress",
-            [
-                {
-                    **dict.fromkeys(run.table("progress").schema.names),
-                    **clocks,
-                    "updates": 500,
-                    "target_q_lag": lag if ill else 0.05,
-                    "q_abs_max": q_abs_max if ill else 10.0,
-                }
-            ],
-        )
-    run.append(
-        "audit",
-        [{**dict.fromkeys(run.table("audit").schema.names), "reward": -1.5}],
-    )
+                fed = {"drawn_rows": round(share * 10_000), "td_abs_mean": replay_td}
+                append(run, "conditions", clocks, source="logs", condition=name, **fed)
+                stratum = {"stratum": name if strata else "all", "quota_share": share / quota_met}
+                append(run, "strata", clocks, source="logs", **stratum, **fed)
+        ends = {"target_q_lag": lag if ill else 0.05, "q_abs_max": q_abs_max if ill else 10.0}
+        append(run, "progress", clocks, updates=500, **ends)
+    append(run, "audit", {}, reward=-1.5)
     run.flush()
     return run
+
+
+def append(run: Run, table: str, clocks: Mapping[str, int], **values: Any) -> None:
+    """Append a row of which all that is not given is null."""
+    run.append(table, [{**dict.fromkeys(run.table(table).schema.names), **clocks, **values}])
 
 
 def action_rows(

@@ -126,7 +126,10 @@ def action_space(
     kind: ActionKind, task: Task, num_envs: int
 ) -> DiscreteActions | ContinuousActions:
     """Return the action space by name."""
-    kinds = {"discrete": DiscreteActions, "continuous": ContinuousActions}
+    kinds: dict[str, type[DiscreteActions | ContinuousActions]] = {
+        "discrete": DiscreteActions,
+        "continuous": ContinuousActions,
+    }
     return kinds[kind](task, num_envs)
 
 
