@@ -54,18 +54,6 @@ def test_a_setting_of_the_default_target_needs_no_rule(tmp_path: Path) -> None:
     assert load_config(hard, ["target.every=9"]).target == Hard(every=9)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (["target.every=9"], '`target.every` is a setting of target.rule = "hard", the rule is'),
-        (["target.rule=hard", "target.tau=0.1"], '`target.tau` is a setting of target.rule = "po'),
-    ],
-)
-def test_setting_of_the_other_target_rule_names_the_rule(overrides: list[str], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        load_config(None, overrides)
-
-
 def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("seed = 1\n")

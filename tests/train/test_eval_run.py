@@ -150,6 +150,7 @@ def test_episodes_may_be_asked_for_by_kind(
         ("nominal=ten", "is neither a number nor kind=number"),
         ("ice=3", "there is no kind 'ice'"),
         ("nominal=0", "must be at least 1, got 0"),
+        ("nominal=2,nominal=3", "names 'nominal' twice"),
     ):
         assert main([*line, "--episodes", wrong]) == 2
         assert said in " ".join(capsys.readouterr().err.split())

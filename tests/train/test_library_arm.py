@@ -23,7 +23,6 @@ from restock.train.libraries.library_arm import (
     train_library,
 )
 from restock.train.run.run import Run
-from restock.train.study.study import load_study
 
 TASK = load_profile("warehouse_amr").task
 SETTINGS = (
@@ -135,19 +134,3 @@ def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch
 def test_the_library_refuses_arguments_it_does_not_know(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"refused its arguments: .*wings"):
         trained(tmp_path / "x", "sb3-dqn", wings=2)
-
-
-@pytest.mark.parametrize(
-    ("arm", "said"),
-    [
-        ('library = "sb3-sac"', "sb3-sac"),
-        ('library = "sb3-dqn"\nmixture = "uniform"', "without logs here"),
-        ("arguments = { n_steps = 3 }", "arguments need a library"),
-    ],
-)
-def test_arms_that_cannot_be_are_refused(tmp_path: Path, arm: str, said: str) -> None:
-    (tmp_path / "s.toml").write_text(
-        f'store = "s"\n[[arms]]\nname = "a"\n{arm}\n[[arms]]\nname = "b"'
-    )
-    with pytest.raises(ConfigError, match=said):
-        load_study(tmp_path / "s.toml")

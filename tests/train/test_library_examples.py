@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,6 @@ from support.stores import recording_transitions, write_store
 
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
-from restock.train.libraries.library_arm import dqn_arguments, resolve
-from restock.train.twin.env.interface import AFTER_LOGS
 
 EXAMPLES = ROOT / "docs" / "examples"
 NEEDS = {
@@ -54,40 +51,6 @@ def test_every_example_is_run_and_explained() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.py")} == {*NEEDS, *own}
     page = (EXAMPLES.parent / "libraries.md").read_text(encoding="utf-8")
     assert all(f"examples/{name}.py" in page for name in NEEDS)
-
-
-class Called(Exception):
-    """Raised in place of making a library's algorithm."""
-
-
-@pytest.mark.parametrize("name", ["sb3_dqn", "sb3_mixture"])
-def test_sb3_has_the_settings_of_the_default_recipe(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    module, given = example(name), {}
-
-    def algorithm(_: str, envs: int, **arguments: Any) -> None:
-        given.update(arguments, envs=envs)
-        raise Called
-
-    monkeypatch.setattr(module, "DQN", algorithm)
-    monkeypatch.setattr(module, "make_vec_env", lambda *_, n_envs, **__: n_envs)
-    with pytest.raises(Called):
-        module.main(*(["panel", "run"] if name == "sb3_mixture" else []))
-    config = resolve((), "sb3-dqn")
-    expected: dict[str, Any] = dqn_arguments(config) | {
-        "envs": config.env.num_envs,
-        "policy_kwargs": {"net_arch": list(config.network.hidden)},
-        "max_grad_norm": float("inf"),  # none, as in Restock
-    }
-    if name == "sb3_mixture":
-        expected["exploration_initial_eps"] = AFTER_LOGS
-        assert given["replay_buffer_kwargs"]["n_step"] == config.loss.n_step
-        own = inspect.signature(module.main).parameters["offline_updates"].default
-        assert own == config.schedule.offline_updates
-    else:
-        assert given["n_steps"] == config.loss.n_step
-    assert {key: given[key] for key in expected} == expected
 
 
 @pytest.mark.long

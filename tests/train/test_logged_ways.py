@@ -173,3 +173,13 @@ def test_a_runs_evaluations_drive_logged_ways_on_request(panel: Panel, tmp_path:
     assert {row["episode_seed"] for row in driven} == ways
     (_, said) = plan_evaluation(tmp_path / "run", missions="logged").warnings
     assert "chosen on such routes" in said
+
+
+def test_a_run_on_another_floor_cannot_evaluate_on_them(
+    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_floor(replace(FLOOR, name="away", map_origin=(900.0, 0.0, 0.0)), tmp_path / "away.toml")
+    other = [f"--set=env.layouts={tmp_path / 'away.toml'}", "--out", str(tmp_path / "other")]
+    assert main([*LOGGED_TRAINING, "--panel", str(panel.path), *other]) == 2
+    assert "is in another frame than the floor" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

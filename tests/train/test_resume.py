@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.long import one_in
+from support.panels import SCHEDULED
 from support.stores import CONDITIONS, recording_transitions
 from support.toy_run import assert_same_run, config, run_to_end, session, tables
 from support.toy_twin import CONDITIONS as TOY_CONDITIONS
@@ -29,26 +30,6 @@ from restock.train.run import checkpoint
 from restock.train.run.checkpoint import earlier, go_back
 from restock.train.session import Session
 
-# Schedules, priorities, a cap a row, corrections and an age limit at once.
-EVERYTHING = """
-max_replays_per_row = 40
-max_age_env_steps = 900
-[sources]
-logs = { schedule = "linear", start = 0.75, end = 0.25, to_env_steps = 480 }
-[correction]
-post = "density_ratio"
-[[strata]]
-name = "nominal"
-share = { schedule = "linear", start = 0.4, end = 0.5, to_env_steps = 480 }
-[[strata]]
-name = "wheel_slip"
-within = "per"
-[[strata]]
-name = "recovery"
-[each_condition]
-share = "equal"
-within = "uniform"
-"""
 # So few logged rows that fresh ones fill the quotas too.
 QUOTAS = "max_replays_per_row = 8\n" + "".join(
     f"[[strata]]\nname = '{name}'\nunit = 'episode'\nshare = 0.5\n"
@@ -83,7 +64,7 @@ def logs_by(text: str, conditions: Iterable[Condition]) -> Callable[[Path], Logs
     return made
 
 
-SCHEDULED = {"schedule": "linear", "start": 0.9, "end": 0.1, "to_env_steps": 480}
+RATIO = {"schedule": "linear", "start": 0.9, "end": 0.1, "to_env_steps": 480}
 CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[], Any]]] = {
     # Each batch is audited, so rows wait for the labels of episodes under way.
     "network, ring, twin, tables": ({"record": {"audit_share": 1.0}}, None, lambda: None),
@@ -93,7 +74,7 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
         lambda: None,
     ),
     "a teacher and its filter": (
-        {"teacher": {"source": "given", "ratio": SCHEDULED, "offline_updates": 40}},
+        {"teacher": {"source": "given", "ratio": RATIO, "offline_updates": 40}},
         None,
         Walker,
     ),
@@ -104,7 +85,7 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
     ),
     "shares of logged rows": (
         {"replay": {"logs_share": None}},
-        logs_by(EVERYTHING, CONDITIONS),
+        logs_by(SCHEDULED, CONDITIONS),
         lambda: None,
     ),
     "quotas that fresh rows fill": (

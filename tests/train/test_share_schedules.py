@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.panels import SCHEDULED
 from support.stores import CONDITIONS, recording_transitions
 from support.toy_run import config, run_to_end
 from support.toy_twin import TASK as TOY_TASK
@@ -188,30 +189,9 @@ def test_surplus_of_a_used_up_stratum_goes_to_the_others(table: pa.Table, tmp_pa
     assert draws.controller.drawn[place] == before == limit
 
 
-EVERYTHING = """
-max_replays_per_row = 40
-max_age_env_steps = 900
-[sources]
-logs = { schedule = "linear", start = 0.75, end = 0.25, to_env_steps = 1200 }
-[correction]
-post = "density_ratio"
-[[strata]]
-name = "nominal"
-share = { schedule = "linear", start = 0.4, end = 0.5, to_env_steps = 1200 }
-[[strata]]
-name = "wheel_slip"
-within = "per"
-[[strata]]
-name = "recovery"
-[each_condition]
-share = "equal"
-within = "uniform"
-"""
-
-
 def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> None:
     """Full correction keeps P(outcome) what it was, however the shares move."""
-    text = EVERYTHING.replace("density_ratio", "full")
+    text = SCHEDULED.replace("density_ratio", "full")
     built = panel(table, tmp_path / "p", text)
     draws = draws_of(built, PlannedDraws(0, 100_000, 0, 1200))
     post = np.array([stratum.timing == "post" for stratum in built.strata])
@@ -246,7 +226,7 @@ SETTINGS = config(replay={"logs_share": None}, schedule={"env_steps": 1600})
 def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Panel]:
     """Return a run on everything at once."""
     path = tmp_path_factory.mktemp("runs")
-    built = panel(table, path / "panel", EVERYTHING)
+    built = panel(table, path / "panel", SCHEDULED)
     return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
 
 

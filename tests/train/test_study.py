@@ -275,6 +275,8 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     ("text", "said"),
     [
         ("arms = []", "arms must be two or more"),
+        ('[[arms]]\nname = "a"\nlibrary = "sb3-sac"\n[[arms]]\nname = "b"', "sb3-sac"),
+        ('[[arms]]\nname = "a"\narguments = { n = 3 }\n[[arms]]\nname = "b"', "need a library"),
         ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "but the study has no store"),
         ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "`baseline`"),
         (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -119,20 +118,6 @@ def test_rosbags_reads_back_every_message(tmp_path: Path, file_format: Format, n
     assert stored == [(m.log_ns, m.topic, m.data) for m in written]
     assert texts == [f"message {i}" for i in range(50) if i % 3]
     assert qos.durability.name == "TRANSIENT_LOCAL"
-
-
-def test_a_bag_carries_its_definitions_and_no_library_version(tmp_path: Path) -> None:
-    _write(tmp_path / "bag", "rosbag2")
-    database = tmp_path / "bag" / "bag.db3"
-    with sqlite3.connect(database) as connection:
-        kept = dict(
-            connection.execute(
-                "SELECT topic_type, encoded_message_definition FROM message_definitions"
-            )
-        )
-        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    assert set(kept) == {"std_msgs/msg/String", "std_msgs/msg/Bool"}
-    assert int.from_bytes(database.read_bytes()[96:100], "big") == 3_040_000
 
 
 @pytest.mark.parametrize("file_format", ["mcap", "rosbag2"])

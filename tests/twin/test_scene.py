@@ -12,54 +12,17 @@ from rosbags.highlevel import AnyReader
 from support.long import one_in
 from support.paths import ROOT
 
-from restock.train.twin.floors.layout import PARKED_M
-from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.recording.bag_writer import Format, typestore
+from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.recorder import HARDWARE, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import (
-    EMPTY,
     MARKERS,
     PERTURBATION,
     TOPICS,
     TRAFFIC,
-    Scene,
-    mission_markers,
     perturbation_text,
 )
 
-MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 LATCHED = {"/tf_static", "/map", "/behaviour_policy", "/amcl_pose", PERTURBATION, MARKERS, TRAFFIC}
-
-
-def _markers(data: bytes) -> list[Any]:
-    return list(typestore().deserialize_cdr(data, MARKER_ARRAY).markers)
-
-
-def test_a_mission_shows_its_goal_pallets_and_patches() -> None:
-    scene = Scene(
-        pallets=np.array([[2.0, 3.0, np.pi / 2], [*PARKED_M[:2], 0.0]]),
-        patches=np.array([[1.0, 2.0, 0.5, 0.25, 0.03], [1e6, 1e6, 0.0, 0.0, 1.0]]),
-        traffic=EMPTY.traffic,
-        perturbation=Perturbation(),
-        goal_radius_m=0.4,
-        body_m=(0.7, 0.5, 0.3),
-    )
-    decoded = _markers(mission_markers(5, scene, (4.0, 1.0)))
-    assert [(m.ns, m.id, m.action) for m in decoded] == [
-        ("", 0, 3),  # deletes what was there
-        ("goal", 0, 0),
-        ("robot", 0, 0),
-        ("pallet", 0, 0),
-        ("patch", 0, 0),
-    ]
-    _, goal, robot, pallet, patch = decoded
-    assert (goal.pose.position.x, goal.pose.position.y, goal.scale.x) == (4.0, 1.0, 0.8)
-    assert (robot.header.frame_id, robot.frame_locked) == ("base_link", True)
-    assert pallet.pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
-    assert (pallet.pose.position.x, pallet.pose.position.z) == (2.0, pallet.scale.z / 2)
-    assert (patch.scale.x, patch.scale.y) == (1.0, 0.5)
-    assert {m.header.frame_id for m in (goal, pallet, patch)} == {"map"}
-    assert all(m.header.stamp.nanosec == 5 for m in decoded)
 
 
 @pytest.mark.parametrize(("file_format", "name"), one_in(2, [("mcap", "a.mcap"), ("rosbag2", "a")]))

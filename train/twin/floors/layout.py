@@ -308,17 +308,6 @@ def strip_warehouse(
 
     `open_racks` are left out: floor to walk on. There is no aisle segment beside such a place.
     """
-    for what, strips, end in (
-        ("aisles", aisle_y_m, depth_m),
-        ("cross-aisles", cross_x_m, width_m),
-    ):
-        edges = [edge for strip in strips for edge in strip]
-        if len(strips) < 2 or edges != sorted(edges) or edges[0] < 0 or edges[-1] > end:
-            raise ConfigError(
-                f"{what} {strips} are not two or more strips in order within 0 to {end} m",
-                where="warehouse layout",
-                remedy="give each strip as (start, end) in metres, in rising order",
-            )
     blocks = [
         Rect(west[1], south[1], east[0], north[0])
         for south, north in pairwise(aisle_y_m)
