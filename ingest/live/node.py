@@ -210,6 +210,7 @@ def _message_class(kind: str) -> Any:
 
 DIAGNOSTICS_S = 1.0
 DISCOVERY_S = 1.0
+MAX_AHEAD_S = 0.2  # of a stamp to the node's clock: simulators publish /clock at 10 Hz and more
 WAKE_S = 0.2  # a signal is heard after at most this time
 NAME = "restock_policy"
 
@@ -265,7 +266,13 @@ class PolicyNode:
         )
         self.shadow = bool(self._value("shadow"))
         slow = float(self._value("alarm_speed_mps"))
-        pilot = Pilot(policy, limits, self._value("takeover_topic"), None if slow < 0 else slow)
+        pilot = Pilot(
+            policy,
+            limits,
+            self._value("takeover_topic"),
+            None if slow < 0 else slow,
+            MAX_AHEAD_S,
+        )
         reported = profile.inputs.behaviour_policy
         kinds = {
             "proposal": (PROPOSAL, self.form.type),
@@ -456,6 +463,7 @@ class PolicyNode:
         status.message = "stalled" if stalled else warned or (mode if self.active else "ready")
         counts = {**pilot.counts, **{f"unreadable: {k}": n for k, n in pilot.unreadable.items()}}
         counts |= {f"off the clock: {k}": n for k, n in pilot.observer.left_out.items()}
+        counts |= {f"ahead of the clock: {k}": n for k, n in pilot.observer.ahead.items()}
         for name, count in counts.items():
             entry = pair()
             entry.key, entry.value = name, str(int(count))

@@ -202,11 +202,16 @@ class LiveObserver:
     A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags').
     Messages are held back to what the tick before held: memory does not grow.
 
+    Args:
+        profile: what to take, and how.
+        max_ahead_s: refuse a message whose stamp is ahead of its log time by more. None: take it,
+            as of a recording, whose log time may be another computer's.
+
     Raises:
         ConfigError: the profile takes what is `not_live`.
     """
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, max_ahead_s: float | None = None) -> None:
         expect("profile", profile, Profile, "`load_profile(NAME_OR_FILE)` gives one")
         if lacking := not_live(profile):
             raise ConfigError(
@@ -220,6 +225,8 @@ class LiveObserver:
             if name not in PROVENANCE:
                 self._inputs.setdefault(source.topic, []).append(source)
         self.left_out: dict[str, int] = {}  # messages whose stamps are off the clock, per topic
+        self.ahead: dict[str, int] = {}  # … or ahead of log time
+        self._max_ahead_ns = None if max_ahead_s is None else round(max_ahead_s * NS)
         self.reset()
 
     def reset(self) -> None:
@@ -259,7 +266,6 @@ class LiveObserver:
         self._newest_ns = log_time_ns
         stamp_ns = self._stamp(topic, message, log_time_ns, latched)
         if stamp_ns is None:
-            self.left_out[topic] = self.left_out.get(topic, 0) + 1
             return
         taken = _Message(log_time_ns, stamp_ns, fields)
         if topic != self.profile.inputs.command.topic:
@@ -337,7 +343,7 @@ class LiveObserver:
         return columns, Samples(stamps, np.zeros(len(stamps), np.intp))
 
     def _stamp(self, topic: str, message: Any, log_time_ns: int, latched: bool) -> int | None:
-        """When a message was measured, on the alignment clock; None where it is off it."""
+        """Return when a message was measured, on the alignment clock; None, counted, if unknown."""
         if self.profile.clock.alignment == "log_time":
             return log_time_ns
         received_ns = log_time_ns - self._clock.offset_ns(log_time_ns)
@@ -345,9 +351,16 @@ class LiveObserver:
         if header is None:
             return received_ns
         stamp_ns = int(header.stamp.sec) * NS + int(header.stamp.nanosec)
+        ahead = self._max_ahead_ns is not None and stamp_ns - log_time_ns > self._max_ahead_ns
         if latched:  # it may have been published long ago: it does not tell the time
-            return stamp_ns if self._clock.agrees(log_time_ns, stamp_ns) else received_ns
-        return stamp_ns if self._clock.receive(topic, log_time_ns, stamp_ns) else None
+            known = not ahead and self._clock.agrees(log_time_ns, stamp_ns)
+            return stamp_ns if known else received_ns
+        # One that is ahead would set the clock ahead, and what is held back would look fresh.
+        if not ahead and self._clock.receive(topic, log_time_ns, stamp_ns):
+            return stamp_ns
+        refused = self.ahead if ahead else self.left_out
+        refused[topic] = refused.get(topic, 0) + 1
+        return None
 
     def _optional(self, topic: str) -> bool:
         return all(source.optional for source in self._inputs[topic])

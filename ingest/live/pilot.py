@@ -60,6 +60,7 @@ class Pilot:
             the last ACTIVE_S.
         alarm_speed_mps: the fastest that the limiter allows while the alarm is on; None: as fast as
             without.
+        max_ahead_s: as of `LiveObserver`.
 
     Raises:
         ConfigError: the profile cannot be observed live, or there is a speed without an alarm or a
@@ -72,6 +73,7 @@ class Pilot:
         limits: Limits | None,
         takeover_topic: str = "",
         alarm_speed_mps: float | None = None,
+        max_ahead_s: float | None = None,
     ) -> None:
         self.policy, self.limits, self.profile = policy, limits, policy.profile
         self._slow = limits
@@ -83,7 +85,7 @@ class Pilot:
                     remedy="restock export RUN --to onnx --alarm 0.1 --out policy.onnx",
                 )
             self._slow = limits.at_most(alarm_speed_mps)
-        self.observer = LiveObserver(self.profile)
+        self.observer = LiveObserver(self.profile, max_ahead_s)
         self._people = [
             source for name, source in self.profile.command_sources.items() if name in OPERATORS
         ]

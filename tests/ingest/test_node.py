@@ -34,9 +34,10 @@ from restock.ingest.live.node import (
     with_node_topics,
 )
 from restock.ingest.profile.profile import load_profile, profile_toml
-from restock.ingest.task.robot import Limiter
+from restock.ingest.task.robot import STOP, Limiter
 from restock.replay.store.store import Store
 from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.recording.bag_writer import stamp
 
 PROFILE = load_profile("warehouse_amr")
 SPEC = EpisodeSpec("nominal", 20_003)
@@ -217,6 +218,52 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
     assert "nothing received yet" in pilot.reason
     assert speeds(graph)[-1] == (0.0, 0.0)
     assert all(np.isfinite(pair).all() for pair in speeds(graph))
+
+
+def test_it_stops_for_what_is_too_close_to_be_measured(policy: Path) -> None:
+    """-inf in a scan (REP 117), ahead of a robot that drives ahead."""
+    graph, node = started(policy)
+    node.trigger_activate()
+    robot = TwinRobot(graph, SPEC)
+    driven(robot, steps=8)
+    assert speeds(graph)[-1][0] > 0
+    ranges = robot.env.sensing.ranges_m[0].astype(np.float32)
+    ranges[np.abs(robot.env.simulation.bearings_rad) < 0.2] = -np.inf
+    robot.sense(ranges=ranges)
+    graph.fire()
+    assert graph.of(SHADOW)[-1].linear.x == 0
+    assert graph.of(LIMITER)[-1].data == STOP
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    robot.sense()
+    graph.fire()
+    assert speeds(graph)[-1][0] > 0
+
+
+def test_messages_ahead_of_its_clock_are_refused_and_reported(policy: Path) -> None:
+    """Taken, the first one would set the clock ahead, and a dead lidar would look alive."""
+    graph, node = started(policy)
+    node.trigger_activate()
+    robot, send, ahead_s = TwinRobot(graph, SPEC), graph.send, 3600
+
+    def stamped_ahead(topic: str, message: Any, *offered: Any) -> None:
+        if topic == "/scan":
+            message.header.stamp = stamp(graph.now_ns + round(ahead_s * 1e9))
+        send(topic, message, *offered)
+
+    graph.send = stamped_ahead  # type: ignore[method-assign]
+    driven(robot, steps=2)
+    assert node.policy.pilot.reason == "nothing received yet on /scan"
+    ahead_s = 0.1  # as by a simulator's clock
+    driven(robot, steps=6)
+    assert speeds(graph)[-1][0] > 0
+    ahead_s = 0.5
+    driven(robot, steps=4)
+    assert node.policy.pilot.reason == "scan: stale"
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    assert node.policy.pilot.observer.left_out == {}
+    graph.fire(steady=True)
+    values = {each.key: each.value for each in graph.of("/diagnostics")[-1].status[0].values}
+    assert values["ahead of the clock: /scan"] == "6"
 
 
 def test_values_that_overflow_are_a_stop(policy: Path, tmp_path: Path) -> None:
