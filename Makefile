@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo site test test-long test-docs test-slow test-lowest neighbours lint notebook sample-logs clean
+.PHONY: demo site test test-long test-docs test-slow test-lowest test-ros neighbours lint notebook sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -13,6 +13,7 @@ help:
 	@echo "make site         the documentation as a site, build/site/index.html; a broken link fails"
 	@echo "make test-docs    run every block of the documentation as it is printed"
 	@echo "make test-lowest  the tests with the oldest releases of libraries that Restock runs with"
+	@echo "make test-ros     the node under rclpy, over DDS on this machine, in a Python of its own"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
 	@echo "make notebook     run docs/tutorial.md, write its outputs again and build/tutorial.ipynb"
@@ -35,7 +36,7 @@ demo: $(VENV)/.runtime
 
 # A process a core, each with whole files: fixtures of a module are made once. Each computes on one
 # thread: threads of several processes on the same cores wait for each other at full load.
-test test-long test-docs test-lowest: export OMP_NUM_THREADS = 1
+test test-long test-docs test-lowest test-ros: export OMP_NUM_THREADS = 1
 # Many tests start Restock in a process of its own: where the environment forbids files of bytecode,
 # each would compile it again, and each of these targets all tests.
 test test-long test-docs test-lowest: export PYTHONDONTWRITEBYTECODE =
@@ -66,6 +67,16 @@ test-lowest: .venv-lowest/.ready
 	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test,onnx]'
 	@touch $@
 
+# Where there are no wheels of rclpy the tests are skipped, and say so.
+test-ros: .venv-ros/.ready
+	.venv-ros/bin/python -m pytest -rs tests/ingest/test_ros.py
+
+.venv-ros/.ready: pyproject.toml
+	$(PYTHON) -m venv .venv-ros
+	.venv-ros/bin/pip install --quiet --disable-pip-version-check -e '.[onnx,ros]' \
+		pytest pytest-timeout hypothesis moto[server]
+	@touch $@
+
 # d3rlpy pins an old gymnasium and lerobot a CUDA torch: the tests that read exports back with the
 # real libraries use a Python of their own, where there is one.
 neighbours: .venv-neighbours/.ready
@@ -89,4 +100,4 @@ sample-logs: $(VENV)/.runtime
 	$(BIN)/python sample_logs/make.py
 
 clean:
-	rm -rf $(VENV) .venv-neighbours .venv-lowest build dist *.egg-info
+	rm -rf $(VENV) .venv-neighbours .venv-lowest .venv-ros build dist *.egg-info
