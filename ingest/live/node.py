@@ -265,14 +265,8 @@ class PolicyNode:
             profile, self._value("cmd_vel_topic"), self._value("cmd_vel_type")
         )
         self.shadow = bool(self._value("shadow"))
-        slow = float(self._value("alarm_speed_mps"))
-        pilot = Pilot(
-            policy,
-            limits,
-            self._value("takeover_topic"),
-            None if slow < 0 else slow,
-            MAX_AHEAD_S,
-        )
+        takeover, slow = self._value("takeover_topic"), float(self._value("alarm_speed_mps"))
+        pilot = Pilot(policy, limits, takeover, None if slow < 0 else slow, MAX_AHEAD_S)
         reported = profile.inputs.behaviour_policy
         kinds = {
             "proposal": (PROPOSAL, self.form.type),
