@@ -1,4 +1,4 @@
-"""Faults planted in logs, and what `restock diagnose --before-training` makes of them.
+"""Faults planted in logs, and what `restock diagnose` makes of them.
 
     python benchmarks/planted_row_faults.py --out /tmp/row_faults sample_logs more_logs/*.mcap
     python benchmarks/planted_row_faults.py --out /tmp/row_faults sample_logs --unchanged

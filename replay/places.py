@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from importlib import resources
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from restock.replay.store.parquet_views import REMAKE, read_parquet
 from restock.replay.store.store import Store, is_store
 
 RUN_CONFIG = "config.json"
-_MADE_BY = {"panel": "mix --out", "run": "train --out"}
 
 
 @contextmanager
@@ -28,7 +27,6 @@ def open_place(
     path: str | Path,
     *,
     beside: Mapping[str, str | Path] | None = None,
-    memory_limit: str | None = None,
     only_store: bool = False,
     opened: Callable[[Store], None] = lambda store: None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
@@ -40,7 +38,6 @@ def open_place(
         path: the place: a folder, or `s3://bucket/prefix` for a store; `store@12` for a version.
         beside: a run and a panel, each under a schema of its own: `{"run": "runs/a"}` gives
             `run.audit`, `{"panel": "panel"}` gives `panel.rows`.
-        memory_limit: of DuckDB, for a store.
         only_store: take nothing but a store.
         opened: called with the store before it is queried: `Store.verify` verifies its files.
 
@@ -51,7 +48,7 @@ def open_place(
     """
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
-        with Store(place, memory_limit=memory_limit) as store:
+        with Store(place) as store:
             opened(store)
             add_computed_tables(store)
             _add_all(store.bare, beside)
@@ -95,20 +92,44 @@ def _install_gaps(store: Store) -> None:
     install_gaps(store)
 
 
+def beside_of(places: Iterable[str | Path]) -> dict[str, Path]:
+    """Return the panel and the run to query beside a store, each by its kind.
+
+    Raises:
+        StoreError: a place is neither, or there are two of a kind.
+    """
+    found: dict[str, Path] = {}
+    for place in map(Path, places):
+        kind = kind_beside(place)
+        if kind is None or kind in found:
+            what = f"is a second {kind}" if kind else "is not a panel or a run"
+            raise StoreError(
+                what if place.exists() else "does not exist",
+                where=str(place),
+                remedy="beside a store, give a panel (`restock mix`) and a run (`restock train`)",
+            )
+        found[kind] = place
+    return found
+
+
+def kind_beside(place: str | Path) -> str | None:
+    """Return whether a place is a panel or a run, by its own file."""
+    from restock.replay.panel.panel import HEADER
+
+    with suppress(OSError, ValueError):  # a query is too long for a path
+        for kind, file in (("panel", HEADER), ("run", RUN_CONFIG)):
+            if (Path(place) / file).is_file():
+                return kind
+    return None
+
+
 def _add_all(
     connection: duckdb.DuckDBPyConnection, beside: Mapping[str, str | Path] | None
 ) -> None:
     for schema, path in (beside or {}).items():
         connection.execute(f'CREATE SCHEMA "{schema}"')
-        kind = _add(connection, Path(path), schema)
-        if kind == schema:
-            continue
-        what = f"not a {schema}" if Path(path).exists() else f"no such {schema}"
-        raise StoreError(
-            f"is a {kind}, not a {schema}" if kind else what,
-            where=str(path),
-            remedy=f"give a folder that `restock {_MADE_BY[schema]}` wrote",
-        )
+        if _add(connection, Path(path), schema) != schema:
+            raise StoreError(f"is not a {schema} with tables", where=str(path))
 
 
 def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> None:

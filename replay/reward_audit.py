@@ -48,7 +48,6 @@ def audit_reward(
     thresholds: Thresholds,
     *,
     discount: float | None = None,
-    memory_limit: str | None = None,
 ) -> RewardAudit:
     """Return whether more success earns more, in a store's logs or a run's evaluations.
 
@@ -56,7 +55,6 @@ def audit_reward(
         place: a store, or a run.
         audits, thresholds: all that are known; those of the reward are run.
         discount: of one step; for a run its own, for a store DISCOUNT.
-        memory_limit: of DuckDB, for a store.
 
     Raises:
         ConfigError: another discount than a run's evaluations were made with; thresholds that none
@@ -78,7 +76,6 @@ def audit_reward(
     with open_place(
         place,
         beside=beside,
-        memory_limit=memory_limit,
         only_store=not of_run,
         opened=Store.verify,
     ) as connection:

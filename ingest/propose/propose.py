@@ -44,7 +44,7 @@ REMEDIES = {
     "of /tf and /tf_static",
 }
 INSTEAD_OF_COMMANDS = (
-    "; or, if the measured motion may be used as the command, add --odometry-as-command"
+    "; or, if the measured motion may be used as the command, `profile new --odometry-as-command`"
 )
 
 

@@ -303,7 +303,7 @@ def _enough_memory() -> Iterator[None]:
             raise
         raise PanelError(
             f"DuckDB may hold too little in memory: {str(error).splitlines()[0]}",
-            remedy="give it more with `restock mix --memory-limit`, or Store(memory_limit=…)",
+            remedy="give it more: RESTOCK_MEMORY_LIMIT, or Store(memory_limit=…)",
         ) from error
 
 

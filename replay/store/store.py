@@ -8,6 +8,7 @@ that no file of transitions is looked at before a query needs it; manifests are 
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 import threading
@@ -50,7 +51,8 @@ from restock.replay.store.same_drives import SHARED, install_shared_rows
 AS_WRITTEN = "join_order,build_side_probe_side"
 # DuckDB takes a negative limit, "none" or "null" for none at all, and fails at random with zero.
 _UNLIMITED_OR_ZERO = re.compile(r"\s*(?:-|none\b|null\b|[0.]+\s*[a-z%])", re.IGNORECASE)
-_MEMORY_REMEDY = 'write it like "4GB" or "512MB"'
+MEMORY_LIMIT = "RESTOCK_MEMORY_LIMIT"  # in the environment
+_MEMORY_REMEDY = f'write it like "4GB" or "512MB" ({MEMORY_LIMIT})'
 MAX_CLOSES = 500  # tries, .01 s apart
 T = TypeVar("T")
 
@@ -71,7 +73,8 @@ class Store:
             a version of it.
         version: of its transitions table, a number or the moment whose newest it was; default that
             of the path, or the newest.
-        memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
+        memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default RESTOCK_MEMORY_LIMIT of
+            the environment, or DuckDB's own (80 %).
 
     `version` is of the transitions table, `files` the Parquet files of each table, `bare` the
     connection with those views only that a query has named, `changed_by_others` the ingests whose
@@ -107,8 +110,8 @@ class Store:
                 "disabled_optimizers": AS_WRITTEN,
             }
         )
-        if memory_limit is not None:
-            self._set_memory(memory_limit)
+        if limit := memory_limit or os.environ.get(MEMORY_LIMIT):
+            self._set_memory(limit)
         try:
             held = stored_files(self.path, TRANSITIONS, transitions)
             self._ingests = ingests_table(held)

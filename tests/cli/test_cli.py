@@ -155,17 +155,12 @@ def sample_rows(tmp_path):
 @pytest.mark.parametrize(
     "words",
     [
-        ["eval", "run", "--on-logs", "own", "--baseline", "main"],
-        ["eval", "run", "--on-logs", "own", "--no-drive"],
-        ["eval", "run", "--horizon", "5"],
-        ["eval", "run", "--no-drive", "--seed", "3"],
+        ["eval", "run", "--on-logs", "own", "--video"],
         ["diagnose", "run", "--seed", "3"],
-        ["diagnose", "run", "--profile", "p"],
         ["coverage", "gaps", "store", "--min-rows", "-4"],
         ["export", "run", "--to", "onnx", "--out", "p.onnx", "--cameras", "front"],
         ["audit", "store", "--capacity", "--strict"],
-        ["audit", "store", "--capacity", "--run", "runs/a"],
-        ["audit", "runs/a", "--reward", "--panel", "panel"],
+        ["audit", "runs/a", "--reward", "--baseline", "planner"],
     ],
     ids=" ".join,
 )

@@ -79,7 +79,6 @@ def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
     path = str(run)
     return {
         "eval": ["eval", path, "--dry-run", "--policies", "agent"],
-        "baseline": ["eval", path, "--no-drive", "--save-as-baseline", str(out / "b.parquet")],
         "report": ["report", path, "--out", str(out / "r.html")],
         "card": ["report", path, "--card"],
         "compare": ["compare", path, str(root / "run")],
@@ -244,7 +243,6 @@ def writers(root: Path, out: Path) -> list[list[str]]:
         ["export", run, "--to", "onnx", "--out", str(out / "x.onnx")],
         ["mix", store, "--mixture", "coverage", "--out", str(out / "panel")],
         ["report", run, "--out", str(out / "r.html")],
-        ["eval", run, "--no-drive", "--save-as-baseline", str(out / "b.parquet")],
     ]
 
 
@@ -258,12 +256,18 @@ def test_a_target_that_cannot_be_written_is_said(
 
 
 @pytest.mark.parametrize(
-    ("limit", "remedy"), [("0GB", 'write it like "4GB"'), ("1MB", "raise --memory-limit")]
+    ("limit", "remedy"), [("0GB", 'write it like "4GB"'), ("1MB", "RESTOCK_MEMORY_LIMIT")]
 )
 def test_a_memory_limit_that_is_too_small_is_said(
-    limit: str, remedy: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    limit: str,
+    remedy: str,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     store = str(root / "store")
+    monkeypatch.setenv("RESTOCK_MEMORY_LIMIT", limit)
     for argv in (
         ["sql", store, "FROM coverage"],
         ["mix", store, "--mixture", "coverage", "--out", str(tmp_path / "panel")],
@@ -271,7 +275,7 @@ def test_a_memory_limit_that_is_too_small_is_said(
         ["audit", store, "--capacity"],
         ["audit", store, "--reward"],
     ):
-        assert cli.main([*argv, "--memory-limit", limit]) == 2
+        assert cli.main(argv) == 2
         said = capsys.readouterr().err
         assert "memory limit" in said, argv
         assert remedy in said.splitlines()[-1], argv

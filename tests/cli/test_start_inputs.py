@@ -180,13 +180,12 @@ def test_unread_recordings_are_sorted_by_kind_too(
         write_bag(Drive(seconds), bags / name)
     write_bag(OtherLidar(3.0), bags / "small")
     argv = (str(bags), "--out", str(out), "--tag", "site=north", "--minutes", "0.5")
-    code, document = start(capsys, *argv, "--footprint", "0.5x0.4")
+    code, document = start(capsys, *argv)
     assert code == 3
     mine = f"{bags / 'a'} {bags / 'b'} {bags / 'c'}"
     options = "--tag site=north --minutes 0.5"
-    # The outline is one robot's: it is in the first call alone.
     assert document["stopped"]["remedies"][:2] == [
-        f"restock start {mine} --out {out} --footprint 0.5x0.4 {options}",
+        f"restock start {mine} --out {out} {options}",
         f"restock start {bags / 'small'} --out {out}-2 {options}",
     ]
     argv = (str(bags), "--out", str(out), "--accept", *up_to_the_panel(tmp_path))

@@ -361,7 +361,7 @@ def test_the_verb_fails_on_an_error_and_passes_without(store_path, tmp_path, cap
     out = capsys.readouterr().out
     assert "stale_data" in out
     assert "skipped" in out
-    assert cli.main([*easy, "--strict", "--junit", str(junit), "--memory-limit", "1GB"]) == 1
+    assert cli.main([*easy, "--strict", "--junit", str(junit)]) == 1
     assert int(ElementTree.fromstring(junit.read_text())[0].get("failures", "")) > 0
 
 
@@ -381,11 +381,10 @@ def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp
         (tmp_path, [], tmp_path),  # no store
         (lost, [], lost),  # without a row, which passes no gate
         (lost, ["--reward"], lost),
-        (store_path, ["--run", panels["time"]], panels["time"]),  # no run
+        (store_path, [panels["time"], panels["time"]], panels["time"]),  # two panels
         (store_path, ["--junit", tmp_path / "file" / "x.xml"], tmp_path / "file"),
-        (store_path, ["--memory-limit", "lots"], "lots"),
-        (other, ["--panel", panels["time"]], panels["time"]),  # made from another store
-        (other, ["--run", run], run),
+        (other, [panels["time"]], panels["time"]),  # made from another store
+        (other, [run], run),
     ):
         assert cli.main(["audit", str(place), *map(str, words)]) == 2
         assert str(named) in "".join(capsys.readouterr().err.split())

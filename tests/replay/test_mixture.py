@@ -373,9 +373,6 @@ def test_the_verb_explains_then_packs_and_never_overwrites(store_path, tmp_path,
     assert (out / "panel.json").read_bytes() == before
     assert cli.main(["mix", str(store_path)]) == 2
     assert "no --out" in capsys.readouterr().err
-    for words in ([str(store_path), "--verify", str(out)], ["--verify", str(out), "--out", "x"]):
-        assert cli.main(["mix", *words]) == 2
-        assert "no effect with --verify" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, capsys):

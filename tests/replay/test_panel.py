@@ -368,14 +368,14 @@ def test_damage_is_found(transitions, tmp_path, capsys):
     panel = build_panel(transitions, uniform(), tmp_path / "p")
     rows, header = panel.path / ROWS, panel.path / "panel.json"
     assert not rows.stat().st_mode & 0o222
-    assert cli.main(["mix", "--verify", str(panel.path)]) == 0
-    assert panel.id in capsys.readouterr().out
+    assert cli.main(["store", "verify", str(panel.path)]) == 0
+    assert panel.id in capsys.readouterr().err
     good, text = rows.read_bytes(), header.read_bytes()
     between = bytearray(good)
     between[6000] ^= 1  # between two of the blocks that every opening looks at
     changed(rows, bytes(between))
     Panel.open(panel.path)
-    assert cli.main(["mix", "--verify", str(panel.path)]) == 2
+    assert cli.main(["store", "verify", str(panel.path)]) == 2
     assert str(rows) in "".join(capsys.readouterr().err.split())
     for path, content, problem in (
         (rows, good[:-1] + bytes([good[-1] ^ 1]), "checksum"),

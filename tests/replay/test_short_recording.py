@@ -39,7 +39,7 @@ def test_every_shipped_mixture_packs_one_episode(name, tmp_path, capsys):
     assert panel.header.left_out["gap before the evaluation split"] >= 9  # 2 s of .2 s, jitter off
     learnt = np.asarray(panel.meta_column("step_index"))
     assert learnt.max() < 50 - 5 - 9
-    assert cli.main(["audit", str(store), "--panel", str(tmp_path / "panel"), "--json"]) in (0, 1)
+    assert cli.main(["audit", str(store), str(tmp_path / "panel"), "--json"]) in (0, 1)
     found = {one["audit"]: one for one in json.loads(capsys.readouterr().out)["audits"]}
     assert found["leakage"]["status"] == "pass"
 

@@ -125,7 +125,7 @@ def test_what_was_sampled_joins_what_was_logged(store_path, run_dir, capsys, tra
         "SELECT transition_id, source_file FROM run.audit JOIN transitions USING (transition_id)"
         " ORDER BY ALL"
     )
-    rows = json.loads(out_of(capsys, str(store_path), query, "--run", str(run_dir), "--json"))
+    rows = json.loads(out_of(capsys, str(store_path), str(run_dir), query, "--json"))
     assert rows == [
         {"transition_id": (1 << 25) + step, "source_file": "logs/1.mcap"} for step in (3, 4)
     ]
@@ -136,8 +136,8 @@ def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, capsys):
     query = "SELECT sum(rows) AS rows FROM strata"
     assert json.loads(out_of(capsys, str(panel.path), query, "--json")) == [{"rows": len(panel)}]
     query = "SELECT count(*) AS rows FROM panel.rows JOIN transitions USING (transition_id)"
-    beside = ["--panel", str(panel.path), "--json"]
-    assert json.loads(out_of(capsys, str(store_path), query, *beside)) == [{"rows": len(panel)}]
+    places = str(store_path), str(panel.path)
+    assert json.loads(out_of(capsys, *places, query, "--json")) == [{"rows": len(panel)}]
 
 
 @pytest.mark.parametrize(
@@ -167,13 +167,13 @@ def test_wrong_places_are_refused(tmp_path, store_path, run_dir, capsys):
     for place, words, problem in (
         (tmp_path, [], "it is not a store"),
         (tmp_path / "x", [], "it does not exist"),
-        (store_path, ["--run", tmp_path], "not a run"),
-        (store_path, ["--run", tmp_path / "x"], "no such run"),
-        (store_path, ["--run", panel], "is a panel, not a run"),
-        (store_path, ["--panel", run_dir], "is a run, not a panel"),
+        (store_path, [tmp_path], "is not a panel or a run"),
+        (store_path, [tmp_path / "x"], "does not exist"),
+        (store_path, [panel, panel], "is a second panel"),
+        (store_path, [run_dir, run_dir], "is a second run"),
         (store_path, ["--json", "--csv"], "choose one"),
     ):
-        assert problem in out_of(capsys, str(place), "SELECT 1", *map(str, words), code=2)
+        assert problem in out_of(capsys, str(place), *map(str, words), "SELECT 1", code=2)
 
 
 def test_without_a_query_there_is_a_prompt(store_path, capsys, monkeypatch):

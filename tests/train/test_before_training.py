@@ -322,7 +322,7 @@ def test_a_measured_gap_is_evidence_and_no_verdict(tmp_path: Path, gap: TwinGap)
 def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Rows of pure noise: nothing follows from anything, and 'what' is said with its evidence."""
     store = write_store(tmp_path / "store", [recording_transitions(index) for index in (1, 2)])
-    words = ["diagnose", "--before-training", str(store), "--no-twin"]
+    words = ["diagnose", str(store), "--no-twin"]
     profile = tmp_path / "profile.toml"
     assert main(words) == 2
     assert "no shipped profile has this task" in capsys.readouterr().err

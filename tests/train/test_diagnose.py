@@ -236,11 +236,10 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
     make_run(tmp_path / "well")
     for words, said in (
         ([str(tmp_path / "young")], "has no evaluation to diagnose"),
-        ([str(tmp_path)], "is not a run directory"),
+        ([str(tmp_path)], "is not a run, a panel or a store"),
         ([], "needs a run"),
-        (["--before-training", "nowhere"], "there is no such panel or store"),
-        (["--before-training", "."], "is not a panel or a store"),
-        (["run", "--before-training", "."], "cannot be combined with a run"),
+        (["nowhere"], "nowhere: does not exist"),
+        ([".", "--confirm", "run"], "--confirm: applies only to a run"),
         (
             [str(tmp_path / "well"), "--confirm", str(tmp_path / "c")],
             "is HEALTHY: there is nothing to confirm",

@@ -59,7 +59,7 @@ def test_what_was_recorded_is_shown_again_or_its_lack_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = kept_run(tmp_path / "a")
-    line = ["eval", str(run), "--no-drive", "--json"]
+    line = ["eval", str(run), "--episodes", "0", "--json"]
     assert main(line) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "has no recorded evaluation" in said

@@ -80,7 +80,7 @@ def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(
         if one["condition"] == "blocked_aisle":
             one["time_s"] += 1.0
     pq.write_table(table.from_pylist(rows, schema=table.schema), run / FILE)
-    argv = ["eval", str(run), "--no-drive", "--video", "--policies", "agent", "--json"]
+    argv = ["eval", str(run), "--episodes", "0", "--video", "--policies", "agent", "--json"]
     assert main(argv) == 0
     said = json.loads(capsys.readouterr().out)
     assert [Path(path).name for path in said["films"]] == ["wheel_slip-worst.webp"]

@@ -110,7 +110,7 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(
     }
     assert main([*line, "--policies", "agent"]) == 0
     assert f"agent: {text}" in capsys.readouterr().err
-    assert main([*line[:2], "--no-drive"]) == 0
+    assert main([*line[:2], "--episodes", "0"]) == 0
     assert f"policy run@{updates} of step 60," in " ".join(capsys.readouterr().err.split())
     assert headline(gather(path)).endswith(f". Driven: {text}")
     assert main(["report", str(path), "--card", "--json"]) == 0

@@ -506,7 +506,7 @@ def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
         raise RunError(
             "has no recorded evaluation",
             where=str(run),
-            remedy=f"run `restock eval {quoted(run)}` (without --no-drive)",
+            remedy=f"run `restock eval {quoted(run)}` to drive one",
         )
     return table.to_pylist(), text
 

@@ -1,13 +1,11 @@
-"""Compare a run with a baseline on the same episodes, per perturbation and condition.
+"""Compare two evaluated policies per perturbation and condition, on the same episodes.
 
-A baseline is another run, or a file that keeps one's evaluation under a name, small enough to be
-committed beside the code that a pipeline tests. Differences are paired by episode: both policies
-drive the same episode, so only the policies differ.
+Differences are paired by episode: both policies drive the same episode, so only the policies
+differ.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,34 +13,28 @@ from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.errors import RunError, counted, quoted
-from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.run.kept_evaluations import cell_name, shown_evaluation
 from restock.train.run.run import Run
-from restock.train.run.run_tables import EVAL_EPISODES
 
 AGENT = "agent"
-FOLDER = Path("baselines")  # in the working directory: names are looked up there
 EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive", "refused"]
 MARGIN = 0.05  # of success: a difference of no more is none
 MIN_EPISODES = 10  # of a row; fewer give no interval and no verdict
 MIN_OF_A_KIND = 5  # … and of each condition in the row of all, whose spreads are added up
-_KEY = b"restock-baseline"
 _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 _Episodes = dict[_Key, tuple[float, float]]  # success and return
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A policy's episodes, and what another must share to be compared with it."""
+    """A policy's episodes."""
 
     name: str
-    task_hash: str
     cells: dict[tuple[str, str], _Episodes]  # by perturbation and condition (with its block)
 
 
@@ -54,73 +46,18 @@ def read_run_evaluation(path: Path, policy: str = AGENT) -> Evaluated:
     """
     run = Run.open(path)
     name = str(path) if policy == AGENT else policy
-    return Evaluated(name, str(run.document.get("task_hash")), _cells(_driven(run, policy)))
-
-
-def read_baseline(name: str) -> Evaluated:
-    """Read a baseline by the directory of a run, a file, or the name that it was saved under.
-
-    Raises:
-        RunError: there is none.
-    """
-    path = Path(name)
-    if path.is_dir():
-        return read_run_evaluation(path)
-    file = baseline_file(name)
-    if not file.is_file():
-        known = ", ".join(sorted(path.stem for path in FOLDER.glob("*.parquet")))
-        raise RunError(
-            f"is neither a run nor a baseline; there are {known or 'none'} in {FOLDER}/",
-            where=name,
-            remedy="`restock eval RUN --save-as-baseline NAME` saves one",
-        )
-    remedy = "save it again with --save-as-baseline"
-    try:
-        about = json.loads((pq.read_schema(file).metadata or {})[_KEY])
-        table = read_table(file, EVAL_EPISODES, error=RunError, remedy=remedy)
-    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
-        raise RunError("is not a baseline", where=str(file), remedy=remedy) from error
-    return Evaluated(f"{name} ({about['run']})", about["task_hash"], _cells(table))
-
-
-def save_baseline(path: Path, name: str) -> Path:
-    """Keep a run's evaluation under a name; returns the file. One of the name is replaced.
-
-    Raises:
-        RunError: no run, or it was not evaluated.
-    """
-    run = Run.open(path)
-    about = {"run": path.name, "task_hash": str(run.document.get("task_hash"))}
-    table = _driven(run, AGENT).replace_schema_metadata({_KEY: json.dumps(about).encode()})
-    file = baseline_file(name)
-    write_table(table, file)
-    return file
-
-
-def baseline_file(name: str) -> Path:
-    """Return `baselines/NAME.parquet`, or the file that is named."""
-    return Path(name) if name.endswith(".parquet") else FOLDER / f"{name}.parquet"
+    return Evaluated(name, _cells(_driven(run, policy)))
 
 
 def regression(
     baseline: Evaluated, candidate: Evaluated, *, margin: float = MARGIN, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Compare with a baseline: one row per perturbation and condition, one over all conditions.
+    """Compare with a baseline: a row per perturbation and condition, and one over all conditions.
 
     `worse` is a success lower by more than `margin`, with the paired 95 % interval below 0;
     `better` is an interval above 0. From fewer than `MIN_EPISODES` neither is told: the row is
     `inconclusive`. A cell whose episodes are not the same is `refused`.
-
-    Raises:
-        RunError: the two are of different tasks.
     """
-    if baseline.task_hash != candidate.task_hash:
-        raise RunError(
-            f"is of task {candidate.task_hash}, the baseline {baseline.name} of"
-            f" {baseline.task_hash}: their episodes are not the same",
-            where=candidate.name,
-            remedy="evaluate a baseline that was trained on this task",
-        )
     rng = np.random.default_rng(seed)
     rows = []
     for perturbation in dict.fromkeys(cell[0] for cell in baseline.cells):
@@ -141,7 +78,7 @@ def regression(
 def _row(
     cell: tuple[str, str], pairs: list[NDArray[Any]], margin: float, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Return a row in which every condition counts the same, whatever its episodes.
+    """Conditions count the same, however many episodes they have.
 
     Args:
         pairs: of each condition (n, 2, 2): episodes x (baseline, candidate) x (success, return).
@@ -236,8 +173,6 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
 
 __all__ = [
     "Evaluated",
-    "read_baseline",
     "read_run_evaluation",
     "regression",
-    "save_baseline",
 ]

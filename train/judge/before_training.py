@@ -448,7 +448,7 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
             rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
             return OpenedRows(rows, own, _of_store(store, rows, own), [path])
     raise RunError(
-        "is not a panel or a store" if path.exists() else "there is no such panel or store",
+        "is not a run, a panel or a store" if path.exists() else "does not exist",
         where=str(path),
         remedy="`restock mix STORE --mixture coverage --out PANEL` makes a panel",
     )

@@ -304,7 +304,7 @@ def confirm(
             f"is {diagnosis.cause} by its own figures, and only its rows are at fault: another run"
             " cannot confirm that",
             where=str(run.path),
-            remedy="correct the rows, mix again, and ask `restock diagnose --before-training PANEL`"
+            remedy="correct the rows, mix again, and ask `restock diagnose PANEL`"
             " whether they are right now",
         )
     if diagnosis.cause in _NOTHING:

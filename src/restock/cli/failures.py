@@ -18,7 +18,6 @@ _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = (
     f"{_CHECK}; `restock store compact STORE --drop-damaged --dry-run` looks for one in a store"
 )
-WITH_MEMORY_LIMIT = ("sql", "audit", "mix")
 GL = "MUJOCO_GL"
 NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
 # package of an exception -> what to do
@@ -41,9 +40,8 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
         return RestockError(
             f"DuckDB's memory limit is too small: {full}",
             where=where,
-            remedy="raise --memory-limit (default: 80 % of the machine's memory)"
-            if args[0] in WITH_MEMORY_LIMIT
-            else "free some memory, or use a machine with more: DuckDB may take 80 % of it",
+            remedy="free some memory, or use a machine with more: DuckDB may take 80 % of it, or as"
+            " much as RESTOCK_MEMORY_LIMIT in the environment says",
         )
     if isinstance(error, StoreError) and error.where is None:  # raised where only rows were known
         return StoreError(error.what, where=where, remedy=error.remedy)

@@ -76,8 +76,8 @@ def find_places(
         notes.append(
             f"{1 - fits.sum() / len(visited_m):.0%} of the poses are nearer to obstacles than the"
             f" {room_m:.2f} m that this robot needs, or in another part of the floor: no mission "
-            "goes there. If the robot did drive there, it is smaller than in the profile: give "
-            "--footprint LxW"
+            "goes there. If the robot did drive there, it is smaller than in the profile: measure "
+            "its [task.body]"
         )
     best: dict[tuple[int, int], tuple[float, tuple[float, float]]] = {}
     for i, j in np.unique(cells[wide], axis=0).tolist():
@@ -318,7 +318,7 @@ def floor_of_grid(
             f"there is no place for a goal for a robot that needs {turn_m:.2f} m around its "
             "middle to turn",
             where=where,
-            remedy="check the body in the profile (--footprint LxW), or give a larger map",
+            remedy="check [task.body] in the profile, or give a larger map",
         )
     floor = Warehouse(
         width_m=round(free.shape[0] * cell_m, 6),
@@ -340,7 +340,7 @@ def floor_of_grid(
 
 
 _NO_ROOM_REMEDY = (
-    "check the robot's size (--footprint LxW), and of a map.yaml mode, negate and the thresholds"
+    "check [task.body] in the profile, and of a map.yaml mode, negate and the thresholds"
 )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,12 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RestockError, RunError
+from restock.errors import ConfigError, ExitCode, RestockError
 from restock.replay.fleet.store_difference import shifted
 from restock.replay.store.audit import (
     OFFENDED,
     SAMPLE_ROWS,
-    WORST_FIRST,
     Audit,
     Finding,
     Severity,
@@ -41,15 +39,17 @@ class AuditCommand:
     --baseline, the run must have passed `restock gate`. A comparison that is not possible fails,
     too. docs/audit.md has a workflow to copy.
 
-    Example: `restock audit store/ --against store@41 --run runs/a --baseline runs/main`
+    Example: `restock audit store/ runs/a --against store@41 --baseline runs/main`
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store to audit. With --reward, it may also be a run."""
-    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """Also audit this panel, which was made from the store."""
-    run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """Also audit the evaluation of this run."""
+    second: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL|RUN]")] = (
+        None
+    )
+    """Also audit a panel that was made from the store, or the evaluation of a run."""
+    third: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")] = None
+    """And the other of the two, in either order."""
     against: Annotated[str | None, tyro.conf.arg(metavar="OLD")] = None
     """The earlier store, or an earlier version (store@41): everything it held must still be
     there."""
@@ -70,14 +70,10 @@ class AuditCommand:
     its evaluations is used."""
     strict: bool = False
     """Warnings fail, too."""
-    memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """Memory limit of DuckDB, e.g. 4GB; beyond it, DuckDB spills to a temporary folder."""
     json: bool = False
     """Print one JSON document: {"store", "failed", "audits": [{"part", "audit", "status", …}]}."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also write JUnit XML: one suite each for audits, difference and gate."""
-    summary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Append a Markdown summary to this file, for example $GITHUB_STEP_SUMMARY."""
 
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
@@ -85,9 +81,12 @@ class AuditCommand:
         from restock.replay.reward_audit import audit_reward
         from restock.replay.store.audit import load_audits, load_thresholds
 
+        if (self.capacity or self.reward) and self.second is not None:
+            option = "--capacity" if self.capacity else "--reward"
+            raise ConfigError("takes one place", where=option, remedy=f"leave out {self.second}")
         if self.capacity:
-            _refuse_with(self, "--capacity", "panel", "run_dir", "audits", "thresholds", "reward")
-            _refuse_with(self, "--capacity", "discount", "strict", "junit", "summary")
+            _refuse_with(self, "--capacity", "audits", "thresholds", "reward")
+            _refuse_with(self, "--capacity", "discount", "strict", "junit")
             _refuse_with(self, "--capacity", "against", "baseline")
             return self._capacity()
         self._check_options()
@@ -99,7 +98,6 @@ class AuditCommand:
                 audits,
                 thresholds,
                 discount=self.discount,
-                memory_limit=self.memory_limit,
             )
             parts = [Part("audit", reward.findings)]
         else:
@@ -126,15 +124,19 @@ class AuditCommand:
             _print([one for part in parts for one in part.findings])
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
+    def _beside(self) -> dict[str, Path]:
+        from restock.replay.places import beside_of
+
+        return beside_of(place for place in (self.second, self.third) if place is not None)
+
     def _check_options(self) -> None:
         """Refuse options that do nothing or cannot be written to, before the work.
 
         Raises:
             ConfigError: there is one.
-            RunError: --run is not a run.
+            StoreError: a place beside the store is not a panel or a run.
         """
         from restock.files import expect_file_place
-        from restock.replay.places import RUN_CONFIG
 
         if self.discount is not None and not (self.reward and 0 <= self.discount <= 1):
             raise ConfigError(
@@ -145,17 +147,13 @@ class AuditCommand:
                 remedy="give --reward, and the discount per step, for example 0.99",
             )
         if self.reward:
-            _refuse_with(self, "--reward", "panel", "run_dir", "against", "baseline")
-            if (Path(self.store) / RUN_CONFIG).is_file():
-                _refuse_with(self, "the --reward of a run", "memory_limit")
-        if self.baseline is not None and self.run_dir is None:
+            _refuse_with(self, "--reward", "against", "baseline")
+        run = self._beside().get("run")
+        if self.baseline is not None and run is None:
             raise ConfigError(
-                "applies only to a run", where="--baseline", remedy="also give --run RUN"
+                "applies only to a run", where="--baseline", remedy="give the run after the store"
             )
-        expect_file_place(self.junit, "--junit", run=self.run_dir or Path(self.store))
-        expect_file_place(self.summary, "--summary", run=self.run_dir or Path(self.store))
-        if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
-            raise RunError("is not a run directory", where=str(self.run_dir))
+        expect_file_place(self.junit, "--junit", run=run or Path(self.store))
 
     def _run_audits(self, audits: Sequence[Audit], thresholds: Mapping[str, Any]) -> list[Finding]:
         from restock.cli import output
@@ -163,12 +161,10 @@ class AuditCommand:
         from restock.replay.store.audit import run_audits
         from restock.replay.store.store import Store
 
-        beside = {"panel": self.panel, "run": self.run_dir}
-        given = {name: path for name, path in beside.items() if path is not None}
+        given = self._beside()
         place = open_place(
             self.store,
             beside=given,
-            memory_limit=self.memory_limit,
             only_store=True,
             opened=Store.verify,
         )
@@ -183,11 +179,11 @@ class AuditCommand:
         parts = []
         if self.against is not None:
             parts.append(Part("diff", self._difference(self.against)))
-        if self.run_dir is not None and self.baseline is not None:
+        if self.baseline is not None:
             from restock.train.judge.gate import passed_gate
 
             try:
-                found = of_gate(passed_gate(self.run_dir, self.baseline))
+                found = of_gate(passed_gate(self._beside()["run"], self.baseline))
             except RestockError as error:
                 found = refused("comparable", error, option=f"--baseline {self.baseline}")
             parts.append(Part("gate", found))
@@ -205,24 +201,20 @@ class AuditCommand:
             return refused("comparable", error, option=f"--against {old}")
 
     def _write(self, parts: Sequence[Part], failing: set[str]) -> None:
-        """Write the findings as JUnit XML and as Markdown, if they are wanted."""
+        """Write the findings as JUnit XML, if they are wanted."""
         from restock.files import write_text
         from restock.replay.store.audit import junit_suites
 
         if self.junit is not None:
             suites = {f"{part.name} {self.store}": part.findings for part in parts}
             write_text(self.junit, junit_suites(suites, failing))
-        if self.summary is not None:
-            self.summary.parent.mkdir(parents=True, exist_ok=True)
-            with self.summary.open("a", encoding="utf-8") as file:
-                file.write(markdown(f"restock audit {self.store}", parts, failing=failing))
 
     def _capacity(self) -> int:
         from restock.cli import output
         from restock.replay.places import open_place
         from restock.replay.store.audit import recommend_capacity
 
-        with open_place(self.store, memory_limit=self.memory_limit, only_store=True) as connection:
+        with open_place(self.store, only_store=True) as connection:
             capacity = recommend_capacity(connection)
         if self.json:
             output.print_json({"store": str(self.store), "capacity": asdict(capacity)})
@@ -365,7 +357,7 @@ def _summary(findings: list[Finding]) -> str:
 
 
 _MARKS = {"fail": "❌", "warn": "⚠️", "info": "ℹ️", "pass": "✅", "skipped": "–"}
-SHOWN = 5  # rows of a finding on a terminal and in a summary
+SHOWN = 5  # rows of a finding on a terminal
 
 
 class Part(NamedTuple):
@@ -476,48 +468,3 @@ def _as_finding(
     audit = Audit(name, severity, advice, doc, None, "")
     columns = list(every[0]) if every else []
     return Finding(audit, status, len(every), columns, every[:SAMPLE_ROWS], {})
-
-
-def markdown(title: str, parts: Sequence[Part], *, failing: set[str]) -> str:
-    """Write a summary as Markdown for a pipeline's page, failures first."""
-    every = [(part.name, one) for part in parts for one in part.findings]
-    every.sort(key=lambda pair: WORST_FIRST.index(pair[1].status))
-    failed = sum(one.status in failing for _, one in every)
-    passed = sum(one.status == "pass" for _, one in every)
-    verdict = f"**{failed} failed**" if failed else "**passed**"
-    lines = [
-        f"## {_MARKS['fail' if failed else 'pass']} {title}",
-        "",
-        f"{verdict}; of {len(every)} checks {passed} passed,"
-        f" {sum(one.status == 'skipped' for _, one in every)} were skipped.",
-        "",
-    ]
-    shown = [(name, one) for name, one in every if one.status not in ("pass", "skipped")]
-    if shown:
-        lines += ["| | check | rows | what |", "| --- | --- | ---: | --- |"]
-        lines += [
-            f"| {_MARKS[one.status]} {one.status} | {name}: `{one.audit.name}` | {one.rows:,} |"
-            f" {_cell(one.audit.doc)} |"
-            for name, one in shown
-        ]
-    for name, one in shown:
-        if one.status not in failing:
-            continue
-        lines += ["", f"### {name}: {one.audit.name}", "", f"{one.audit.advice}", ""]
-        columns = one.columns
-        lines += [f"| {' | '.join(map(_cell, columns))} |", f"|{' --- |' * len(columns)}"]
-        lines += [
-            f"| {' | '.join(_cell(row[column]) for column in columns)} |"
-            for row in one.sample[:SHOWN]
-        ]
-        if one.rows > SHOWN:
-            lines.append(f"\n… {one.rows - SHOWN:,} more")
-    return "\n".join(lines) + "\n"
-
-
-def _cell(value: Any) -> str:
-    """Return a value for a Markdown table: one line, without markup."""
-    text = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-    text = " ".join(text.split())
-    text = text if len(text) <= 100 else f"{text[:99]}…"
-    return re.sub(r"([\\`|*_\[\]])", r"\\\1", text).replace("<", "&lt;").replace(">", "&gt;")

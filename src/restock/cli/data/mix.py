@@ -38,7 +38,7 @@ class MixCommand:
     version, mixture, task and rows.
     """
 
-    store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """A TOML file, or one of coverage and uniform. See docs/mixture.md."""
@@ -48,34 +48,17 @@ class MixCommand:
     """Only show the plan; write nothing."""
     force: bool = False
     """Replace an existing panel."""
-    memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """Memory limit of DuckDB, e.g. 1GB. Packing needs little more, whatever the panel's size."""
-    verify: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """Check every byte of an existing panel; do nothing else."""
     json: bool = False
     """Print the plan as one JSON document."""
 
     def run(self) -> None:
         """Plan, and unless it is a dry run, pack."""
         from restock.cli import output
-        from restock.cli.command_line import refuse
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import check_free, open_source, write_panel
         from restock.replay.plan.plan import plan_panel
         from restock.replay.store.store import Store
 
-        if self.verify is not None:
-            why, remedy = "has no effect with --verify", "leave out one of them"
-            if self.store is not None:
-                raise MixtureError(f"the store {why}", where=self.store, remedy=remedy)
-            planning = ("mixture", "out", "dry_run", "force", "version", "memory_limit")
-            refuse(self, planning, why, remedy=remedy)
-            self._verify(self.verify)
-            return
-        if self.store is None:
-            raise MixtureError(
-                "no STORE given", remedy="give the store from which to take transitions"
-            )
         if self.out is None and not self.dry_run:
             raise MixtureError("no --out given", remedy="give --out PANEL, or --dry-run")
         if self.out is not None and not self.dry_run:
@@ -83,7 +66,7 @@ class MixCommand:
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
         with (
-            Store(self.store, memory_limit=self.memory_limit) as store,
+            Store(self.store) as store,
             open_source(store, mixture, folder=folder) as source,
         ):
             with output.progress("planning", None):
@@ -109,20 +92,6 @@ class MixCommand:
         )
         for line in _summary(document):
             output.stdout().print(line, markup=False, soft_wrap=not sys.stdout.isatty())
-
-    def _verify(self, path: Path) -> None:
-        from restock.cli import output
-        from restock.replay.panel.panel import Panel
-
-        panel = Panel.open(path, verify=True)
-        size = sum(record.bytes for record in panel.header.files.values())
-        if self.json:
-            document = {"panel": str(path), "id": panel.id, "rows": len(panel), "bytes": size}
-            output.print_json(document | {"unchanged": True})
-            return
-        output.stdout().print(
-            f"panel {panel.id}: {len(panel):,} rows, all {size:,} bytes as they were written"
-        )
 
 
 def describe(plan: PanelPlan) -> dict[str, Any]:

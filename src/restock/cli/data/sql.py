@@ -35,49 +35,46 @@ class SqlCommand:
     Queries are read-only, and Ctrl-C stops a query. Without a query, a prompt opens.
     """
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A store, a run directory or a panel."""
+    second: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
+    """Beside a store: a panel or a run whose tables the query can also use, as panel.rows,
+    run.audit, …"""
+    third: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")] = None
+    """And the other of the two, in either order."""
     query: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUERY]")] = None
     """The query, or - to read it from stdin. Default: open a prompt."""
-    run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run whose tables the query can also use, as run.audit, run.strata, …"""
-    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """A panel whose tables the query can also use, as panel.rows, panel.strata."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
     """Print CSV with a header."""
-    memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """Memory limit of DuckDB, e.g. 4GB; beyond it, DuckDB spills to a temporary folder."""
     export: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a store's views for use in any DuckDB: an init file (.sql) or a database (.duckdb)."""
 
     def run(self) -> None:
         """Run the query and print its rows."""
         from restock.cli import output
-        from restock.replay.places import open_place
+        from restock.replay.places import beside_of, open_place
 
+        place, others, query = self._places()
         if self.json and self.csv:
             raise QueryError("--json and --csv cannot be combined", remedy="choose one")
         if self.export is not None:
-            if self.query is not None:
+            if query is not None or others:
                 raise QueryError(
-                    "--export writes the views, and runs no query", remedy="leave out one"
+                    "--export writes a store's views, and runs no query", remedy="leave out one"
                 )
-            self._export(self.export)
+            self._export(place, self.export)
             return
-        beside = {"run": self.run_dir, "panel": self.panel}
-        given = {name: path for name, path in beside.items() if path is not None}
         with open_place(
-            self.path,
-            beside=given,
-            memory_limit=self.memory_limit,
+            place,
+            beside=beside_of(others),
             opened=output.say_unverified,
         ) as connection:
-            if self.query is None and sys.stdin.isatty():
+            if query is None and sys.stdin.isatty():
                 self._prompt(connection)
             else:
-                text = sys.stdin.read() if self.query in (None, "-") else self.query
+                text = sys.stdin.read() if query in (None, "-") else query
                 self._answer(connection, text or "", alone=True)
 
     def _answer(
@@ -90,7 +87,7 @@ class SqlCommand:
         columns, values, count = fetch(
             connection,
             text,
-            where=str(self.path),
+            where=self.path,
             at_most=SHOWN_ROWS if terminal else None,
             alone=alone,
         )
@@ -143,16 +140,24 @@ class SqlCommand:
             except (QueryError, StoreError) as error:
                 sys.stderr.write(f"{error}\n")
 
-    def _export(self, out: Path) -> None:
+    def _places(self) -> tuple[str, tuple[str, ...], str | None]:
+        """Return the place to query, those beside it, and the query: a last word that is none."""
+        from restock.replay.places import kind_beside
+
+        others = [word for word in (self.second, self.third, self.query) if word is not None]
+        query = others.pop() if others and kind_beside(others[-1]) is None else None
+        return self.path, tuple(others), query
+
+    def _export(self, place: str, out: Path) -> None:
         from restock.cli import output
         from restock.files import expect_file_place
         from restock.replay.store.export_views import export_views
         from restock.replay.store.store import Store
 
         expect_file_place(out, "--export")
-        with Store(self.path) as store:
+        with Store(place) as store:
             export_views(store, out)
-            output.say(f"views of {self.path}, version {store.version} -> {out}")
+            output.say(f"views of {store.path}, version {store.version} -> {out}")
 
 
 def _cut(row: dict[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -209,19 +210,20 @@ class RemoveCommand:
 
 @dataclass
 class VerifyCommand:
-    """Read every file of a store and compare the checksum of each page.
+    """Read every file of a store, or of a panel, and compare all checksums.
 
         restock store verify store/
+        restock store verify panel/
 
     `mix`, `export`, `audit`, `coverage gaps` and `info` do this first, but skip a file that was
     found whole before if its size and time are the same. This reads all of them again. `sql` and
     the rest of `coverage` only say how many files nobody has verified.
 
-    Exit codes: 0 all are whole, 1 a file is damaged or missing.
+    Exit codes: 0 all are whole, 1 a file is damaged or missing (of a panel: 2).
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
-    """The store: a folder, or s3://bucket/prefix."""
+    """The store: a folder, or s3://bucket/prefix. Or a panel."""
     json: bool = False
     """Print one JSON document: {"files", "damaged": [{"file", "remedy"}]}."""
 
@@ -229,7 +231,10 @@ class VerifyCommand:
         """Verify, and list what is damaged."""
         from restock.cli import output
         from restock.ingest.store.damaged_files import verify_store
+        from restock.replay.panel.panel import HEADER
 
+        if (Path(self.store) / HEADER).is_file():
+            return self._verify_panel()
         done = verify_store(self.store)
         if self.json:
             output.print_json(asdict(done))
@@ -238,3 +243,14 @@ class VerifyCommand:
         whole = done.files - len(done.damaged)
         output.say(f"{self.store}: {whole:,} of {counted(done.files, 'file')} whole")
         return ExitCode.FAILED if done.damaged else ExitCode.OK
+
+    def _verify_panel(self) -> ExitCode:
+        from restock.cli import output
+        from restock.replay.panel.panel import Panel
+
+        panel = Panel.open(self.store, verify=True)
+        files = len(panel.header.files)
+        if self.json:
+            output.print_json({"files": files, "damaged": []})
+        output.say(f"panel {panel.id}: {counted(files, 'file')} and {len(panel):,} rows whole")
+        return ExitCode.OK

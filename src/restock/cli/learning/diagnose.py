@@ -24,27 +24,27 @@ class DiagnoseCommand:
     evidence and an experiment that would confirm it. The figures are from the last three
     evaluations; most of the runs must agree. Faulty rows in the panel change HEALTHY to BUFFER.
 
-    With --before-training, no run is needed: the rows of a panel or a store are compared with fresh
-    rows from the twin and with the task's definitions. Do the actions explain the motion? Do
+    Of a panel or a store, before training, the rows are compared with fresh rows from the twin and
+    with the task's definitions. Do the actions explain the motion? Do
     rewards and episode ends follow the task? Do the rows follow from one another? This finds
     systematic errors that no figure of a run shows, and prints the rows that are the evidence.
 
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
-    """Runs of one method (seeds)."""
-    before_training: Annotated[Path | None, tyro.conf.arg(metavar="PANEL_OR_STORE")] = None
-    """Diagnose the rows of this panel or store, without a run. Takes some seconds."""
+    places: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")
+    ]
+    """Runs of one method (seeds); or one panel or store, whose rows are diagnosed."""
     profile: str | None = None
-    """With --before-training: the profile with which the rows were ingested. Default: the one
-    stored with them."""
+    """Of a panel or store: the profile with which the rows were ingested. Default: the one stored
+    with them."""
     perturbation: Path | None = None
-    """With --before-training: a perturbation that calibrates the twin, e.g. written by `restock
-    twin fit`."""
+    """Of a panel or store: a perturbation that calibrates the twin, e.g. written by `restock twin
+    fit`."""
     twin: bool = True
     """Do not compare rows with the twin, which takes some seconds: those of a run's panel are not
-    diagnosed; with --before-training, they are checked only against the task's definitions."""
+    diagnosed; those of a panel or store are checked only against the task's definitions."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None
@@ -59,19 +59,18 @@ class DiagnoseCommand:
         from restock.train.judge.diagnose import check_place, confirm, diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
-        if self.before_training is not None:
-            return self._before_training(self.before_training)
+        if not self.places:
+            raise ConfigError("needs a run, a panel or a store", where="restock diagnose")
+        first, *others = self.places
+        if not others and not (first / "config.json").is_file():
+            return self._before_training(first)
         refuse(
             self,
             ("profile", "perturbation"),
-            "applies only to --before-training",
+            "applies only to a panel or a store",
             remedy="leave it out",
         )
-        if not self.runs:
-            raise ConfigError(
-                "needs a run, or --before-training PANEL_OR_STORE", where="restock diagnose"
-            )
-        runs = [Run.open(path) for path in self.runs]
+        runs = [Run.open(path) for path in self.places]
         if self.confirm is not None:
             check_place(self.confirm)
         own = diagnosis = diagnose(runs)
@@ -79,7 +78,7 @@ class DiagnoseCommand:
         if found is not None:
             diagnosis = with_rows(own, found)
         if not self.json:
-            _show(diagnosis, self.runs)
+            _show(diagnosis, self.places)
             if found is None and self.twin:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
         confirmation = None
@@ -93,7 +92,7 @@ class DiagnoseCommand:
             )
         if self.json:
             of_rows = None if found is None else found.document()
-            document = _document(diagnosis, self.runs)
+            document = _document(diagnosis, self.places)
             print_json(document | {"rows": of_rows, "confirmation": confirmation})
         elif confirmation is not None:
             _show_confirmation(confirmation)
@@ -101,17 +100,14 @@ class DiagnoseCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _before_training(self, path: Path) -> int:
+        from restock.cli.command_line import refuse
         from restock.cli.output import print_json
-        from restock.errors import ConfigError, ExitCode
+        from restock.errors import ExitCode
         from restock.ingest.profile.profile import load_profile
         from restock.train.judge.before_training import diagnose_before_training
         from restock.train.twin.physics.perturbation import load_perturbation
 
-        if self.runs or self.confirm is not None:
-            raise ConfigError(
-                "--before-training cannot be combined with a run or --confirm",
-                where="restock diagnose",
-            )
+        refuse(self, ("confirm",), "applies only to a run", remedy="leave it out")
         diagnosis = diagnose_before_training(
             path,
             profile=None if self.profile is None else load_profile(self.profile),

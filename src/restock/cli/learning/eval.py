@@ -1,4 +1,4 @@
-"""`restock eval`: a run's policy in the twin, against a baseline, or off-policy on logs alone."""
+"""`restock eval`: a run's policy in the twin, or off-policy on logs alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 # Options that say what is driven, and what becomes of it.
 _DRIVES = (
     *("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "missions"),
-    *("baseline", "save_as_baseline", "drive", "video"),
+    "video",
 )
 
 
@@ -30,9 +30,9 @@ class EvalCommand:
     closest approach to people and the time lost against the planner, with 95 % intervals; partly
     and wholly blocked aisles are listed separately. Adds the episodes to RUN/eval/episodes.parquet.
 
-    With --baseline, the policy is compared with another run or a saved baseline on the same
-    episodes. With --on-logs nothing is driven: off-policy evaluation on logged episodes that the
-    policy did not learn from (docs/eval.md), written to RUN/eval/off_policy.parquet.
+    With --on-logs nothing is driven: off-policy evaluation on logged episodes that the policy did
+    not learn from (docs/eval.md), written to RUN/eval/off_policy.parquet. `restock gate` decides
+    whether the policy may take the place of another.
 
     Example: `restock eval runs/a --perturbations none,friction,latency`
     """
@@ -41,7 +41,8 @@ class EvalCommand:
     """The run directory."""
     episodes: Annotated[str, tyro.conf.arg(metavar="N|KIND=N,...")] = "20"
     """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision). Or a number for each
-    kind, as nominal=1000,wheel_slip=300: other kinds are not driven."""
+    kind, as nominal=1000,wheel_slip=300: other kinds are not driven. 0: drive nothing, and show the
+    newest evaluation in RUN/eval/episodes.parquet."""
     perturbations: str = "none,friction,latency"
     """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (for example
     from `restock twin fit`)."""
@@ -50,13 +51,6 @@ class EvalCommand:
     of the logs' drivers), cloned:DRIVER, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
     """Seed of the first episode. All policies drive the same seeds."""
-    baseline: str | None = None
-    """Compare with this run, a saved baseline, or another one of the --policies (cloned, planner),
-    per condition, on the same episodes. `restock gate` decides whether it may take its place."""
-    save_as_baseline: str | None = None
-    """Save the evaluation as baselines/NAME.parquet (or as the .parquet file given)."""
-    drive: bool = True
-    """Drive nothing: use (or just show) the episodes in RUN/eval/episodes.parquet."""
     video: bool = False
     """For each condition, film the agent's worst failure and an episode in which it succeeded and
     another policy failed, from above, into RUN/eval/films. The episodes are driven again. `restock
@@ -64,9 +58,6 @@ class EvalCommand:
     on_logs: str | None = None
     """Off-policy evaluation on the episodes of this store, or on the held-out episodes of this
     panel. "own": the run's own panel."""
-    horizon: int | None = None
-    """With --on-logs: the number of steps over which importance weights are multiplied. Default:
-    all."""
     layouts: str | None = None
     """Floors to drive on, e.g. generated:test. Default: the run's own floors; for a run trained on
     generated:train, the test floors."""
@@ -88,11 +79,9 @@ class EvalCommand:
             why = "cannot be combined with --on-logs, which drives nothing"
             refuse(self, _DRIVES, why, remedy="leave out one of them")
             return self._evaluate_off_policy(self.on_logs)
-        refuse(self, ("horizon",), "applies only to --on-logs", remedy="give --on-logs, too")
         return self._drive()
 
     def _drive(self) -> int:
-        from restock.cli.command_line import refuse
         from restock.cli.output import print_json, progress, say
         from restock.errors import ExitCode
         from restock.train.evaluation.eval_run import (
@@ -102,26 +91,14 @@ class EvalCommand:
             read_recorded,
             settings,
         )
-        from restock.train.evaluation.regression import (
-            read_baseline,
-            read_run_evaluation,
-            regression,
-        )
-        from restock.train.evaluation.regression import save_baseline as save
         from restock.train.run.kept_evaluations import summary_rows
 
-        if not self.drive:
-            names = ("episodes", "perturbations", "seed", "limiter")
-            refuse(self, names, "has no effect with --no-drive", remedy="leave out one of them")
-        beside = self.baseline if self.baseline in _names(self.policies) else None
-        baseline = None
-        if self.baseline is not None and beside is None:
-            baseline = read_baseline(self.baseline)
+        drive = self.episodes != "0"
         plan = plan_evaluation(
             self.run_path,
             policies=_names(self.policies),
             perturbations=_names(self.perturbations),
-            episodes=self.episodes,
+            episodes=self.episodes if drive else "20",
             first_seed=self.seed,
             layouts=self.layouts,
             missions=self.missions,
@@ -131,7 +108,7 @@ class EvalCommand:
             print_json({**settings(plan), "episodes": plan.total})
             return 0
         document: dict[str, Any] = {}
-        if self.drive:
+        if drive:
             for line in plan.warnings:
                 say(line)
             for kind, floors in plan.left_out.items():
@@ -144,7 +121,7 @@ class EvalCommand:
                 rows = summary_rows(drive_evaluation(plan, advance))
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]
             document = {**settings(plan), "results": rows, "clones": clones}
-        elif self.baseline is None and self.save_as_baseline is None and not self.video:
+        elif not self.video:
             shown, text = read_recorded(self.run_path)
             document = {"results": summary_rows(shown), "recorded": text}
         if self.video:
@@ -153,13 +130,6 @@ class EvalCommand:
             with progress("filming", None) as advance:
                 films, missing = film_evaluation(plan, advance)
             document |= {"films": [str(path) for path in films], "not_filmed": missing}
-        if beside is not None:
-            baseline = read_run_evaluation(self.run_path, beside)
-        if baseline is not None:
-            rows = regression(baseline, read_run_evaluation(self.run_path))
-            document |= {"baseline": baseline.name, "regression": rows}
-        if self.save_as_baseline is not None:
-            document["saved"] = str(save(self.run_path, self.save_as_baseline))
         if self.json:
             print_json(document)
         else:
@@ -182,19 +152,13 @@ class EvalCommand:
             say(f"filmed {path}")
         for why in document.get("not_filmed", ()):
             say(f"not filmed: {why}")
-        if "regression" in document:
-            show_regression(document["regression"], document["baseline"])
-        if "saved" in document:
-            say(f"baseline saved as {document['saved']}")
 
     def _evaluate_off_policy(self, logs: str) -> int:
         from restock.cli.output import print_json, progress, say
-        from restock.errors import ConfigError, counted
+        from restock.errors import counted
         from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
 
-        if self.horizon is not None and self.horizon < 1:
-            raise ConfigError(f"must be at least 1, got {self.horizon}", where="--horizon")
-        config = OpeConfig(horizon=self.horizon)
+        config = OpeConfig()
         plan = plan_off_policy(self.run_path, None if logs == "own" else logs, config)
         document = plan.document()
         if self.dry_run:
@@ -301,7 +265,7 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
     )
     for row in result.rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
-            longest = f"; --horizon {row['ess_steps']} is enough" if row["ess_steps"] else ""
+            longest = f"; {row['ess_steps']} steps would be few enough" if row["ess_steps"] else ""
             say(f"{row['measure']}: pdwis is refused: {row['refused']}{longest}")
     if any(row["estimator"] == "fqe" for row in result.rows):
         say(
@@ -326,36 +290,4 @@ def _value(row: dict[str, Any]) -> str:
     return interval_text(row["value"], row["low"], row["high"])
 
 
-def show_regression(rows: list[dict[str, Any]], baseline: str) -> None:
-    """Print a row per perturbation and condition, and one line with the result."""
-    from restock.cli.output import print_table, say
-
-    print_table(
-        [_regression_row(row) for row in rows],
-        title=f"success against the baseline {baseline}, paired by episode [95 %]",
-    )
-    for row in rows:
-        if row["reason"]:
-            say(f"{row['perturbation']}, {row['condition']}: {row['reason']}")
-    if any(row["verdict"] == "refused" for row in rows):
-        say("drive both with the same --episodes, --perturbations and --seed")
-
-
-def _regression_row(row: dict[str, Any]) -> dict[str, Any]:
-    known = row["baseline"] is not None
-    difference = f"{row['difference']:+.2f}" if known else ""
-    if row["difference_low"] is not None:
-        difference += f" [{row['difference_low']:+.2f}, {row['difference_high']:+.2f}]"
-    return {
-        "perturbation": row["perturbation"],
-        "condition": row["condition"],
-        "episodes": row["episodes"],
-        "baseline": f"{row['baseline']:.2f}" if known else "",
-        "candidate": f"{row['candidate']:.2f}" if known else "",
-        "difference": difference,
-        "P(improvement)": f"{row['improvement']:.2f}" if known else "",
-        "": row["verdict"],
-    }
-
-
-__all__ = ["show_measures", "show_off_policy", "show_regression"]
+__all__ = ["show_measures", "show_off_policy"]

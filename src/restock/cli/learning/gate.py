@@ -18,8 +18,8 @@ class GateCommand:
     policy that is worse by the margin in any of them passes with a probability of at most 5 %.
 
     Exits with 0 if it is shown not to be worse, with 1 if that is not shown or it is shown to be
-    worse, and with 2 if a verdict would mean nothing. Writes RUN/gate: gate.json, gate.html and the
-    episodes.
+    worse, and with 2 if a verdict would mean nothing. Writes RUN/gate: gate.json, gate.html, the
+    episodes, and junit.xml for pipelines.
 
     Example: `restock gate runs/a --baseline planner --margins success=0.05,bumps_per_km=1`
     """
@@ -45,8 +45,6 @@ class GateCommand:
     """Pairs of episodes of each condition, at most."""
     seed: int = 1_000_000
     """Seed of the first mission."""
-    junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write the verdicts as JUnit XML, for pipelines."""
     json: bool = False
     """Print the document as JSON: claim, evidence and limits."""
 
@@ -69,15 +67,10 @@ class GateCommand:
             budget=self.budget,
             first_seed=self.seed,
         )
-        if self.junit is not None:
-            from restock.files import expect_file_place
-
-            expect_file_place(self.junit, "--junit", run=self.run_path)
         with progress("driving", None) as advance:
             document = drive_gate(plan, lambda text: advance(note=text))
         page = write_gate_page(document, self.run_path / FOLDER / "gate.html")
-        if self.junit is not None:
-            write_text(self.junit, junit(document))
+        write_text(self.run_path / FOLDER / "junit.xml", junit(document))
         if self.json:
             print_json(document)
         else:

@@ -32,7 +32,6 @@ NOT_AGAIN = (
     "dry_run",
     "json",
 )  # options that stages do not depend on
-OF_ONE_ROBOT = ("urdf", "footprint", "robot")
 
 
 def fullest(document: Document) -> str | None:
@@ -71,7 +70,7 @@ def several_kinds(kinds: list[Any], requested: StartCommand) -> Stop:
     ]
     calls = []
     for kind, folder in zip(kinds, folders, strict=True):
-        options = _options(requested, but=() if folder == out else OF_ONE_ROBOT)
+        options = _options(requested, but=() if folder == out else ("urdf",))
         words = [*kind["recordings"], "--out", str(folder), *options]
         calls.append(f"restock start {shlex.join(words)}")
     return Stop(
@@ -111,11 +110,8 @@ def _proposal(out: Path) -> Document:
     return read_json(proposed) if proposed.is_file() else {}
 
 
-def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bool) -> Stop | None:
-    """Stop if the lidar sees something inside the robot's outline most of the time.
-
-    `proposed`: the profile is as it was proposed, and may be proposed again.
-    """
+def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
+    """Stop if the lidar sees something inside the robot's outline most of the time."""
     inside, task = checked.get("inside_outline"), _task(profile)
     if task is None or inside is None or inside <= INSIDE:
         return None
@@ -125,9 +121,7 @@ def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bo
         f"the robot's outline ({size}) is wrong: the lidar sees something inside it at "
         f"{inside:.0%} of the ticks",
         (
-            "measure the robot, and add --footprint LxW to this command"
-            if proposed
-            else f"measure the robot, edit length_m and width_m of [task.body] in {profile}, and "
+            f"measure the robot, edit length_m and width_m of [task.body] in {profile}, and "
             "run the same command again",
             "or add --accept to it, if the outline is right",
         ),
@@ -360,7 +354,6 @@ def robot_line(profile: Path | str | None) -> str:
 
 
 __all__ = [
-    "OF_ONE_ROBOT",
     "edited",
     "fit_is_worse",
     "floor_settings",

@@ -212,13 +212,6 @@ def driven(document: Document) -> list[str]:
                 cells.append(f"{row['condition']} {interval_text(row['success'], *ends)}")
         lines.append(f"{policy}: {', '.join(cells)}")
     lines += [clone["text"] for clone in document.get("clones", [])]
-    compared = [
-        f"{row['condition']} {_difference(row)}"
-        for row in document.get("regression", [])
-        if row["perturbation"] == "none" and row["difference"] is not None
-    ]
-    if compared:
-        lines.append(f"agent against {document['baseline']}, by episode: {', '.join(compared)}")
     return lines
 
 
@@ -226,11 +219,6 @@ def driven_on_ways(document: Document) -> list[str]:
     """Say which routes were driven, and the success of each policy there."""
     bare = {**document, "clones": []}  # the next evaluation says how good the clone is
     return [str(document["missions"]), *driven(bare)]
-
-
-def _difference(row: Mapping[str, Any]) -> str:
-    ends = row["difference_low"], row["difference_high"]
-    return f"{interval_text(row['difference'], *ends, '+.2f')} ({row['verdict']})"
 
 
 def on_logs(document: Document) -> list[str]:

@@ -476,7 +476,7 @@ def film(to: Settings) -> Stage:
         "film",
         "Film failures, and missions that only the fine-tuned policy completes",
         "Episodes of the evaluation, driven again: failing before on the left, and after.",
-        [*("eval", str(to.run), "--no-drive", "--video"), *("--policies", "agent")],
+        [*("eval", str(to.run), "--episodes", "0", "--video"), *("--policies", "agent")],
     )
 
 
@@ -490,18 +490,15 @@ def fed_uniformly(to: Settings) -> str:
     return f"run:{to.uniform}"
 
 
-def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:
-    """Evaluate in the twin; with `goal` known, also against the way the logs were driven."""
-    cloned = ["--policies", "agent,cloned,planner,random"] if goal is not None else []
+def evaluate(to: Settings, *, beside_logs: bool = False) -> Stage:
+    """Evaluate in the twin; `beside_logs` also the way the logs were driven."""
+    cloned = ["--policies", "agent,cloned,planner,random"] if beside_logs else []
     return Stage(
         "eval",
         "Evaluate on the same seeded episodes",
         "The kept checkpoint, the scripted planner and a random policy, clean and with less"
         " friction and more latency than in training.",
-        [
-            *("eval", str(to.run), "--episodes", to.of_each_kind, *cloned),
-            *(("--baseline", "cloned") if goal else ()),
-        ],
+        ["eval", str(to.run), "--episodes", to.of_each_kind, *cloned],
         outcome=outcomes.driven,
         shows_progress=True,
     )

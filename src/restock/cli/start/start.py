@@ -12,7 +12,6 @@ import tyro
 
 from restock.cli.start import stages
 from restock.cli.start.decisions import (
-    OF_ONE_ROBOT,
     edited,
     evidence_lines,
     fit_is_worse,
@@ -118,10 +117,10 @@ class Way:
         proposed = not own and not edited(to.profile, requested.out)
         if proposed:
             self._propose(requested.paths if len(readable) != 1 else (recording,))
-        elif given := [name for name in OF_ONE_ROBOT if getattr(requested, name) is not None]:
-            options, why = " and ".join(f"--{n}" for n in given), "given" if own else "edited"
+        elif requested.urdf is not None:
+            why = "given" if own else "edited"
             self._warn(
-                f"{to.profile} was {why}: {options} can only change a proposal, and has no effect"
+                f"{to.profile} was {why}: --urdf can only change a proposal, and has no effect"
             )
         others = [] if own or self.work.plan else of_other_kinds(requested.out)
         mine = [row for row in readable if row["path"] not in others]
@@ -138,7 +137,7 @@ class Way:
                 f"edit {to.profile}{known if len(readable) > 1 else ''}",
                 self.again,
             )
-        outline = wrong_outline(checked.document, to.profile, proposed=proposed)
+        outline = wrong_outline(checked.document, to.profile)
         if outline is not None and not requested.accept:
             raise Stopped(outline.why, *outline.remedies)
         if not self.work.plan:
@@ -146,10 +145,7 @@ class Way:
 
     def _propose(self, sources: tuple[str, ...]) -> None:
         requested, to = self.requested, self.to
-        flags = [] if requested.footprint is None else ["--footprint", requested.footprint]
-        flags += [] if requested.urdf is None else ["--urdf", str(requested.urdf)]
-        flags += [] if requested.robot is None else ["--robot", requested.robot]
-        flags += [ODOMETRY] * requested.odometry_as_command
+        flags = [] if requested.urdf is None else ["--urdf", str(requested.urdf)]
         flags.append("--hindsight-goals")  # without a goal there is no success to train for
         proposed = self.work.do(stages.propose(to, sources, flags, requested.urdf))
         if not proposed.good:
@@ -163,7 +159,11 @@ class Way:
                     f"edit {to.profile}, whose first lines list the topics"
                 )
             if any(ODOMETRY in problem for problem in problems):
-                reported = f"add {ODOMETRY} to this command, or {reported}"
+                reported = (
+                    f"propose it by `restock profile new {quoted(sources[0])} {ODOMETRY}"
+                    f" --hindsight-goals --out FILE.toml`, and add --profile FILE.toml to this"
+                    f" command; or {reported}"
+                )
             raise Stopped("; ".join(problems), reported, self.again)
         if requested.accept:
             return
@@ -204,10 +204,12 @@ class Way:
             return None
         floor = self.work.do(stages.floor(to))
         if not floor.good and to.map is not None:
-            sized = "measure the robot, and add --footprint LxW to this command"
+            sized = (
+                f"measure the robot, and edit length_m and width_m of [task.body] in {to.profile}"
+            )
             raise Stopped(
                 f"{to.map} cannot be the floor of these recordings",
-                *([sized] if any("--footprint" in why for why in floor.errors) else ()),
+                *([sized] if any("[task.body]" in why for why in floor.errors) else ()),
                 "give the map.yaml in which the robot was localised, or leave out --map: the "
                 "floor is then made from the recordings",
                 self.again,
@@ -279,14 +281,13 @@ class Way:
         """Evaluate in the twin and on held-out logs, and write one page."""
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
-            goal = has_goal(to.profile)
-            if goal and floor.good:
+            if floor.good and has_goal(to.profile):
                 why = None if self.work.plan else no_ways(to)
                 if why is None:
                     judged.append(do(stages.evaluate_on_ways(to)))
                 else:
                     self._warn(f"no evaluation on the routes of the logs: {why}")
-            judged.append(do(stages.evaluate(to, goal=goal)))
+            judged.append(do(stages.evaluate(to, beside_logs=True)))
         if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
             judged.append(do(stages.judge(to)))
         else:
@@ -326,15 +327,8 @@ class StartCommand:
     """The output folder: profile.toml, store, panel, run, and run/report.html."""
     profile: str | None = None
     """Use this existing profile; do not propose one."""
-    footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
-    """For the proposal: the robot's length and width in metres, for example 0.6x0.5."""
     urdf: Path | None = None
     """For the proposal: the robot's URDF. It replaces the recording's /robot_description."""
-    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """For the proposal: which robot, if the recordings are of several: its namespace, for example
-    /robot2."""
-    odometry_as_command: bool = False
-    """Let the proposal use odometry as the command if no command was recorded."""
     map: Path | None = None
     """The map.yaml in which the robot was localised, if the recordings do not contain the map."""
     salvage: bool = False
@@ -460,10 +454,6 @@ class StartCommand:
             from restock.ingest.profile.profile import load_profile
 
             load_profile(self.profile)
-        if self.footprint is not None:
-            from restock.ingest.propose.footprint import parse_footprint
-
-            parse_footprint(self.footprint)
         if self.device != "cpu":
             from restock.train.dqn.learner import open_device
 
