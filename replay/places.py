@@ -114,10 +114,8 @@ def beside_of(places: Iterable[str | Path]) -> dict[str, Path]:
 
 def kind_beside(place: str | Path) -> str | None:
     """Return whether a place is a panel or a run, by its own file."""
-    from restock.replay.panel.panel import HEADER
-
     with suppress(OSError, ValueError):  # a query is too long for a path
-        for kind, file in (("panel", HEADER), ("run", RUN_CONFIG)):
+        for kind, file in (("panel", "panel.json"), ("run", RUN_CONFIG)):
             if (Path(place) / file).is_file():
                 return kind
     return None
