@@ -27,6 +27,10 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import Gaps
+from restock.ingest.propose.robot_choice import (
+    DriveEvidence,
+    drive_evidence,
+)
 from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.signals import wrap_angle
@@ -289,6 +293,7 @@ def limit_of(settled: F64, fastest: float) -> float | None:
 
 MOSTLY, RARELY = 98, 2  # percentiles of speeds: what is beyond is an outlier
 APART = 0.25  # of the fastest command; a command that is further from every action is far off it
+SLIGHT = 0.05  # of the largest speed of commands: noise, or what was rounded
 
 
 @dataclass(frozen=True)
@@ -390,6 +395,32 @@ def commanded(
     return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
 
 
+def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[int, int]:
+    """Count the Twists that ask for motion no wheels make, and all that ask for motion.
+
+    No wheels go up and down, roll or pitch. Other types give (0, 0), and so does odometry, which
+    is measured on uneven floors.
+    """
+    topic, kind = fit
+    message = kind.fields["speed_mps"].removesuffix("linear.x")
+    leaves = [f"{message}{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
+    if is_motion(topic.type) or not set(leaves) <= set(recording.leaves(topic.name)):
+        return 0, 0
+    fields = recording.read({topic.name: leaves})[topic.name].fields
+    requested = np.abs(np.stack([np.asarray(fields[leaf], np.float64) for leaf in leaves], axis=1))
+    requested = requested[np.isfinite(requested).all(axis=1) & (requested > 0).any(axis=1)]
+    if not len(requested):
+        return 0, 0
+    least = SLIGHT * float(np.percentile(requested.max(axis=1), MOSTLY))
+    return int((requested[:, [2, 3, 4]] > least).any(axis=1).sum()), len(requested)
+
+
+def leaves_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> bool:
+    """Return whether most commands of a topic are for an arm or a drone."""
+    off, requested = off_the_floor(recording, fit)
+    return 2 * off > requested
+
+
 def settled_at_most(
     recording: Recording, roles: Roles, commands: Commands, times: Ints, speed: F64, turn: F64
 ) -> tuple[F64, F64]:
@@ -413,14 +444,25 @@ def settled_at_most(
     return found[0], found[1]
 
 
-def sharpest_steering_rad(recording: Recording, roles: Roles) -> float | None:
-    """Return the sharpest of commands that are steering angles; None if they are not."""
+def how_it_turned(
+    recording: Recording, roles: Roles, poses: PoseSeries | None
+) -> tuple[DriveEvidence, float | None]:
+    """Return how the robot turned under its Twists.
+
+    Also return the sharpest of commands that are steering angles.
+    """
     if not roles["command"]:
-        return None
+        return DriveEvidence(), None
     topic, kind = roles["command"][0]
-    if (path := kind.fields.get("steering_rad")) is None:
-        return None
-    fields = recording.read({topic.name: [path]})[topic.name].fields
-    angles = np.abs(np.asarray(fields[path], np.float64))
-    angles = angles[np.isfinite(angles)]
-    return float(np.percentile(angles, 98)) if len(angles) else 0.0
+    if (path := kind.fields.get("steering_rad")) is not None:
+        fields = recording.read({topic.name: [path]})[topic.name].fields
+        angles = np.abs(np.asarray(fields[path], np.float64))
+        angles = angles[np.isfinite(angles)]
+        return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
+    if is_motion(topic.type) or poses is None or len(poses) < 2:
+        return DriveEvidence(), None
+    _, times, speed, turn = commanded(recording, (topic, kind), None)
+    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+    seconds = (times[order] - zero) * 1e-9
+    return drive_evidence(seconds, speed[order], turn[order], since), None

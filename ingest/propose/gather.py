@@ -30,8 +30,9 @@ from restock.ingest.propose.commands import (
     CommandHold,
     Commands,
     choose_command,
+    how_it_turned,
+    leaves_the_floor,
     read_commands,
-    sharpest_steering_rad,
 )
 from restock.ingest.propose.footprint import (
     GUESS,
@@ -53,6 +54,7 @@ from restock.ingest.propose.pose_choice import (
     transform_frames,
 )
 from restock.ingest.propose.robot_choice import (
+    DriveEvidence,
     RobotProposal,
     propose_robot,
     urdf_footprint,
@@ -151,6 +153,7 @@ class Evidence:
     commands: Commands
     chosen: CommandChoice
     hold: CommandHold
+    turned: DriveEvidence  # whether it steers as a car, if nothing describes it
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
@@ -190,6 +193,8 @@ def gather(
     if not roles["command"] and odometry_as_command:
         roles["command"] = fitting(ODOMETRY_AS_COMMAND)
     else:
+        if len(roles["command"]) > 1:  # an arm on the robot may have its own
+            roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
         roles["command"], chosen = choose_command(recording, roles["command"])
     driven = {topic.name for topic, _ in roles["command"][:1]}
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
@@ -231,8 +236,8 @@ def gather(
         upside_down=footprint.upside_down,
         lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
     )
-    if (sharpest_rad := sharpest_steering_rad(recording, roles)) is not None:
-        robot = robot.steered(footprint.length_m, sharpest_rad)
+    turned, command_rad = how_it_turned(recording, roles, poses)
+    robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
     if wheelbase_m is not None and robot.described:
@@ -253,6 +258,7 @@ def gather(
         commands,
         chosen,
         hold,
+        turned,
         paces,
         choose_clock(
             recording,

@@ -8,14 +8,18 @@ each guess, and with all that might become custom signals, commented out.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.propose.clock_choice import by_log_time
+from restock.ingest.propose.commands import off_the_floor
 from restock.ingest.propose.footprint import UPSIDE_DOWN, Footprint
 from restock.ingest.propose.gather import Evidence, GoalChoice, gather, without_first
 from restock.ingest.propose.proposal_lines import (
@@ -26,6 +30,7 @@ from restock.ingest.propose.proposal_lines import (
 )
 from restock.ingest.propose.roles import (
     REQUIRED,
+    Kind,
     clouds_alone,
     robots_in,
     several_commands,
@@ -71,6 +76,7 @@ class Proposal:
     commands: list[str] = field(default_factory=list)  # topics, if several may drive the robot
     kinds: list[RobotKind] = field(default_factory=list)  # if there are several: its own first
     findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
+    wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 
 def propose_profile(
@@ -121,7 +127,10 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         if role == "command" and seen.roles["wheels"]:
             remedy += INSTEAD_OF_COMMANDS
         problems.append(f"no topic for {role}, which every profile needs: {remedy}")
-    if seen.motion is not None and seen.motion.problem:
+    located = "pose" not in missing
+    if other := no_wheeled_robot(recording, seen.roles["command"], located=located):
+        problems = [other]
+    elif seen.motion is not None and seen.motion.problem:
         problems.append(seen.motion.problem)
     text = "\n".join(profile_lines(seen, name, problems))
     trial = Trial()
@@ -144,6 +153,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs", in_one_recording(robots)))
     if steered := steered_by(seen):
         advice.append(Advice("inputs.command", steered))
+    if seen.robot.guessed_steering and not seen.commands.steered:
+        advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
     advice += _odd_commands(seen)
     advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
     if seen.origin_m is not None:
@@ -166,6 +177,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         *(trial.ticks, trial.transitions, problems, advice),
         several_commands(recording),
         findings=trial.findings,
+        wheeled=other is None,
     )
 
 
@@ -242,3 +254,47 @@ def tried(recording: Recording, toml: str) -> Trial:
         return try_profile(profile, read_topics(recording, profile))
     except (ConfigError, RecordingError) as error:
         return Trial(problem=error.what)
+
+
+DRONES = ("mavros_msgs/", "px4_msgs/", "mav_msgs/", "ardupilot_msgs/", "crazyflie_interfaces/")
+MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
+ARMS = ("trajectory_msgs/msg/JointTrajectory", "control_msgs/", "moveit_msgs/")
+CAMERAS = re.compile(r"sensor_msgs/msg/(Image|CompressedImage|CameraInfo|PointCloud2?)$")
+ALONGSIDE = re.compile(r"tf2_msgs/|rcl_interfaces/|rosgraph_msgs/|std_msgs/|diagnostic_msgs/")
+ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its velocity commands"
+
+
+def no_wheeled_robot(
+    recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
+) -> str | None:
+    """Say what a recording is taken for that is not of a robot on wheels, and what to do.
+
+    Else None.
+
+    `command` are the topics that may drive it, `located` whether anything says where it is.
+    """
+    types = {topic.type for topic in recording.topics.values() if topic.expected}
+    flying = sorted({t.split("/")[0] for t in types if t.startswith(DRONES) or t == MULTI_DOF})
+    if not (command and located) and flying:
+        reported = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
+        return f"this looks like a drone's recording (it has {reported}): {ON_WHEELS}"
+    if command:
+        off, requested = off_the_floor(recording, command[0])
+        if 2 * off <= requested:
+            return None
+        return (
+            f"this looks like a robot arm's or a drone's recording ({off:,} of the {requested:,} "
+            f"commands to move of {command[0][0].name} have linear.z, angular.x or angular.y): "
+            f"{ON_WHEELS}"
+        )
+    arm = sorted(t for t in types if t.startswith(ARMS))
+    if arm and not located:
+        reported = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
+        return f"this looks like a robot arm's recording ({reported}): {ON_WHEELS}"
+    rest = [t for t in types if not CAMERAS.search(t) and not ALONGSIDE.match(t)]
+    if types and not rest and any(CAMERAS.search(t) for t in types):
+        return (
+            "this looks like a recording of sensors alone (it has images or point clouds, but no "
+            "velocity command and no odometry): also record the command and a pose"
+        )
+    return None

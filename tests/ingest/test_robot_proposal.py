@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import Drive, columns, typed_topics, write_topics
-from support.paths import SHARED
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
@@ -21,8 +20,6 @@ from restock.ingest.propose.footprint import footprint_of
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import propose_robot
 from restock.ingest.propose.roles import robots_in
-
-RACECAR = SHARED / "robots/racecar-ackermann/BIGPATH.bag"
 
 
 def link(name: str, shape: str = "", mass: float = 0.0) -> str:
@@ -272,14 +269,3 @@ def test_a_file_that_is_no_robot_is_refused(bag, tmp_path):
             propose_profile(recording, "mine", urdf=path)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_urdf(tmp_path / "none.urdf")
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not RACECAR.exists(), reason="../shared/bags is absent")
-def test_commands_that_are_steering_angles_show_a_car() -> None:
-    with open_recording(RACECAR) as recording:
-        profile = parse_profile(propose_profile(recording, "car").toml, where="the proposal")
-    assert profile.robot is not None
-    assert (profile.robot.drive, profile.robot.origin_of("drive")) == ("ackermann", "logs")
-    # No action that it cannot drive: as a differential robot's it turned on the spot in the twin.
-    assert all(speed or not turn for speed, turn in profile.task.actions)

@@ -76,7 +76,7 @@ class ProfileCommand:
     """Also read what is intact in damaged or truncated files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice", "commands", "kinds", "read" (first the one it
+    "problems", "advice", "commands", "kinds", "wheeled", "read" (first the one it
     was proposed from), "unread", "unreadable", "losses"}; `check`: {"inputs", "problems", "advice",
     "inside_outline", "outcome", …}."""
 
@@ -148,6 +148,7 @@ class ProfileCommand:
                     "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
                     "commands": proposal.commands,
                     "kinds": [asdict(kind) for kind in proposal.kinds],
+                    "wheeled": proposal.wheeled,
                     "read": [str(path) for path in chosen],
                     "unread": [str(path) for path in unread],
                     "unreadable": [str(path) for path in unreadable],

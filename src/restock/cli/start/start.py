@@ -151,6 +151,9 @@ class Way:
         if not proposed.good:
             raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
         document = proposed.document
+        if not document.get("wheeled", True):
+            Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
+            raise Stopped("; ".join(document["problems"]), "give recordings of a robot on wheels")
         if problems := document.get("problems"):
             reported = f"edit {to.profile}: its first lines list what is missing"
             if document.get("missing"):

@@ -1,0 +1,175 @@
+"""Robots that nothing describes: whether they steer as a car, by how they turned."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import columns, write_topics
+from support.long import one_in
+from support.paths import SHARED
+from twin.test_robot_drives import CAR, MECANUM, OUTLINE
+
+from restock.cli import main
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.propose.robot_choice import DriveEvidence, drive_evidence
+from restock.ingest.steps.frames import PoseSeries
+from restock.ingest.task.robot import Robot
+from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Task
+from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
+from restock.train.twin.physics.model import robot_model
+from restock.train.twin.physics.perturbation import Perturbation
+
+PERIOD_S, STEPS = 0.2, 240
+SPEEDS, TURNS = (0.2, 0.4, 0.8, -0.4), (0.0, 0.0, 0.6, 1.2, -0.6, -1.2)
+ROBOTS = {
+    "differential": (Robot(wheel_radius_m=0.1, track_m=0.4, mass_kg=30.0), Body(0.6, 0.5)),
+    "skid-steer": (
+        Robot(drive="skid_steer", wheel_radius_m=0.1, track_m=0.4, wheelbase_m=0.4, mass_kg=40.0),
+        Body(0.7, 0.5),
+    ),
+    "mecanum": (MECANUM, Body(0.6, 0.5)),
+    "ackermann": (CAR, OUTLINE),
+}
+
+
+def commands(seed: int, *, spot: bool) -> Any:
+    """(T, 2) as of a person with a remote: each held for .6 to 3 s; with turns on the spot."""
+    rng, held = np.random.default_rng(seed), []
+    if spot:
+        held += [(0.0, 1.2)] * 10 + [(0.4, 0.0)] * 10 + [(0.0, -1.2)] * 10
+    while len(held) < STEPS:
+        held += [(rng.choice(SPEEDS), rng.choice(TURNS))] * rng.integers(3, 16)
+    return np.array(held[:STEPS])
+
+
+def shown(name: str, seed: int, *, spot: bool) -> DriveEvidence:
+    """Return what such a drive of the twin's robot shows, by a localiser's poses."""
+    robot, body = ROBOTS[name]
+    reported = commands(seed, spot=spot)
+    still = (
+        *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
+        *("localised_speed_mps", "localised_lateral_mps"),
+    )
+    start = OpenLoopStart(np.zeros((1, 3)), dict.fromkeys(still, np.zeros(1)), reported[None])
+    task = Task(body=body, actions=((0.0, 0.0), (0.4, 0.0)))
+    driven = drive_open_loop(task, start, [Perturbation()], robot=robot_model(robot, body))
+    poses = driven.pose[0, 0] + np.random.default_rng(seed).normal(0, 0.005, (STEPS + 1, 3))
+    at_ns = (np.arange(STEPS + 1) * PERIOD_S * 1e9).astype(np.int64)
+    return drive_evidence(np.arange(STEPS) * PERIOD_S, *reported.T, PoseSeries(at_ns, *poses.T))
+
+
+@pytest.mark.parametrize("seed", one_in(2, range(2)))
+@pytest.mark.parametrize("name", ROBOTS)
+def test_drives_of_the_twin_tell_a_robot_that_steers(name: str, seed: int) -> None:
+    found = shown(name, seed, spot=True)
+    assert (found.steers, found.pivots) == (name == "ackermann", name != "ackermann")
+    if found.steers:
+        assert "commanded to turn on the spot, by" in found.why
+
+
+@pytest.mark.parametrize("seed", one_in(2, range(2)))
+@pytest.mark.parametrize("name", ROBOTS)
+def test_never_told_to_turn_on_the_spot_is_no_car(name: str, seed: int) -> None:
+    found = shown(name, seed, spot=False)
+    assert not found.pivots
+    assert not found.steers or name == "ackermann"
+    if not found.steers:
+        assert "never turned on the spot, and was never commanded to" in found.why
+
+
+def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
+    """One message that was logged before the clock was set; 0.1 s at a time it is a long way."""
+    at_s, years_s = np.arange(0, 60, PERIOD_S), 50 * 365 * 86_400.0
+    reported, turn_radps = at_s[:-1], np.where(at_s[:-1] % 20 < 10, 0.5, 0.0)
+    yaw = np.concatenate([[0.0], np.cumsum(turn_radps * PERIOD_S)])
+
+    def evidence(stray: bool) -> DriveEvidence:
+        shift_s = years_s if stray else 0.0
+        stamps = np.concatenate([[0] * stray, ((at_s + shift_s) * 1e9)]).astype(np.int64)
+        still = np.zeros(len(stamps))
+        poses = PoseSeries(stamps, still, still, np.concatenate([[0.0] * stray, yaw]))
+        return drive_evidence(reported + shift_s, np.zeros(len(reported)), turn_radps, poses)
+
+    assert evidence(stray=False).pivots
+    for field, value in dataclasses.asdict(evidence(stray=True)).items():
+        assert value == pytest.approx(getattr(evidence(stray=False), field), abs=0.01), field
+
+
+def test_drives_of_one_robot_are_judged_together() -> None:
+    one = DriveEvidence(driven_m=2.0, requested_rad=1.2, spells=1)
+    assert not one.steers
+    assert DriveEvidence.joined([one, one]).steers
+    turned = DriveEvidence(pivoted_rad=3.0)
+    assert DriveEvidence.joined([one, one, turned]).pivots
+
+
+def bag(folder: Path, *, pivots: bool) -> Path:
+    """20 s: ahead, and told twice to turn on the spot."""
+    time_s = np.arange(0, 20, 0.05)
+    spot = (time_s % 10 > 4) & (time_s % 10 < 8)
+    speed, turn = np.where(spot, 0.0, 0.4), np.where(spot, 0.8, 0.0)
+    rate = turn * pivots
+    yaw = np.cumsum(rate) * 0.05
+    at = {
+        "pose.pose.position.x": np.cumsum(speed * np.cos(yaw)) * 0.05,
+        "pose.pose.position.y": np.cumsum(speed * np.sin(yaw)) * 0.05,
+        "pose.pose.orientation.z": np.sin(yaw / 2),
+        "pose.pose.orientation.w": np.cos(yaw / 2),
+        "twist.twist.linear.x": speed,
+        "twist.twist.angular.z": rate,
+    }
+    command = {"linear.x": speed, "angular.z": turn}
+    return write_topics(
+        {
+            "/odom": ("nav_msgs/msg/Odometry", columns(time_s, at)),
+            "/cmd_vel": ("geometry_msgs/msg/Twist", columns(time_s, command, stamped=False)),
+        },
+        folder,
+    )
+
+
+def test_a_proposal_names_a_robot_that_steers_with_its_evidence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "car.toml"
+    source = bag(tmp_path / "bag", pivots=False)
+    assert main(["profile", "new", str(source), "--out", str(file), "--json"]) == 0
+    advice = {one["key"]: one["text"] for one in json.loads(capsys.readouterr().out)["advice"]}
+    assert (
+        "it seems to steer like a car: commanded to turn on the spot, by 6.3"
+        in advice["robot.drive"]
+    )
+    assert "# CONFIRM THAT IT STEERS LIKE A CAR" in file.read_text()
+    assert "angular.z is read as a yaw rate" in advice["inputs.command"]
+    profile = load_profile(file)
+    assert profile.robot is not None
+    assert profile.robot.drive == "ackermann"
+    assert profile.robot.origin_of("drive") == "logs"
+    assert all(speed or not turn for speed, turn in profile.task.actions)
+
+
+REAL = {
+    "jetacker": "CONFIRM THAT IT STEERS LIKE A CAR: commanded to turn on the spot",
+    "robots/racecar-ackermann/BIGPATH.bag": "its commands are steering angles",
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", REAL)
+def test_real_robots_that_steer_are_taken_as_such(name: str, tmp_path: Path) -> None:
+    if not (SHARED / name).exists():
+        pytest.skip(f"no shared bags: {name}")
+    file = tmp_path / "car.toml"
+    assert main(["profile", "new", str(SHARED / name), "--out", str(file)]) == 0
+    assert REAL[name] in " ".join(file.read_text().split("\n# "))
+    profile = load_profile(file)
+    assert profile.robot is not None
+    assert profile.robot.drive == "ackermann"
+    # No action that it cannot drive: as a differential robot's it turned on the spot in the twin.
+    assert all(speed or not turn for speed, turn in profile.task.actions)
