@@ -319,12 +319,12 @@ def _follow(session: Session, phase: str, notify: Notify) -> None:
 
 
 def _conservative_weight(session: Session, phase: str) -> float:
-    """Return the CQL term's weight: constant offline, then linear to its online end."""
+    """Return the CQL term's weight: constant offline, then linear to 0."""
     loss, progress = session.config.loss, session.progress
     if phase == "offline" or progress.online_from is None:
         return loss.conservative
     part = min((progress.env_steps - progress.online_from) / _CONSERVATIVE_STEPS, 1.0)
-    return loss.conservative + part * (loss.conservative_online - loss.conservative)
+    return loss.conservative * (1 - part)
 
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:

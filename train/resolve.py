@@ -167,7 +167,7 @@ def row_bytes(observation_size: int) -> int:
     return row_width(observation_size) * 4 + meta + _SLOT_BYTES
 
 
-_NATURAL = ("floor", "warmup_episodes")
+_NATURAL = ("floor",)
 _CRITICS = 6  # copies of the network: online, target, averaged, a gradient, Adam's two
 
 

@@ -117,7 +117,7 @@ class Session(Stateful):
     events: Events
     probe: Probe | None
     exploration: np.random.Generator
-    executor: ThreadPoolExecutor | None
+    executor: ThreadPoolExecutor
     logs: Logs | None
     log_terms: LogTerms
     practice: Practice
@@ -251,8 +251,7 @@ class Session(Stateful):
 
     def close(self) -> None:
         """Release the thread, the event files and the run."""
-        if self.executor is not None:
-            self.executor.shutdown()
+        self.executor.shutdown()
         self.events.close()
         if self.lock is not None:
             self.lock.release()
@@ -326,7 +325,7 @@ def open_session(
         seed=seed,
         fresh=None if strata is None else strata.known,
     )
-    executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
+    executor = ThreadPoolExecutor(1, "twin")
     collector = Collector(env, ring, conditions, task, executor, teacher, strata)
     fidelity = LogFidelity.of(logs, task.observation_size) if logs is not None else None
     session = Session(

@@ -25,7 +25,7 @@ def main(steps: int = 200_000, num_envs: int = 32, seed: int = 0) -> dict:
         env,
         policy_kwargs={"net_arch": [256, 256]},  # network.hidden
         learning_rate=1e-3,  # optimizer.learning_rate
-        max_grad_norm=float("inf"),  # optimizer.max_grad_norm: none
+        max_grad_norm=float("inf"),  # Restock clips none
         gamma=0.99,  # loss.discount
         n_steps=3,  # loss.n_step
         buffer_size=100_000,  # replay.ring_capacity

@@ -46,8 +46,7 @@ class MissionsFile(Checked, frozen=True, kw_only=True):
 
     missions: tuple[MissionOrder, ...]
     format: str = FORMAT
-    store: str = ""
-    store_version: int = -1  # -1: there is no store
+    store: str = ""  # STORE@VERSION
     mixture: str = ""
 
     def check(self) -> None:
@@ -69,8 +68,8 @@ def read_missions(path: str | Path) -> MissionsFile:
     )
 
 
-def of_list(found: ShoppingList, *, store: str, store_version: int, mixture: str) -> MissionsFile:
-    """Return the plan of a shopping list.
+def of_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:
+    """Return the plan of a shopping list for `store`, named as STORE@VERSION.
 
     Raises:
         ConfigError: it plans nothing: there are no gaps, or none that anything seen so far fills.
@@ -93,9 +92,7 @@ def of_list(found: ShoppingList, *, store: str, store_version: int, mixture: str
         )
         for order in found.orders
     ]
-    return MissionsFile(
-        missions=tuple(orders), store=store, store_version=store_version, mixture=mixture
-    )
+    return MissionsFile(missions=tuple(orders), store=store, mixture=mixture)
 
 
 def refuse_existing(path: Path) -> None:
@@ -122,7 +119,6 @@ def as_toml(missions: MissionsFile) -> str:
         f"# What to log next, as `restock coverage gaps` planned it; {how}.",
         f"format = {toml_value(missions.format)}",
         f"store = {toml_value(missions.store)}",
-        f"store_version = {missions.store_version}",
         f"mixture = {toml_value(missions.mixture)}",
     ]
     for order in missions.missions:

@@ -129,9 +129,8 @@ class OtherStore(Checked, frozen=True):
     """One more store that batches are drawn from, with the same strata and shares of its own."""
 
     name: str  # its strata are named `name/stratum`
-    path: str  # absolute, or relative to the mixture's file
+    path: str  # absolute, or relative to the mixture's file; PATH@VERSION: not the newest
     share: Portion  # share of a batch
-    version: int | None = None  # version of the store; None: the newest
     # What its rows stand for: how often things occur, the main store's rates, or these.
     represents: Represents | None = None
 

@@ -124,7 +124,7 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
         if not path.is_absolute() and folder is not None:
             path = folder / path
     try:
-        store = Store(path, version=wanted.version)
+        store = Store(path)
         store.verify()
         return store
     except StoreError as error:

@@ -144,8 +144,7 @@ OTHERS = """
 logs = 0.4
 [[sources.stores]]
 name = "twin"
-path = "other"
-version = 1
+path = "other@1"
 share = 0.2
 [evaluation_split]
 by = "none"
@@ -165,7 +164,7 @@ def test_a_store_whose_rows_are_all_in_the_first_one_is_named(tmp_path, store_pa
     rows = recording_transitions(3)
     write_store(tmp_path / "other", [rows])
     mixture = tmp_path / "m.toml"
-    mixture.write_text(OTHERS.replace("version = 1\n", "") + EVERY)
+    mixture.write_text(OTHERS.replace("@1", "") + EVERY)
     assert cli.main(["mix", str(store_path), "--mixture", str(mixture), "--dry-run"]) == 2
     said = capsys.readouterr().err
     assert f"all {len(rows)} rows of 'twin' are also in the main store" in said
@@ -204,7 +203,7 @@ def test_another_store_is_drawn_from_at_its_pinned_version(two_stores, store_pat
 def test_a_run_draws_from_both_stores_by_their_schedules(two_stores, store_path):
     share = "{schedule = 'linear', start = 0.0, end = 0.4, to_env_steps = 1000}"
     text = OTHERS.replace("share = 0.2", f"share = {share}").replace(
-        '"other"', f'"{two_stores}/other"'
+        '"other@1"', f'"{two_stores}/other@1"'
     )
     panel = panel_of(store_path, text + EVERY, two_stores / "p")
     controller = controller_for(panel, PlannedDraws(640, 6400, 0, 1000), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from concurrent.futures import Executor, Future
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -86,8 +87,20 @@ def one_stratum(shelf: Logs, **changes: Any) -> Logs:
     return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
 
 
-def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_path: Path) -> None:
-    assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config(env={"overlap": False})))
+class AtOnce(Executor):
+    """An executor that runs what it is given, in the thread that gives it."""
+
+    def submit(self, work: Any, /, *args: Any, **named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(work(*args, **named))
+        return future
+
+
+def test_simulating_on_another_thread_changes_nothing(
+    undisturbed: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("restock.train.session.ThreadPoolExecutor", lambda *_: AtOnce())
+    assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config()))
 
 
 def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
@@ -341,10 +354,13 @@ def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
     assert undisturbed.learner.gradient_steps == 60 + progress.online_updates
 
 
-def test_the_policy_that_is_kept_is_an_average_of_the_weights() -> None:
+def test_the_policy_that_is_kept_is_an_average_of_the_weights(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rows = logs().rows[:32].clone()
     for rate in (1.0, 0.25):
-        learner = Learner(config(evaluation={"averaging": rate}), TASK.observation_size, 3)
+        monkeypatch.setattr("restock.train.dqn.network.AVERAGING", rate)
+        learner = Learner(config(), TASK.observation_size, 3)
         seen = []
         for _ in range(6):
             learner.update(rows)

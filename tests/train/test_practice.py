@@ -89,7 +89,7 @@ def test_success_practises_what_fails_once_it_is_believed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(practice_module, "MAX_CHANGE", 1.0)
-    found = practice(rule="success", warmup_episodes=4, floor=0.1)
+    found = practice(rule="success", floor=0.1)
     np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
     found.note(ended("nominal", True, 50) + ended("wheel_slip", False, 50))
     found.note(ended("blocked_aisle", True, 3, "partial"))  # too few to be believed
@@ -106,7 +106,7 @@ def test_success_practises_what_fails_once_it_is_believed(
 
 def test_an_arm_with_too_few_missions_goes_by_its_kind() -> None:
     arms = [MissionArm(f"slip on {x}", "wheel_slip", 0.1, layout=f"{x}") for x in range(9)]
-    found = practice([*arms, ARMS[0]], rule="success", warmup_episodes=4, floor=0.0)
+    found = practice([*arms, ARMS[0]], rule="success", floor=0.0)
     slip = replace(ended("wheel_slip", True)[0], layout="0")
     found.note([slip, replace(slip, layout="1", success=False), *[replace(slip, layout="2")] * 6])
     rates = found.failure_rate
@@ -125,12 +125,12 @@ def test_old_episodes_fade_by_their_half_life() -> None:
 
 def test_shares_move_at_interval_ends_within_the_limit() -> None:
     reported: list[list[float]] = []
-    settings = PracticeConfig(rule="success", every_env_steps=100)
+    settings = PracticeConfig(rule="success")
     found = Practice(settings, ARMS, reported.append)
     found.note(ended("nominal", True, 30))
-    assert found.advance(at(99)) == []
-    found.advance(at(100))
-    found.advance(at(250))
+    assert found.advance(at(999)) == []
+    found.advance(at(1000))
+    found.advance(at(2500))
     assert len(reported) == 3  # at first, and twice after
     steps = np.abs(np.diff(reported, axis=0)).max(axis=1)
     assert steps[0] == pytest.approx(MAX_CHANGE)
@@ -148,13 +148,13 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
 
 
 def test_a_run_too_short_for_its_shares_to_move_says_so() -> None:
-    moving = parse_config({"practice": {"rule": "success", "warmup_episodes": 9}}, where="here")
+    moving = parse_config({"practice": {"rule": "success"}}, where="here")
     first = [{"arm": arm, "wanted_share": 0.5} for arm in ("nominal", "wheel_slip")]
     for practised in ([], first, first * 2):
         said = unmoved(practised, moving)
         assert said is not None
-        assert "practice.every_env_steps=1,000" in said
-        assert "practice.warmup_episodes=9" in said
+        assert "every 1,000 steps" in said
+        assert "5 missions have ended" in said
     then = [{"arm": "nominal", "wanted_share": 0.4}, {"arm": "wheel_slip", "wanted_share": 0.6}]
     assert unmoved(first + then, moving) is None
     assert unmoved(first, parse_config({"practice": {"rule": "even"}}, where="here")) is None
@@ -196,7 +196,7 @@ class KindsToy(ToyTwin):
         self._shares = np.array(list(conditions.values()))
 
 
-PRACTICE = {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2}
+PRACTICE = {"rule": "success"}
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
         Walker,
     ),
     "practice": (
-        {"practice": {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2}},
+        {"practice": {"rule": "success"}},
         None,
         lambda: None,
     ),
@@ -103,7 +103,11 @@ def interrupted(live: Session, stop: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_cut_run_ends_as_an_undisturbed_one(case: str, tmp_path: Path) -> None:
+def test_a_cut_run_ends_as_an_undisturbed_one(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("restock.train.feed.practice.INTERVAL_STEPS", 100)
+    monkeypatch.setattr("restock.train.feed.practice.WARMUP_EPISODES", 2)
     changes, make_logs, teacher = CASES[case]
     settings = config(**{**changes, "schedule": SHORT})
     logs = {} if make_logs is None else {"logs": make_logs(tmp_path)}

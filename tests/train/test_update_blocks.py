@@ -56,7 +56,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "default": {},
     "every term": {
         "loss": {"conservative": 0.5, "margin": 0.5, "margin_policies": ["operator"]},
-        "optimizer": {"learning_rate": 3e-3, "max_grad_norm": 0.1},
+        "optimizer": {"learning_rate": 3e-3},
         "target": {"rule": "hard", "every": 13},
     },
     "teacher": {"teacher": {"source": "logs", "offline_updates": 20}},

@@ -104,7 +104,6 @@ class Behaviour(Stateful):
     """G with its optimizer and the current ratio. `average` is the G that is evaluated and kept.
 
     Args:
-        averaging: the rate of the average of weights, as of Q's.
         path: how its network is differentiated.
     """
 
@@ -117,11 +116,10 @@ class Behaviour(Stateful):
         actions: int,
         *,
         seed: int,
-        averaging: float,
         device: torch.device,
         path: UpdatePath,
     ) -> None:
-        self.config, self._averaging = config, averaging
+        self.config = config
         generator = torch.Generator().manual_seed(_SEED + seed)
         self.network = make_behaviour(observation_size, actions, generator).to(device)
         self.average = clone(self.network)
@@ -151,16 +149,12 @@ class Behaviour(Stateful):
         device = self.ratio.device
         self._fill_gradient(Labelled(labelled.observation.to(device), labelled.action.to(device)))
         self.updates += 1
-        self.optimizer.step(self._slow, self.averaging_rate(self.updates))
+        self.optimizer.step(self._slow, averaging_rate(self.updates))
 
     def move(self, labelled: Labelled, rate: Tensor) -> None:
         """Make one gradient step on the device alone; the caller keeps the counts."""
         self._fill_gradient(labelled)
         self.optimizer.move(self._slow, rate)
-
-    def averaging_rate(self, update: int) -> float:
-        """Return the rate of the average at update number `update` (from 1)."""
-        return averaging_rate(self._averaging, update)
 
     def count(self, updates: int) -> None:
         """Count updates that were made by `move`."""

@@ -51,8 +51,8 @@ class LossConfig(Checked, frozen=True):
     n_step: Count = 3  # steps of fresh rows' returns; the panel has its own
     double: bool = True
     huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
-    conservative: NonNegative = 0.1  # weight of the CQL term on rows from logs, while offline
-    conservative_online: NonNegative = 0.0  # weight that it changes to, linearly, when online
+    # Weight of the CQL term on rows from logs, while offline; online it falls to 0, linearly.
+    conservative: NonNegative = 0.1
     margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
     margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin
 
@@ -95,7 +95,6 @@ def describe(rule: TargetRule) -> dict[str, Any]:
 
 class OptimizerConfig(Checked, frozen=True):
     learning_rate: Positive = 1e-3
-    max_grad_norm: Positive | None = None  # None: no clipping (Huber bounds each row's gradient)
 
 
 class ReplayConfig(Checked, frozen=True):
@@ -175,7 +174,6 @@ class EnvConfig(Checked, frozen=True):
     # A missions file, or its [[missions]]: that part of the episodes is of those; docs/train.md.
     missions: str | tuple[MissionOrder, ...] | None = None
     missions_share: Share = 0.5
-    overlap: bool = True  # simulate and learn on two threads; same result
     layouts: str = "default"  # floors: generated:train, FILE.toml, map.yaml; docs/layouts.md
     # A ready-made one's name, a TOML file, or its table; of a schedule, one drawn an episode.
     perturbation: str | dict[str, Any] = "nominal"
@@ -194,16 +192,12 @@ class PracticeConfig(Checked, frozen=True):
     # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
     by: tuple[str, ...] = ("block",)
     floor: Share | None = None  # least share of an arm; None: FLOOR if shares move, else 0
-    every_env_steps: Count = 1_000  # length of an interval of practice
-    warmup_episodes: NonNegativeInt = 5  # episodes of an arm before its rate is used
 
 
 class EvaluationConfig(Checked, frozen=True):
     every_env_steps: Count = 20_000
     episodes: Count = 10  # episodes per condition
     seed: Seed = 90_000  # seed of the first fixed episode; not used in training
-    # Rate of the average of weights that is evaluated; 1: the last ones.
-    averaging: Annotated[float, Meta(gt=0, le=1)] = 0.001
     layouts: str | None = None  # None: env.layouts (generated:train: its validation floors)
     # Where the fixed episodes start and end: by their seeds, or as the logged episodes that the
     # panel holds out (all of them) did, each way at most once.

@@ -82,13 +82,11 @@ class Learner(Stateful):
         self.optimizer = FlatAdam(
             self.network,
             config.optimizer.learning_rate,
-            config.optimizer.max_grad_norm,
             compiled=self.path == "native",
         )
         self._policy = FlatParameters(self.policy_network, learns=False).values
         self._slow = FlatParameters(self.target_network, learns=False).values
         self.target = TargetUpdate(config.target, [self.optimizer.values], [self._slow])
-        self.averaging = config.evaluation.averaging
         learns = self.optimizer
         # What the loss is computed with: the networks, or kernels that do the same.
         self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
@@ -103,7 +101,6 @@ class Learner(Stateful):
                 observation_size,
                 actions,
                 seed=config.seed,
-                averaging=self.averaging,
                 device=self.device,
                 path=self.path,
             )
@@ -135,7 +132,7 @@ class Learner(Stateful):
         loss = self._fill_gradient(rows, terms)
         self.gradient_steps += 1
         # `policy_network`, the one that is evaluated and kept, follows as an average of weights.
-        self.optimizer.step(self._policy, self.averaging_rate(self.gradient_steps))
+        self.optimizer.step(self._policy, averaging_rate(self.gradient_steps))
         if self.behaviour is not None and labelled is not None:
             self.behaviour.learn(labelled)
         return loss
@@ -169,10 +166,6 @@ class Learner(Stateful):
             self.behaviour.count(updates)
         if isinstance(self.target.rule, Polyak):
             self.target.last_sync = self.gradient_steps
-
-    def averaging_rate(self, update: int) -> float:
-        """Return the rate of the average of weights at update number `update` (from 1)."""
-        return averaging_rate(self.averaging, update)
 
     @property
     def moved(self) -> list[Tensor]:

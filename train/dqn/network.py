@@ -255,14 +255,17 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
 _BETAS, _EPS = (0.9, 0.999), 1e-8  # Adam's
 
 
-def averaging_rate(rate: float, steps: int) -> float:
+AVERAGING = 0.001  # rate of the average of weights that is evaluated and kept
+
+
+def averaging_rate(steps: int) -> float:
     """Return the rate of an average of weights at step number `steps` (from 1).
 
     The greedy policy of a single update is noisy: a small change of values turns over many
-    actions at once. The average over the last 1 / rate updates is not (Polyak and Juditsky 1992).
-    Until there are as many, it is the mean of all of them.
+    actions at once. The average over the last 1 / AVERAGING updates is not (Polyak and Juditsky
+    1992). Until there are as many, it is the mean of all of them.
     """
-    return max(rate, 1.0 / steps)
+    return max(AVERAGING, 1.0 / steps)
 
 
 class FlatAdam(Stateful):
@@ -274,7 +277,6 @@ class FlatAdam(Stateful):
     Args:
         network: whose parameters are moved into `values`, their gradients into `gradient`.
         learning_rate: Adam's.
-        max_grad_norm: to which a longer gradient is cut; None: never.
         compiled: by the compiled step, to the same bits: one pass over memory, the average's too.
     """
 
@@ -284,14 +286,12 @@ class FlatAdam(Stateful):
         self,
         network: nn.Module,
         learning_rate: float,
-        max_grad_norm: float | None = None,
         *,
         compiled: bool = False,
     ) -> None:
         self._flat = FlatParameters(network, learns=True)
         self.values, self.gradient = self._flat.values, self._flat.gradient
-        self.learning_rate, self.max_grad_norm = learning_rate, max_grad_norm
-        self._compiled = compiled
+        self.learning_rate, self._compiled = learning_rate, compiled
         # Written in place from here on: a CUDA graph keeps hold of them.
         self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
         # What `adam` moves, and counts in tensors: all as one, and on a GPU in slices.
@@ -309,7 +309,6 @@ class FlatAdam(Stateful):
         if not self._compiled:
             self.move(average, rate)
             return
-        self._clip()
         self._compiled_step(average, rate)
 
     def count(self, steps: int) -> None:
@@ -319,7 +318,6 @@ class FlatAdam(Stateful):
     @torch.no_grad()
     def move(self, average: Tensor | None, rate: float | Tensor) -> None:
         """Step by operations on the device alone, which a CUDA graph can repeat."""
-        self._clip()
         values, gradient, moved, squares = self._moved
         adam(
             *(values, gradient, moved, squares, [], list(self._step.unbind())),
@@ -334,10 +332,6 @@ class FlatAdam(Stateful):
         )
         if average is not None:
             average.lerp_(self.values, rate)
-
-    def _clip(self) -> None:
-        if self.max_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_([self.values], self.max_grad_norm)
 
     def _compiled_step(self, average: Tensor | None, rate: float) -> None:
         self._step.fill_(self._steps)

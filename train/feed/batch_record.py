@@ -430,8 +430,7 @@ LEAVE_OUT = (
     "mixture's `where`, mix again and train again"
 )
 TRAIN_SLOWER = (
-    "train with a lower optimizer.learning_rate, or a smaller optimizer.max_grad_norm; "
-    "checkpoints and tables up to here are valid"
+    "train with a lower optimizer.learning_rate; checkpoints and tables up to here are valid"
 )
 
 

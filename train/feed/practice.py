@@ -43,6 +43,8 @@ FLOOR = 0.05  # of an arm under the rule "success", unless the config says other
 WHERE = "practice"
 HALF_LIFE_EPISODES = 20.0  # an arm's episode that is this old counts half
 MAX_CHANGE = 0.1  # of a share per interval
+INTERVAL_STEPS = 1_000  # environment steps after which shares may move
+WARMUP_EPISODES = 5  # of an arm, before its own rate is used
 
 
 class Practice(Stateful):
@@ -141,7 +143,7 @@ class Practice(Stateful):
         Call while no step of the twin is out. `last`: the run ends here, in whatever interval.
         """
         env_steps = steps["env_steps"]
-        due = env_steps - self._closed_at >= self.config.every_env_steps
+        due = env_steps - self._closed_at >= INTERVAL_STEPS
         if not due and not (last and self._interval_episodes.any()):
             return []
         rows = [{**steps, **row} for row in self._rows()]
@@ -160,7 +162,7 @@ class Practice(Stateful):
     @property
     def believed(self) -> Bools:
         """Return whether each arm has ended often enough, (K,)."""
-        return self._seen >= self.config.warmup_episodes
+        return self._seen >= WARMUP_EPISODES
 
     @property
     def failure_rate(self) -> F64:
@@ -174,7 +176,7 @@ class Practice(Stateful):
             return np.bincount(kinds, values)[kinds]
 
         failures, episodes = of_kind(self._failures), of_kind(self._episodes)
-        known = of_kind(self._seen) >= self.config.warmup_episodes
+        known = of_kind(self._seen) >= WARMUP_EPISODES
         rate = np.where(known, (failures + 0.5) / (episodes + 1), 1.0)
         return np.where(self.believed, (self._failures + 0.5) / (self._episodes + 1), rate)
 

@@ -29,6 +29,7 @@ from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.behaviour import Labelled
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner, Terms
+from restock.train.dqn.network import averaging_rate
 from restock.train.feed.batches import Batches, LogTerms, ReplayBatch
 from restock.train.feed.teacher import Imitation
 
@@ -95,8 +96,7 @@ class UpdateBlocks:
             width=ring.rows.shape[1],
             longest=LONGEST,
             labelled=0 if imitation is None else imitation.batch_size,
-            has_conservative=logs is not None
-            and max(config.loss.conservative, config.loss.conservative_online) > 0,
+            has_conservative=logs is not None and config.loss.conservative > 0,
             expert=expert,
         )
 
@@ -312,10 +312,10 @@ class CapturedUpdates:
         learner, behaviour = self.learner, self.learner.behaviour
         columns = [block.logged, block.conservative]
         updates = torch.arange(len(block)) + 1 + ahead
-        rates = [learner.averaging_rate(learner.gradient_steps + k) for k in updates.tolist()]
+        rates = [averaging_rate(learner.gradient_steps + k) for k in updates.tolist()]
         slow = [0.0] * len(block)
         if behaviour is not None:
-            slow = [behaviour.averaging_rate(behaviour.updates + k) for k in updates.tolist()]
+            slow = [averaging_rate(behaviour.updates + k) for k in updates.tolist()]
         columns += [torch.tensor(rates), torch.tensor(slow)]
         return torch.stack(columns, dim=1)
 

@@ -284,7 +284,6 @@ _KINDS: dict[str, Kind] = {
     "config.device": "free",
     "config.threads": "free",
     "config.record": "free",
-    "config.env.overlap": "free",
     "config.profile": "free",  # a name or a file: `profile` says what it held
     "config.target": "target",
     "config.evaluation.off_policy": "free",

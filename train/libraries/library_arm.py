@@ -119,7 +119,7 @@ def dqn_arguments(config: TrainConfig) -> dict[str, Any]:
         "exploration_fraction": min(config.epsilon.steps / max(schedule.env_steps, 1), 1.0),
         "exploration_initial_eps": config.epsilon.start,
         "exploration_final_eps": config.epsilon.end,
-        "max_grad_norm": config.optimizer.max_grad_norm or 10.0,
+        "max_grad_norm": 10.0,
     }
 
 

@@ -205,7 +205,7 @@ class GapsCommand:
             **document(found),
         }
         if self.missions_out is not None:
-            plan = of_list(found, store=place, store_version=version, mixture=self.mixture)
+            plan = of_list(found, store=f"{place}@{version}", mixture=self.mixture)
             write_missions(self.missions_out, plan)
             answer["missions_file"] = str(self.missions_out)
         if self.json:

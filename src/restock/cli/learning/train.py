@@ -406,14 +406,15 @@ def unmoved(practised: list[dict[str, Any]], config: TrainConfig) -> str | None:
 
     `practised` are the rows of the run's table `practice`.
     """
-    practice = config.practice
+    from restock.train.feed.practice import INTERVAL_STEPS, WARMUP_EPISODES
+
     drawn = {(row["arm"], row["wanted_share"]) for row in practised}
-    if practice.rule != "success" or len(drawn) > len({arm for arm, _ in drawn}):
+    if config.practice.rule != "success" or len(drawn) > len({arm for arm, _ in drawn}):
         return None
     return (
-        'practice.rule="success" never changed the shares of the missions: it may at the'
-        f" end of every practice.every_env_steps={practice.every_env_steps:,}, by arms or kinds of"
-        f" which practice.warmup_episodes={practice.warmup_episodes:,} missions have ended"
+        'practice.rule="success" never changed the shares of the missions: it may after'
+        f" every {INTERVAL_STEPS:,} steps, by arms or kinds of which {WARMUP_EPISODES} missions"
+        " have ended"
     )
 
 
