@@ -236,7 +236,7 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
         (["eval", "{missing}"], "no such run"),
         (["eval", "{trained}", "--policies", "nobody"], "there is no 'nobody'"),
         (["eval", "{trained}", "--perturbations", "rain"], "choose from none, friction"),
-        (["eval", "{trained}", "--episodes", "0"], "must be at least 1"),
+        (["eval", "{trained}", "--episodes", "-1"], "must be at least 1"),
     ],
 )
 def test_wrong_input_gives_one_clear_message_and_writes_nothing(
