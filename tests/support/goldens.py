@@ -4,8 +4,8 @@
 
 A change that is not meant to change values must leave them alone. A hash is of one column, so that
 a column can be added or removed without touching the others. Sums of floats are rounded
-differently by other processors and libraries: hashes are compared on the machine that `made_on`
-describes, and row counts everywhere.
+differently by other processors and libraries: hashes, and all tables of the run, are compared on
+the machine that `made_on` describes, and numbers of ingested and mixed rows everywhere.
 """
 
 from __future__ import annotations
