@@ -125,7 +125,7 @@ def _read() -> dict[str, dict[str, str]]:
 
 # In their order: a view may use those before it.
 VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
-FRAMES = "frames.sql"  # over stored_frames, which a store alone has
+FRAMES_SQL = "frames.sql"  # over stored_frames, which a store alone has
 MACROS = (
     "macros.sql",
     "flawed_rows.sql",
@@ -203,7 +203,9 @@ class Definitions:
         replaced: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
     ) -> None:
         self._connection, self.summaries = connection, summaries
-        self._statements = dict(_statements(_of_store(observation_type, (*VIEWS, FRAMES, *MACROS))))
+        self._statements = dict(
+            _statements(_of_store(observation_type, (*VIEWS, FRAMES_SQL, *MACROS)))
+        )
         if summaries:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
         self.computed: dict[tuple[str, ...], Callable[[], None]] = {}

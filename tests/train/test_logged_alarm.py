@@ -14,7 +14,7 @@ from support.stores import recording_transitions, write_store
 from restock.cli import main
 from restock.ingest.live.policy_file import PolicyFile
 from restock.replay.panel.panel import Panel
-from restock.train.evaluation.logged_alarm import logged_alarm, logged_episodes
+from restock.train.evaluation.onnx_policy import logged_alarm, logged_episodes
 
 STEPS = 60
 

@@ -7,11 +7,13 @@ entries in order, the action table in m/s and rad/s, and the control period.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 from torch import nn
@@ -21,14 +23,18 @@ from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
 from restock.ingest.live.alarm import KEY as ALARM
+from restock.ingest.live.alarm import WINDOW_S, Alarm, fit_alarm
+from restock.ingest.live.pilot import OPERATORS
 from restock.ingest.live.policy_file import FORMAT, OnnxFile, with_digest
 from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
 from restock.process import import_extra
 from restock.replay.panel.panel import Panel
+from restock.replay.store.parquet_views import passed_in
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
 from restock.train.dqn.network import QNetwork
-from restock.train.evaluation.logged_alarm import logged_alarm
+from restock.train.evaluation.evaluate import STUCK_RADIUS_M, STUCK_WINDOW_S
+from restock.train.evaluation.ope_dataset import panel_store
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run, run_panel
@@ -214,6 +220,43 @@ def _array(tensor: torch.Tensor) -> F32:
 
 def _onnx() -> Any:
     return import_extra("onnx", "onnx", "a policy is exported with onnx")
+
+
+SAFE_ROWS = 50_000  # at most, of episodes chosen by hash: bounds memory and time
+
+
+def logged_alarm(panel: Panel, miss_rate: float) -> Alarm:
+    """Fit an alarm to the panel's episodes, as its first store has them at the panel's version.
+
+    Raises:
+        ConfigError: no such miss rate, or too few episodes that failed or did not.
+        StoreError: the store is no longer there.
+    """
+    episodes = logged_episodes(panel)
+    failed = [(failure, observation) for failure, observation in episodes if failure is not None]
+    return fit_alarm(
+        [observation for _, observation in failed],
+        [failure for failure, _ in failed],
+        [observation for failure, observation in episodes if failure is None],
+        miss_rate=miss_rate,
+        period_s=panel.task.control_period_s,
+    )
+
+
+def logged_episodes(panel: Panel) -> list[tuple[str | None, F32]]:
+    """Return how each episode failed and its observations (n, D) before; all, if it did not."""
+    query = files(__package__).joinpath("onsets.sql").read_text(encoding="utf-8")
+    settings = {
+        "people": list(OPERATORS),
+        "steps": round(WINDOW_S / panel.task.control_period_s),
+        "stuck_m": STUCK_RADIUS_M,
+        "stuck_s": STUCK_WINDOW_S,
+        "safe_rows": SAFE_ROWS,
+    }
+    wanted = pa.table({"episode_id": panel.meta["episode_id"].unique().cast(pa.string())})
+    with panel_store(panel) as store, passed_in(store.connection, wanted=wanted):
+        rows = store.connection.execute(query, settings).fetchall()
+    return [(failure, np.array(observations, np.float32)) for failure, observations in rows]
 
 
 __all__ = ["OnnxPolicy", "export_onnx", "to_onnx"]

@@ -151,8 +151,7 @@ class SqlCommand:
     def _export(self, place: str, out: Path) -> None:
         from restock.cli import output
         from restock.files import expect_file_place
-        from restock.replay.store.export_views import export_views
-        from restock.replay.store.store import Store
+        from restock.replay.store.store import Store, export_views
 
         expect_file_place(out, "--export")
         with Store(place) as store:
