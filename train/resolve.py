@@ -243,11 +243,8 @@ def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     if teacher.source is None:
         teacher = msgspec.structs.replace(teacher, source="none")
     schedule = msgspec.structs.replace(config.schedule, env_steps=0)
-    env = msgspec.structs.replace(config.env, overlap=False)
     practice = msgspec.structs.replace(config.practice, rule="natural")
-    return msgspec.structs.replace(
-        config, teacher=teacher, schedule=schedule, env=env, practice=practice
-    )
+    return msgspec.structs.replace(config, teacher=teacher, schedule=schedule, practice=practice)
 
 
 __all__ = [
