@@ -84,7 +84,9 @@ def passes(dataset: PanelDataset, count: int, **options: Any) -> list[list[list[
     return found
 
 
-@pytest.mark.parametrize(("method", "limited"), [("fork", False), ("spawn", True)])
+@pytest.mark.parametrize(
+    ("method", "limited"), [("fork", False), pytest.param("spawn", True, marks=pytest.mark.long)]
+)
 def test_persistent_workers_are_told_of_the_epoch(panel, limited_panel, method, limited):
     used = limited_panel if limited else panel
     alone = passes(PanelDataset(used, 20, batches=3, seed=1), 3)
@@ -99,7 +101,7 @@ def test_persistent_workers_are_told_of_the_epoch(panel, limited_panel, method, 
     assert persistent == alone
 
 
-@pytest.mark.parametrize("method", [None, "spawn"])
+@pytest.mark.parametrize("method", [None, pytest.param("spawn", marks=pytest.mark.long)])
 def test_ranks_share_one_sequence(panel, limited_panel, method):
     from torch.testing._internal.distributed.fake_pg import FakeStore
 
