@@ -72,7 +72,7 @@ def list_views() -> Iterator[str]:
     """Yield every view of a store, with every column."""
     from restock.ingest.task.schema import frame_schema, recording_schema, transition_schema
     from restock.replay.store.definitions import (
-        FRAMES,
+        FRAMES_SQL,
         HELD_CONDITIONS,
         definitions,
         install_columns,
@@ -83,7 +83,7 @@ def list_views() -> Iterator[str]:
         connection.register("stored_transitions", transition_schema(2).empty_table())
         connection.register("stored_recordings", recording_schema().empty_table())
         connection.register("stored_frames", frame_schema().empty_table())
-        connection.execute(definitions("FLOAT[]") + definitions(names=[FRAMES]))
+        connection.execute(definitions("FLOAT[]") + definitions(names=[FRAMES_SQL]))
         install_columns(connection)
         rows = connection.sql("FROM columns").fetchall()
     for view, doc in view_docs().items():
