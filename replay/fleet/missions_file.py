@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from restock.errors import ConfigError
 from restock.files import write_text
+from restock.renamed import MISSIONS_KEYS
 from restock.toml import Checked, read_toml, toml_value, typed
 
 if TYPE_CHECKING:
@@ -63,9 +64,8 @@ def read_missions(path: str | Path) -> MissionsFile:
         ConfigError: it cannot be read, an unknown key, or a value that does not fit.
     """
     remedy = "`restock coverage gaps STORE --missions-out FILE` writes one"
-    return typed(
-        read_toml(Path(path), remedy=remedy), MissionsFile, where=str(path), remedy=_REMEDY
-    )
+    document = read_toml(Path(path), remedy=remedy)
+    return typed(document, MissionsFile, where=str(path), remedy=_REMEDY, renamed=MISSIONS_KEYS)
 
 
 def of_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:

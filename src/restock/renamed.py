@@ -15,6 +15,7 @@ _CAP = "it was removed: set it for the whole mixture"
 _LEAST = "it was removed: leave the stratum out, or give it a smaller share"
 _GONE = "it was removed, as it gained nothing (docs/evidence.md): leave it out"
 _FIXED = "it was removed: its default always applies; leave it out"
+_AT = "it was removed: name the version in the store's place, as in STORE@12"
 
 TRAINING_KEYS = {
     "guard": _GONE,
@@ -76,13 +77,21 @@ MIXTURE_KEYS = {
     "planned": "write planned_draws = UPDATES x BATCH_SIZE in its place",
     "prefer": "it was removed: give the strata a `priority`, which decides",
     "sources.fresh": "it was removed: fresh rows get what is left",
+    "sources.stores.version": _AT,
     "evaluation_split.gap_s": "it was removed: the gap is 2 s",
     "correction.beta": 'it was removed: use the rule "clipped"',
-    "each_condition.min_rows": _LEAST,
-    "each_condition.min_episodes": _LEAST,
-    "each_condition.max_rows_per_episode": _CAP,
-    "each_condition.max_rows_per_recording": _CAP,
+    **{
+        f"{table}.{key}": instead
+        for table in ("each_condition", "strata")
+        for key, instead in {
+            "min_rows": _LEAST,
+            "min_episodes": _LEAST,
+            "max_rows_per_episode": _CAP,
+            "max_rows_per_recording": _CAP,
+        }.items()
+    },
 }
+MISSIONS_KEYS = {"store_version": _AT}
 MIXTURES = {
     "missions": _now("'coverage'"),
     "exposure": 'it was removed: write `[each_condition]` with `kind = "exposure"` and'

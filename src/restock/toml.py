@@ -333,11 +333,13 @@ def _places(
 
 
 def _has(document: Any, keys: list[str]) -> bool:
-    for key in keys:
-        if not isinstance(document, Mapping) or key not in document:
-            return False
-        document = document[key]
-    return True
+    """Return whether a document has a key, by its path; in an array of tables, whether one has."""
+    if not keys:
+        return True
+    if isinstance(document, list):
+        return any(_has(one, keys) for one in document)
+    key, *rest = keys
+    return isinstance(document, Mapping) and key in document and _has(document[key], rest)
 
 
 def _join(*parts: str) -> str:

@@ -190,6 +190,7 @@ def test_a_renamed_key_is_refused_with_its_new_name() -> None:
     for values, old, new in (
         ({"portion": 0.1}, "portion", "share"),
         ({"inner": {"portion": 0.1}}, "inner.portion", "inner.share"),
+        ({"inner": [{}, {"portion": 0.1}]}, "inner.portion", "inner.share"),
     ):
         with pytest.raises(ConfigError) as refused:
             typed(values, Config, where="config.toml", renamed=renamed)

@@ -67,6 +67,8 @@ def test_the_shipped_mixtures_load_and_fill(name, transitions):
             r"sources\.logs\.to_env_steps must be above from_env_steps, which is 0, got 0",
         ),
         (EVERY + "[adaptive]\nfloor = 0.7", "unknown key `adaptive`"),
+        ('[[strata]]\nname = "nominal"\nmin_rows = 9', "give it a smaller share"),
+        ('[[sources.stores]]\nname = "a"\npath = "b"\nversion = 1', "as in STORE@12"),
         (
             "[[strata]]\nname = 'a'\nshare = 0.1\nfloor = 0.2",
             "share of 'a' is 0.1, below its floor",
