@@ -204,7 +204,7 @@ class Session(Stateful):
         self.events = Events(run.path, sinks)
 
     def restore(self) -> None:
-        """Go on from the run's latest checkpoint.
+        """Continue from the run's latest checkpoint.
 
         Raises:
             RunError: no such checkpoint, the policy that was kept is missing or damaged, or

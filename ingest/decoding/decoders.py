@@ -417,7 +417,7 @@ class ColumnDecoder:
         self._plan = compile_plan(message, self._paths.values(), ros1=ros1)
 
     def empty(self) -> Columns:
-        """Columns without a row."""
+        """Return columns without a row."""
         return self._named(self._plan.empty())
 
     def decode(self, batch: MessageBatch) -> Decoded:

@@ -60,7 +60,7 @@ class Decoder(Protocol):
     """Some fields of one channel's messages, a batch at a time."""
 
     def empty(self) -> dict[str, FieldColumn]:
-        """Columns without a row."""
+        """Return columns without a row."""
         ...
 
     def decode(self, batch: MessageBatch) -> Decoded:
@@ -103,7 +103,7 @@ class ParsedDecoder:
         self._parser, self._leaves = parser, tuple(leaves)
 
     def empty(self) -> dict[str, FieldColumn]:
-        """Columns without a row."""
+        """Return columns without a row."""
         return self._columns([])
 
     def decode(self, batch: MessageBatch) -> Decoded:

@@ -150,7 +150,7 @@ class _Delays:
         return median(np.array(self._delay_ns, np.int64))
 
     def growth(self) -> float:
-        """Seconds that the delay grows by in one: between the halves of the last messages."""
+        """Return the seconds by which the delay grows per second, between two halves."""
         log, delay = self._recent(_PACE_NS)
         half = len(log) // 2
         if not half:

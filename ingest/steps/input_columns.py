@@ -391,7 +391,7 @@ class InputColumns:
         return [names[frame] for frame in frames]
 
     def _yaw(self, name: str) -> F64:
-        """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
+        """Return the yaw (N,) of an input's quaternions; NaN without an estimate. See `yaw_of`."""
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path = source.fields["orientation"]

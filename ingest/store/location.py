@@ -445,7 +445,7 @@ def _plain(kind: pa.DataType) -> pa.DataType:
 
 
 def _region() -> str | None:
-    """None where a profile says it."""
+    """Return the region of the environment; None if a profile of AWS says it."""
     named = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
     return named or (None if os.environ.get("AWS_PROFILE") else DEFAULT_REGION)
 

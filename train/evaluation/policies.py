@@ -200,7 +200,7 @@ class ClonedPolicy:
         self._rng = np.random.default_rng([seed, 14])
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
-        """Actions (N,) for observations (N, D), and the probabilities (N,) they had."""
+        """Draw actions (N,) for observations (N, D); return them and their probabilities (N,)."""
         of_each = cloned_probabilities(self.network, observation)  # (N, A)
         draw = self._rng.random((len(of_each), 1))
         action = (draw > of_each.cumsum(axis=1)).sum(axis=1)

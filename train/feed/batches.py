@@ -60,7 +60,7 @@ class ReplayBatch:
 
     @cached_property
     def rows(self) -> Tensor:
-        """Packed, (B, W) float32."""
+        """Return the rows packed, (B, W) float32."""
         return self.gather()
 
 

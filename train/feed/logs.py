@@ -197,7 +197,7 @@ class Probe:
 
     @classmethod
     def of_ring(cls, ring: FreshRing, per_condition: int) -> Probe | None:
-        """Without logs: labelled rows of the ring, copied, so that they stay when it moves on."""
+        """Choose labelled rows of the ring, for a run without logs; they are copied."""
         count = len(ring)
         codes = ring.by_condition.stratum[:count].astype(np.int32)
         key = (ring.meta["episode"][:count] << 20) | ring.meta["episode_step"][:count]

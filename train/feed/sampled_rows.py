@@ -509,7 +509,7 @@ def actions(source: SourceRows, names: Sequence[str]) -> Columns:
     pairs = np.flatnonzero(source.drawn.sum(axis=2).ravel())  # (P,)
 
     def of_task(by_cell: Ints) -> Ints:
-        """(S, C, a) or (S * C, a), of the pairs that were met and all actions: (P, A)."""
+        """Select the pairs that occurred and all actions, (P, A), from (S, C, a) or (S * C, a)."""
         of_pairs = by_cell.reshape(source.pairs, -1)[pairs]
         none_of = ((0, 0), (0, max(count - of_pairs.shape[1], 0)))
         whole: Ints = np.pad(of_pairs, none_of)[:, :count]

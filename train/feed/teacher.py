@@ -357,7 +357,7 @@ class Imitation(Stateful):
 
     @property
     def cloned(self) -> Ints:
-        """The rows (n,) of the logs that online batches are drawn from."""
+        """Return the rows (n,) of the logs that online batches are drawn from."""
         return self._online.rows
 
     def draw_offline(self) -> Labelled:

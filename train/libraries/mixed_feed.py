@@ -331,7 +331,7 @@ class MixedFeed:
         self._begun = time.monotonic() - self._begun
 
     def fresh_meta(self, capacity: int) -> FreshMeta:
-        """Metadata beside a buffer that the library keeps."""
+        """Make metadata beside a buffer that the library keeps."""
         name = self.library
         return FreshMeta(
             capacity, self.num_envs, conditions=self.labels.names, behaviour_policy=name

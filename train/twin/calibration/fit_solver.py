@@ -354,7 +354,7 @@ def channel_residuals(segments: LoggedSegments, replayed: OpenLoopResult) -> dic
 
 
 def position_gap_m(segments: LoggedSegments, replayed: OpenLoopResult) -> F64:
-    """How far the twin is from the logged position, (P, S, K + 1), from a common first pose."""
+    """Return the twin's distance from the logged position, (P, S, K + 1), after a common pose."""
     gap: F64 = np.hypot(
         replayed.signals["pose_x_m"] - segments.signals["pose_x_m"],
         replayed.signals["pose_y_m"] - segments.signals["pose_y_m"],

@@ -446,7 +446,7 @@ def _observation_rows(
 def _reward_rows(
     steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
 ) -> tuple[Rows, dict[tuple[str, str], ConfidenceInterval]]:
-    """Gaps by term, and by (condition, source) the whole gap over the reward's own spread.
+    """Return gaps by term, and the whole gap over the reward's spread by condition and source.
 
     The spread is the distance of a step's reward from the median, taken to be a step's cost at
     least: standing still earns the same at every step, and next to that any gap is large.
