@@ -56,14 +56,13 @@ class DiagnoseCommand:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
-        from restock.replay.places import kind_beside
         from restock.train.judge.diagnose import check_place, confirm, diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
         if not self.places:
             raise ConfigError("needs a run, a panel or a store", where="restock diagnose")
         first, *others = self.places
-        if not others and kind_beside(first) != "run":
+        if not others and not (first / "config.json").is_file():
             return self._before_training(first)
         refuse(
             self,
