@@ -11,11 +11,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.panels import panel_of
-from support.stores import recording_transitions
 
 from restock import cli
-from restock.cli.start import demo, outcomes, stages
+from restock.cli.start import demo, outcomes
 from restock.cli.start.demo import DemoCommand, plan_of
 from restock.cli.start.stages import Settings, Stage
 from restock.cli.start.work import Work
@@ -31,7 +29,8 @@ def plan(tmp_path: Path) -> list[Stage]:
 def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
     verbs = [stage.command[0] for stage in plan(tmp_path)]
     before = ["info", "ingest", "sql", "audit", "mix", "mix"]
-    assert verbs == [*before, "train", "train", "train", "eval", "eval", "eval", "report"]
+    assert verbs == [*before, "train", "train", "train", "eval", "eval", "report"]
+    assert {stage.name for stage in plan(tmp_path)} <= demo.WHY.keys()
     for stage in plan(tmp_path):
         assert cli.main([*stage.command, "--help"]) == 0
         assert not stage.beside or cli.main([*stage.beside, "--help"]) == 0
@@ -40,7 +39,7 @@ def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
 def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
     settings = ("practice.rule=success", "seed=3")
     to = Settings(("logs",), tmp_path, seconds=9, train=settings)
-    stage = stages.train_beside_uniform(to)
+    (stage,) = [stage for stage in plan_of(to) if stage.beside]
     reported = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
     first, second = (
         {flag: value for flag, value in one.items() if flag.startswith("--")} for one in reported
@@ -51,37 +50,17 @@ def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
     assert {"practice.rule=success", "seed=3"} <= {*stage.command} & {*stage.beside}
 
 
-@pytest.mark.parametrize("drivers", [["operator", "planner"], ["joystick", "planner"]])
-def test_the_policy_from_the_logs_alone_imitates_whom_there_is(
-    tmp_path: Path, drivers: list[str]
-) -> None:
-    to = Settings(("logs",), tmp_path)
-    rows = recording_transitions(1)
-    at = rows.schema.get_field_index("behaviour_policy")
-    names = pa.array([drivers[row % 2] for row in range(len(rows))])
-    rows = rows.set_column(at, "behaviour_policy", names.cast(rows.schema.field(at).type))
-    panel_of(rows, "[each_condition]\nshare = 'natural'\n", to.panel)
-    decided = stages.train_on_logs(to).decided
-    assert decided is not None
-    command = decided()
-    assert command is not None
-    assert "teacher.source=logs" in command
-    named = [word for word in command if word.startswith("teacher.policies")]
-    assert named == ([] if "operator" in drivers else ['teacher.policies=["joystick", "planner"]'])
-
-
 def test_the_run_that_is_behind_catches_up(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path, seconds=9)
+    other = demo.fed_uniformly(to)
 
     def driven(run: int, uniform: int) -> list[str] | None:
-        for path, steps in ((to.run, run), (to.uniform, uniform)):
+        for path, steps in ((to.run, run), (other, uniform)):
             path.mkdir(exist_ok=True)
             (path / "config.json").write_text(json.dumps({"format": FORMAT}))
             table = pa.table({"env_steps": [0, steps]})
             pq.write_table(table, path / "progress.parquet")
-        decided = stages.even_out(to).decided
-        assert decided is not None
-        return decided()
+        return demo.catch_up(to)
 
     assert driven(500, 500) is None
     behind = driven(480, 500)
@@ -89,7 +68,7 @@ def test_the_run_that_is_behind_catches_up(tmp_path: Path) -> None:
     assert behind[:5] == ["train", "--resume", str(to.run), "--env-steps", "500"]
     ahead = driven(512, 500)
     assert ahead is not None
-    assert ahead[:5] == ["train", "--resume", str(to.uniform), "--env-steps", "512"]
+    assert ahead[:5] == ["train", "--resume", str(other), "--env-steps", "512"]
 
 
 def verb(command: list[str], code: int = 0) -> int:
@@ -100,7 +79,7 @@ def verb(command: list[str], code: int = 0) -> int:
 
 def test_what_runs_beside_a_stage_fails_it(tmp_path: Path) -> None:
     def stage(*beside: str) -> Stage:
-        return Stage("x", "x", "x", ["info"], beside=beside, writes=())
+        return Stage("x", "x", ["info"], beside=beside, writes=())
 
     missing = stage("info", str(tmp_path / "nothing"))
     assert Work(tmp_path / "a", verb, SILENT).do(stage("info", "--help")).good
@@ -123,7 +102,7 @@ def test_an_unexpected_exit_code_stops_the_demo(
 
     monkeypatch.setattr(cli, "main", dispatch)
     monkeypatch.setattr(outcomes, "errors", lambda text: [])
-    plain = [replace(stage, outcome=stages.nothing) for stage in plan(tmp_path)]
+    plain = [replace(stage, outcome=lambda document: []) for stage in plan(tmp_path)]
     monkeypatch.setattr(demo, "plan_of", lambda to: plain)
     # A failed audit is expected on sample logs; a mixture that is refused is not.
     assert DemoCommand(out=tmp_path / "out").run() == 2
@@ -138,7 +117,7 @@ def test_a_stage_decides_its_command_when_its_turn_comes(tmp_path: Path) -> None
         return verb(command)
 
     def stage(command: list[str] | None) -> Stage:
-        return Stage("x", "x", "x", ["train", "LATER"], decided=lambda: command)
+        return Stage("x", "x", ["train", "LATER"], decided=lambda: command)
 
     assert Work(tmp_path / "out", dispatch, SILENT).do(stage(["train", "now"])).good
     assert ran == [["train", "now", "--json"]]

@@ -43,10 +43,10 @@ def way(out: Path, verbs: Verbs, bag: Path, number: int = 1) -> list[str]:
     work = Work(out, verbs, SILENT)
     store, run = out / "store", out / "run"
     stages = [
-        Stage("ingest", "", "", ["ingest", str(store)], reads=(bag,), writes=(store,)),
-        Stage("mix", "", "", ["mix", str(out / f"panel{number}")]),
+        Stage("ingest", "", ["ingest", str(store)], reads=(bag,), writes=(store,)),
+        Stage("mix", "", ["mix", str(out / f"panel{number}")]),
         Stage(
-            *("train", "", "", ["train", str(run)]),
+            *("train", "", ["train", str(run)]),
             writes=(run,),
             resume=("train-on", str(run)),
         ),

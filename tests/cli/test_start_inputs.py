@@ -26,7 +26,6 @@ from restock import cli
 from restock.cli.start import stages
 from restock.cli.start.decisions import (
     floor_settings,
-    missions_unseen,
     possible_kinds,
     practice_settings,
     updates_settings,
@@ -253,13 +252,13 @@ def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(
     profile.write_text(text)
     assert load_profile(profile).task.lidar is lidar
     to, floor = Settings((), tmp_path, profile=profile), {"episodes": list(DEFAULT_CONDITIONS)}
-    kinds = possible_kinds(to, floor)
+    kinds, unseen = possible_kinds(to, floor)
     assert kinds == [kind for kind in DEFAULT_CONDITIONS if lidar or kind != "blocked_aisle"]
     conditions = [one for one in floor_settings(to, kinds) if one.startswith("env.conditions")]
     assert bool(conditions) is not lidar
     assert not any("blocked_aisle" in one for one in conditions)
-    assert (missions_unseen(to, floor) is None) is lidar
-    assert missions_unseen(to, {"episodes": ["nominal"]}) is None
+    assert unseen == ([] if lidar else ["blocked_aisle"])
+    assert possible_kinds(to, {"episodes": ["nominal"]}) == (["nominal"], [])
 
 
 def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:

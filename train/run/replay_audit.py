@@ -104,11 +104,11 @@ def shortfalls(fed: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-__all__ = [
-    "ReplayAudit",
-    "ReplayAuditRecord",
-    "SHORT",
-    "fed_shares",
-    "replay_audit",
-    "shortfalls",
-]
+def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows for people of what the critic was fed, in % of all rows (`fed_shares`)."""
+    shares = ("natural", "wanted", "drawn", "logs", "fresh", "short")
+    return [
+        {"stratum": row["stratum"]}
+        | {name.replace("logs", "logged"): f"{100 * row[f'{name}_share']:.1f}" for name in shares}
+        for row in fed
+    ]

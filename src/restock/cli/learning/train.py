@@ -240,7 +240,7 @@ def _print(
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say
-    from restock.train.run.replay_audit import fed_shares, shortfalls
+    from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls
     from restock.train.run.run import Run
 
     run = Run.open(prepared.path)
@@ -363,23 +363,6 @@ def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
         or (row["wanted_share"] and row["short_share"] > 0.5 * row["wanted_share"])
     ]
     return lines
-
-
-def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows for people of what the critic was fed, in % of all rows (`fed_shares`)."""
-    columns = {
-        "natural": "natural_share",
-        "wanted": "wanted_share",
-        "drawn": "drawn_share",
-        "logged": "logs_share",
-        "fresh": "fresh_share",
-        "short": "short_share",
-    }
-    return [
-        {"stratum": row["stratum"]}
-        | {name: f"{100 * row[column]:.1f}" for name, column in columns.items()}
-        for row in fed
-    ]
 
 
 def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.cli.start.outcomes import Document, of_nominal
-from restock.cli.start.stages import Settings, Stop
+from restock.cli.start.stages import Settings
 from restock.cli.start.work import FOLDER, Ended
 from restock.errors import ConfigError, StoreError, counted, quoted
 from restock.files import read_json
@@ -26,15 +26,18 @@ UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with all other s
 INTERVALS = 20  # at least so many points of every curve
 DRIVERS = "behaviour_policies"  # key in a row of the coverage
 INSIDE = 0.5  # share of ticks: with more returns inside the outline, the outline is wrong
-NOT_AGAIN = (
-    "paths",
-    "out",
-    "dry_run",
-    "json",
-)  # options that stages do not depend on
+NOT_AGAIN = ("paths", "out", "dry_run", "json")  # options that stages do not depend on
 
 
-def fullest(document: Document) -> str | None:
+class Stop(Exception):
+    """A point where a person must decide: why, and what to type or to edit."""
+
+    def __init__(self, why: str, *remedies: str) -> None:
+        super().__init__(why)
+        self.why, self.remedies = why, remedies
+
+
+def fullest(recordings: list[Document]) -> str | None:
     """Return the recording with most of what a profile needs: a command, a pose, and time."""
     from restock.ingest.propose.roles import KINDS
 
@@ -46,8 +49,7 @@ def fullest(document: Document) -> str | None:
         roles = sum(bool(there & types(role)) for role in ("command", "pose", "wheels"))
         return roles, row["duration_s"] or 0.0
 
-    rows = document.get("recordings", [])
-    return str(max(rows, key=rank)["path"]) if rows else None
+    return str(max(recordings, key=rank)["path"]) if recordings else None
 
 
 def edited(profile: Path | str | None, out: Path) -> bool:
@@ -76,7 +78,8 @@ def several_kinds(kinds: list[Any], requested: StartCommand) -> Stop:
     return Stop(
         f"these are recordings of {len(kinds)} kinds of robots, but a profile describes one kind: "
         f"{' | '.join(reported)}",
-        (*calls, f"or add --accept: recordings of the other kinds are left out of {out}"),
+        *calls,
+        f"or add --accept: recordings of the other kinds are left out of {out}",
     )
 
 
@@ -93,21 +96,15 @@ def _options(requested: StartCommand, *, but: Collection[str]) -> list[str]:
     return words
 
 
-def of_other_kinds(out: Path) -> list[str]:
-    """Return the recordings of other kinds of robots, and those that could not be read."""
-    document = _proposal(out)
-    others = [path for kind in document.get("kinds", [])[1:] for path in kind["recordings"]]
-    return [*others, *document.get("unreadable", [])]
+def proposal(out: Path) -> tuple[list[str], str | None]:
+    """Return the recordings that a folder's proposal leaves out, and the one it was made from.
 
-
-def proposed_from(out: Path) -> str | None:
-    """Return the recording that the proposal in this folder was made from."""
-    return next(iter(_proposal(out).get("read", [])), None)
-
-
-def _proposal(out: Path) -> Document:
+    Left out are those of other kinds of robots, and those that could not be read.
+    """
     proposed = out / FOLDER / "propose.json"
-    return read_json(proposed) if proposed.is_file() else {}
+    found = read_json(proposed) if proposed.is_file() else {}
+    others = [path for kind in found.get("kinds", [])[1:] for path in kind["recordings"]]
+    return [*others, *found.get("unreadable", [])], next(iter(found.get("read", [])), None)
 
 
 def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
@@ -120,11 +117,9 @@ def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
     return Stop(
         f"the robot's outline ({size}) is wrong: the lidar sees something inside it at "
         f"{inside:.0%} of the ticks",
-        (
-            f"measure the robot, edit length_m and width_m of [task.body] in {profile}, and "
-            "run the same command again",
-            "or add --accept to it, if the outline is right",
-        ),
+        f"measure the robot, edit length_m and width_m of [task.body] in {profile}, and run the"
+        " same command again",
+        "or add --accept to it, if the outline is right",
     )
 
 
@@ -171,11 +166,7 @@ def practice_settings(profile: Path | str | None) -> list[str]:
     return ["practice.rule=success"] if has_goal(profile) else []
 
 
-def no_room(floor: Ended) -> str | None:
-    """Say why nothing can be driven on the floor; None if something can."""
-    if floor.good and floor.document.get("episodes") == []:
-        return "no mission fits on the floor that the recordings show"
-    return None
+NO_ROOM = "no mission fits on the floor that the recordings show"
 
 
 def mistrust(floor: Ended, gap: Ended) -> str | None:
@@ -183,7 +174,7 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
     if not floor.good:
         return f"there is no floor to drive on: {'; '.join(floor.errors)}"
     if "nominal" not in floor.document["episodes"]:
-        return "no mission fits on the floor that the recordings show"
+        return NO_ROOM
     if not gap.good:
         return f"its gap to the logs cannot be measured: {'; '.join(gap.errors)}"
     verdict = of_nominal(gap.document)
@@ -264,28 +255,18 @@ def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
     return settings
 
 
-def missions_unseen(to: Settings, document: Document) -> str | None:
-    """Say which missions are left out because the robot has no lidar to see them coming."""
-    if not (unseen := _unseen(to, document)):
-        return None
-    kinds = ", ".join(unseen).replace("_", " ")
-    return f"no missions of {kinds}: without a lidar, a robot finds it by driving into it"
+def possible_kinds(to: Settings, floor: Document) -> tuple[list[str], list[str]]:
+    """Return the kinds of mission that the floor has room for: to drive, and to leave out.
 
-
-def _unseen(to: Settings, document: Document) -> list[str]:
-    """Return the kinds of episode that need a lidar, if the robot has none."""
+    A robot without a lidar finds what some missions stage only by driving into it.
+    """
     from restock.train.twin.missions import MISSIONS
 
-    task = _task(to.profile)
+    task, kinds = _task(to.profile), list(floor.get("episodes", []))
     if task is None or task.lidar:
-        return []
-    return [kind for kind in document.get("episodes", []) if MISSIONS[kind].needs_lidar]
-
-
-def possible_kinds(to: Settings, document: Document) -> list[str]:
-    """Return the kinds of mission that the floor has room for and that the robot can do."""
-    unseen = _unseen(to, document)
-    return [kind for kind in document.get("episodes", []) if kind not in unseen]
+        return kinds, []
+    unseen = [kind for kind in kinds if MISSIONS[kind].needs_lidar]
+    return [kind for kind in kinds if kind not in unseen], unseen
 
 
 def logs_alone_settings(coverage: Document) -> list[str]:
@@ -336,42 +317,17 @@ def robot_line(profile: Path | str | None) -> str:
     if robot is None:
         return "the twin's default robot, as nothing describes yours: give --urdf FILE"
     reported = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
-    untold = []
+    guessed = []
     for key, name, unit in (
         ("wheel_radius_m", "wheel radius", "m"),
         ("track_m", "track", "m"),
         ("mass_kg", "mass", "kg"),
     ):
         if (value := getattr(robot, key)) is None:
-            untold.append(name)
+            guessed.append(name)
         else:
-            reported.append(
-                f"{name} {value:g} {unit} (from {robot.origin.get(key, 'the profile')})"
-            )
-    if untold:
-        reported.append(f"{', '.join(untold)} guessed from its outline: give --urdf FILE")
+            origin = robot.origin.get(key, "the profile")
+            reported.append(f"{name} {value:g} {unit} (from {origin})")
+    if guessed:
+        reported.append(f"{', '.join(guessed)} guessed from its outline: give --urdf FILE")
     return ", ".join(reported)
-
-
-__all__ = [
-    "edited",
-    "fit_is_worse",
-    "floor_settings",
-    "fullest",
-    "has_goal",
-    "horizon",
-    "logs_alone_settings",
-    "missions_unseen",
-    "mistrust",
-    "no_room",
-    "no_ways",
-    "node_refuses",
-    "of_other_kinds",
-    "possible_kinds",
-    "practice_settings",
-    "proposed_from",
-    "robot_line",
-    "several_kinds",
-    "updates_settings",
-    "wrong_outline",
-]

@@ -7,22 +7,22 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.cli.start import stages
-from restock.cli.start.stages import Settings, Stage, fed_uniformly, from_logs_alone
-from restock.cli.start.work import Work, escape
+from restock.cli.start.stages import Settings, Stage
+from restock.cli.start.work import Work, escape, speaker
 from restock.errors import ConfigError, ExitCode, policy_words, quoted
 from restock.stats import wilson
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from restock.replay.panel.panel import Panel
     from restock.replay.trace.trace import Trace
 
 
@@ -60,14 +60,16 @@ class DemoCommand:
             raise ConfigError(f"must be a number above 0, got {self.seconds:g}", where="--seconds")
         if self.episodes < 1:
             raise ConfigError(f"must be at least 1, got {self.episodes}", where="--episodes")
-        to, plan = self._plan()
+        found = find_logs()
+        logs = self.out / "logs" if found is None else found
+        rule = ("practice.rule=success",)
+        to = Settings(
+            (str(logs),), self.out, seconds=self.seconds, episodes=self.episodes, train=rule
+        )
+        plan = plan_of(to) if found is not None else [record(logs), *plan_of(to)]
         console = stderr() if self.json else stdout()
-
-        def say(line: str) -> None:
-            console.print(line, soft_wrap=True)
-            console.file.flush()  # what is on stderr comes after it
-
-        work = Work(self.out, main, say, plan=self.dry_run, explain=True)
+        say = speaker(console)
+        work = Work(self.out, main, say, plan=self.dry_run, why=WHY)
         if not self.dry_run:
             say(f"[bold]What you are about to see[/bold]\n\n{OPENING}")
         for stage in plan:
@@ -76,70 +78,11 @@ class DemoCommand:
                 return ended.exit_code or int(ExitCode.USAGE)
         report = to.run / "report.html"
         if self.json:
-            print_json({"stages": work.summary(), "report": str(report)})
+            print_json({"stages": [ended.summary() for ended in work.ended], "report": str(report)})
         elif not self.dry_run:
             tell(to, console)
             say(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
         return int(ExitCode.OK)
-
-    def _plan(self) -> tuple[Settings, list[Stage]]:
-        """Return what the stages share, and the stages."""
-        logs, record = find_logs(), []
-        if logs is None:
-            logs = self.out / "logs"
-            record.append(stages.record(logs))
-        to = Settings(
-            logs=(str(logs),),
-            out=self.out,
-            seconds=self.seconds,
-            episodes=self.episodes,
-            train=("practice.rule=success",),
-        )
-        return to, record + plan_of(to)
-
-
-def tell(to: Settings, console: Console) -> None:
-    """Print the results, read from what the stages wrote."""
-    from restock.cli.output import print_table
-
-    def show(title: str, lines: list[str]) -> None:
-        if lines:
-            console.print(f"\n[bold]{title}[/bold]")
-            for line in lines:
-                console.print(line, markup=False, soft_wrap=True)
-        sys.stdout.flush()
-
-    if rows := before_and_after(to):
-        console.print("\n[bold]Before and after fine-tuning[/bold]")
-        console.print(
-            "[dim]Missions that reached their goal without a contact; in brackets, in percent,"
-            " what\nother missions of the kind might give (95 %).[/dim]"
-        )
-        print_table(rows)
-        console.print(steps_line(to))
-    show("What the critic was fed", shelves(to.run))
-    show("Failing before, arriving after: films", films(to))
-    show("One rare event, from its message to an update", rare_event(to))
-    show("What to try next", next_steps(to))
-
-
-def plan_of(to: Settings) -> list[Stage]:
-    """Return the stages of the demo, in order."""
-    return [
-        stages.info(to),
-        stages.ingest(to),
-        stages.coverage(to),
-        stages.audit(to),
-        stages.mix(to),
-        stages.mix_uniform(to),
-        stages.train_on_logs(to),
-        stages.train_beside_uniform(to),
-        stages.even_out(to),
-        stages.evaluate_logs_alone(to),
-        stages.evaluate_beside_uniform(to),
-        stages.film(to),
-        stages.report(to),
-    ]
 
 
 def find_logs() -> Path | None:
@@ -149,6 +92,141 @@ def find_logs() -> Path | None:
     if not logs.is_dir() or not any(logs.iterdir()):
         return None
     return logs.relative_to(Path.cwd()) if logs.is_relative_to(Path.cwd()) else logs
+
+
+def logs_alone(to: Settings) -> Path:
+    """Return the run that never drives, to compare fine-tuning with."""
+    return to.out / "logs-alone"
+
+
+def fed_uniformly(to: Settings) -> Path:
+    """Return the run that is fed the logs as they are."""
+    return to.out / "fed-uniformly"
+
+
+def record(logs: Path) -> Stage:
+    command = ["twin", "record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
+    return Stage("record", "Record", command, writes=(logs,))
+
+
+def plan_of(to: Settings) -> list[Stage]:
+    """Return the stages of the demo, in order."""
+    uniform_panel, uniform, alone = to.out / "panel-uniform", fed_uniformly(to), logs_alone(to)
+    settings = "env.twin=false", "teacher.source=logs", f"schedule.offline_updates={UPDATES}"
+    return [
+        stages.info(to),
+        stages.ingest(to),
+        stages.coverage(to),
+        stages.audit(to),
+        stages.mix(to),
+        Stage(
+            "mix-uniform",
+            "The same logs as they are, to compare with",
+            ["mix", str(to.store), "--mixture", "uniform", "--out", str(uniform_panel)],
+            writes=(uniform_panel,),
+        ),
+        Stage(
+            "logs-alone",
+            "Before fine-tuning: a policy from the logs alone",
+            replace(to, train=settings).training(to.panel, alone, timed=False),
+            writes=(alone,),
+        ),
+        replace(
+            stages.train(to),
+            title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
+            beside=tuple(to.training(uniform_panel, uniform)),
+            writes=(to.run, uniform),
+            resume=(),  # one of the two may have ended
+        ),
+        Stage(
+            "even-out",
+            "As many steps for both",
+            ["train", "--resume", str(uniform), "--env-steps", "AS_THE_OTHER"],
+            shows_progress=True,
+            decided=lambda: catch_up(to),
+        ),
+        stages.evaluate(to, f"run:{uniform}", f"run:{alone}"),
+        Stage(
+            "film",
+            "Film failures, and missions that only the fine-tuned policy completes",
+            ["eval", str(to.run), "--episodes", "0", "--video", "--policies", "agent"],
+        ),
+        stages.report(to),
+    ]
+
+
+# stage -> why it is there
+WHY = {
+    "record": "This installation has no sample recordings: a simulated robot records some.",
+    "info": "The recordings come first: topics, types, counts, durations.",
+    "ingest": "Topics become steps of the control clock (held causally, never interpolated). Steps"
+    " become observations, actions and rewards, and SQL labels each step with its conditions. If"
+    " recordings contain the true condition, the labels are scored.",
+    "coverage": "Hours of the easy aisle, seconds of the wet floor: the store is plain Parquet, and"
+    " the query is plain SQL.",
+    "audit": "Each audit is a query that returns the offending rows. In a pipeline the exit code"
+    " stops you here.",
+    "mix": "Each stratum holds the whole episodes that met its condition, and gets its share of"
+    " every batch. The result is a pinned panel with an id.",
+    "mix-uniform": "Every row has the same probability; strata are only used for the statistics.",
+    "logs-alone": "Updates on the panel, by Q among the actions that its good drivers would"
+    " plausibly take; nothing is driven in the twin.",
+    "train": "Two trainings at once, with the same settings and seed. In the first, each condition"
+    " gets its quota of every batch, from logs and fresh rows; in the other, logs and fresh rows"
+    " are drawn uniformly. Both practise the missions that go wrong more often. The policy chooses"
+    " by Q among actions that the twin's operator finds plausible. Every row is recorded.",
+    "even-out": "The one that has driven less continues until both have made the same number of"
+    " steps.",
+    "eval": "The kept checkpoint, the policy fed uniformly, the one from the logs alone, the"
+    " scripted planner and a random policy, clean and with less friction and more latency than in"
+    " training.",
+    "film": "Episodes of the evaluation, driven again: failing before on the left, and after.",
+    "report": "What the policy was fed, what it learned, and where it fails.",
+}
+
+
+def catch_up(to: Settings) -> list[str] | None:
+    """Continue the run that drove less: a comparison of feeds needs equally many steps."""
+    steps = {path: steps_of(path) for path in (to.run, fed_uniformly(to))}
+    behind, ahead = sorted(steps, key=lambda path: steps[path])
+    if steps[behind] == steps[ahead]:
+        return None
+    longest_s = f"{10 * to.seconds + 600:g}"  # the steps end it
+    budget = ("--env-steps", str(steps[ahead]), "--seconds", longest_s)
+    return ["train", "--resume", str(behind), *budget]
+
+
+def steps_of(run: Path) -> int:
+    """Return how many steps a run made in the twin."""
+    from restock.train.run.run import Run
+
+    return max(Run.open(run).table("progress")["env_steps"].to_pylist(), default=0)
+
+
+def tell(to: Settings, console: Console) -> None:
+    """Print the results, read from what the stages wrote."""
+    from restock.cli.output import print_table
+    from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls
+    from restock.train.run.run import Run
+
+    def show(title: str, lines: Sequence[str]) -> None:
+        if lines:
+            console.print(f"\n[bold]{title}[/bold]")
+            for line in lines:
+                console.print(line, markup=False, soft_wrap=True)
+        sys.stdout.flush()
+
+    if rows := before_and_after(to):
+        what = "Missions that reached their goal without a contact; in brackets, in percent,"
+        show("Before and after fine-tuning", [f"{what} what other missions might give (95 %)."])
+        print_table(rows)
+        console.print(steps_line(to))
+    if fed := fed_shares(Run.open(to.run)):
+        show("What the critic was fed, in % of all rows (`FROM fed` of the run)", shortfalls(fed))
+        print_table(fed_table(fed))
+    show("Failing before, arriving after: films", films(to))
+    show("One rare event, from its message to an update", rare_event(to))
+    show("What to try next", next_steps(to))
 
 
 OPENING = """\
@@ -167,7 +245,7 @@ At the end you see the policies before and after, what the critic was fed of
 each condition, one rare event followed from the recording's message
 to the update that learned from it, and what to try with your own recordings."""
 
-_CELLS = 30  # length of a bar of 100 %
+UPDATES = 2000  # of the policy from the logs alone, as many as before driving in the twin
 RARE = "all rare ones"
 FULL_STEPS = 128_000  # in docs/evidence.md
 
@@ -180,23 +258,17 @@ def before_and_after(to: Settings) -> list[dict[str, str]]:
     """
     from restock.train.run.kept_evaluations import shown_evaluation
 
-    rows = shown_evaluation(to.run)[0].to_pylist()
-    uniform = fed_uniformly(to)
-    names = policy_words([from_logs_alone(to), uniform, "agent", "planner"])
-    driven = {
-        name: [row for row in rows if row["policy"] == policy and row["perturbation"] == "none"]
-        for policy, name in names.items()
-    }
-    if not driven[names[uniform]]:
-        del driven[names[uniform]]
-    if any(row["success"] is None for rows in driven.values() for row in rows):
+    rows = [row for row in shown_evaluation(to.run)[0].to_pylist() if row["perturbation"] == "none"]
+    others = [f"run:{path}" for path in (logs_alone(to), fed_uniformly(to))]
+    there = {row["policy"] for row in rows}
+    names = policy_words(one for one in (*others, "agent", "planner") if one in there)
+    driven = {n: [row for row in rows if row["policy"] == policy] for policy, n in names.items()}
+    if any(row["success"] is None for of in driven.values() for row in of):
         return []
-    kinds = sorted(
-        {row["condition"] for rows in driven.values() for row in rows},
-        key=lambda kind: (kind != "nominal", kind),
-    )
+    found = {row["condition"] for of in driven.values() for row in of}
+    kinds = sorted(found, key=lambda kind: (kind != "nominal", kind))
     return [
-        {"mission": kind} | {name: _arrived(rows, kind) for name, rows in driven.items()}
+        {"mission": kind} | {name: _arrived(of, kind) for name, of in driven.items()}
         for kind in [*kinds, RARE]
     ]
 
@@ -216,10 +288,7 @@ def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
 
 def steps_line(to: Settings) -> str:
     """Say how far fine-tuning came, and how the other policy was fed."""
-    from restock.train.run.run import Run
-
-    steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
-    most = max(steps, default=0)
+    most, uniform = steps_of(to.run), fed_uniformly(to)
     lines = [f"The agent is the fine-tuned policy: {most:,} steps in the twin here."]
     if most < FULL_STEPS / 2:
         lines += [
@@ -228,59 +297,25 @@ def steps_line(to: Settings) -> str:
         ]
     if not most:
         lines = ["The time was up before anything was driven: give more --seconds."]
-    if to.uniform.is_dir():
+    if uniform.is_dir():
         lines += [
             "Fed uniformly has the same network, settings and seed"
             + (", as many steps, and every" if most else ", and every"),
             "row of the logs has the same probability. This compares feeds, not methods, so",
-            f"`restock compare {quoted(to.uniform)} {quoted(to.run)}` refuses",
+            f"`restock compare {quoted(uniform)} {quoted(to.run)}` refuses",
             "(unless --treatment mixture is given). One seed each is a sample of one:",
             "docs/evidence.md has ten.",
         ]
     return "\n".join(lines)
 
 
-def shelves(run: Path) -> list[str]:
-    """Return a line a stratum: its share of the logs, its quota, and what the critic was fed."""
-    from restock.train.run.replay_audit import fed_shares, shortfalls
-    from restock.train.run.run import Run
-    from restock.train.run.run_profile import run_panel
-
-    trained = Run.open(run)
-    panel: Panel | None = run_panel(trained.document)
-    fed = fed_shares(trained)
-    if panel is None or not fed:
-        return []
-    logged = {stratum.name: stratum.natural_share for stratum in panel.strata}
-    width = max(len(row["stratum"]) for row in fed)
-    lines = [f"{'stratum':<{width}}  in the logs  wanted    fed  of it logged, fresh"]
-    for row in fed:
-        of_logs = logged.get(row["stratum"], 0.0)
-        natural, drawn = (round(_CELLS * s) for s in (of_logs, row["drawn_share"]))
-        bar = "█" * min(natural, drawn) + "▒" * (drawn - natural) + "·" * (natural - drawn)
-        lines.append(
-            f"{row['stratum']:<{width}}  {of_logs:>11.1%}  {row['wanted_share']:>6.1%}"
-            f"  {row['drawn_share']:>5.1%}  {row['logs_share']:>9.1%}, {row['fresh_share']:>5.1%}"
-            f"  {bar}".rstrip()
-        )
-    return [
-        *lines,
-        "█ as in the logs   ▒ added by quota   · less than in the logs",
-        f"In % of all {sum(row['drawn_rows'] for row in fed):,} rows that the critic was fed"
-        " (`FROM fed` of the run).",
-        *(f"warning: {line}" for line in shortfalls(fed)),
-    ]
-
-
 def films(to: Settings) -> list[str]:
     """Return where the films are, with the failing policy beside the fine-tuned one."""
     from restock.train.evaluation.film import FOLDER
 
-    found = sorted((to.run / FOLDER).glob("*-rescue.webp"))
-    reported = (
-        ["The policy that failed is on the left; the report shows them, too."] if found else []
-    )
-    return [*map(str, found), *reported]
+    found = [str(path) for path in sorted((to.run / FOLDER).glob("*-rescue.webp"))]
+    where = "The policy that failed is on the left; the report shows them, too."
+    return [*found, where] if found else []
 
 
 def rare_event(to: Settings) -> list[str]:
@@ -306,22 +341,17 @@ def _chosen(run: Path) -> dict[str, Any] | None:
     """Return the audited logged row of the rarest condition with the largest TD error."""
     from restock.train.run.run import Run
 
-    audit: list[dict[str, Any]] = Run.open(run).table("audit").to_pylist()
     rows = [
         row
-        for row in audit
+        for row in Run.open(run).table("audit").to_pylist()
         if row["source"] == "logs" and row["condition"] not in (None, "nominal", "unlabelled")
     ]
-    if not rows:
-        return None
-    often: dict[str, int] = {}
-    for row in rows:
-        often[row["condition"]] = often.get(row["condition"], 0) + 1
-    rarest = min(often, key=lambda condition: (often[condition], condition))
-    return max(
-        (row for row in rows if row["condition"] == rarest),
-        key=lambda row: (abs(row["td"]), row["gradient_step"]),
-    )
+    often = Counter(row["condition"] for row in rows)
+
+    def rank(row: dict[str, Any]) -> tuple[int, str, float]:
+        return -often[row["condition"]], row["condition"], abs(row["td"])
+
+    return max(rows, key=rank, default=None)
 
 
 def _told(trace: Trace, to: Settings) -> list[str]:
@@ -331,44 +361,33 @@ def _told(trace: Trace, to: Settings) -> list[str]:
     from restock.train.run.run import Run
 
     assert trace.audit is not None
-    audit, origin, lines = trace.audit, trace.origin, []
+    audit, origin, run, panel = trace.audit, trace.origin, Run.open(to.run), Panel.open(to.panel)
+    lines = []
     if origin is not None:
         moment = origin.moment["log_time"].replace("T", " ").split("+")[0]
         lines.append(f"recording  {origin.transition['source_file']}, {moment} UTC")
         for message in origin.messages:
             if said := _message(message.input, message.fields):
                 lines.append(f"message    {message.topic}, {message.age_s:.2f} s before: {said}")
-    panel = Panel.open(to.panel)
-    stratum = next(stratum for stratum in panel.strata if stratum.name == audit["stratum"])
+    stratum = next(one for one in panel.strata if one.name == audit["stratum"])
+    fed = next(row for row in fed_shares(run) if row["stratum"] == audit["stratum"])
+    drawn = [r for r in run.table("sampled_episodes").to_pylist() if r["source"] == "logs"]
+    often = sum(row["drawn_rows"] for row in drawn if row["episode"] == audit["episode"])
+    share = float((panel.meta_column("episode_id") == audit["episode"]).mean())
+    even = share * sum(row["drawn_rows"] for row in drawn)
     ended = ", and its episode ends here" if audit["discount"] == 0 else ""
-    drawn, even = _draws(to.run, panel, audit["episode"])
-    fed = next(row for row in fed_shares(Run.open(to.run)) if row["stratum"] == audit["stratum"])
-    target = audit["q"] - audit["td"]
     return [
         *lines,
         f"row        {audit['transition_id']}, driven by the {audit['behaviour_policy']}",
         f"           labelled {audit['condition']}; reward {audit['reward']:.2f}{ended}",
         f"stratum    {stratum.name}: {stratum.natural_share:.1%} of the logs,"
         f" {fed['drawn_share']:.1%} of the rows fed ({fed['logs_share']:.1%} logged)",
-        f"           its episode's rows were drawn {drawn:,} times; with equal probability: "
+        f"           its episode's rows were drawn {often:,} times; with equal probability: "
         f"{even:,.0f}",
         f"update     {audit['gradient_step']:,}, row {audit['batch_row']} of its batch",
-        f"           the critic predicted {audit['q']:.2f}, its target was {target:.2f}",
+        f"           the critic predicted {audit['q']:.2f}, its target was"
+        f" {audit['q'] - audit['td']:.2f}",
     ]
-
-
-def _draws(run: Path, panel: Panel, episode: str) -> tuple[int, float]:
-    """Count how often an episode's rows were drawn, and how often uniform draws would have."""
-    from restock.train.run.run import Run
-
-    logged = [
-        row
-        for row in Run.open(run).table("sampled_episodes").to_pylist()
-        if row["source"] == "logs"
-    ]
-    drawn = sum(row["drawn_rows"] for row in logged if row["episode"] == episode)
-    share = float((panel.meta_column("episode_id") == episode).mean())
-    return drawn, share * sum(row["drawn_rows"] for row in logged)
 
 
 def _message(name: str, fields: dict[str, Any]) -> str:
@@ -377,10 +396,8 @@ def _message(name: str, fields: dict[str, Any]) -> str:
         ranges = [r for r in fields.get("ranges", ()) if r is not None and math.isfinite(r)]
         return f"the nearest return is {min(ranges):.2f} m away" if ranges else "no return"
     if name == "command":
-        return (
-            f"asked for {fields.get('linear.x', 0.0):.2f} m/s and"
-            f" {fields.get('angular.z', 0.0):.2f} rad/s"
-        )
+        speed, turn = fields.get("linear.x", 0.0), fields.get("angular.z", 0.0)
+        return f"asked for {speed:.2f} m/s and {turn:.2f} rad/s"
     return ""
 
 

@@ -4,53 +4,23 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from restock.cli.start import stages
-from restock.cli.start.decisions import (
-    edited,
-    evidence_lines,
-    fit_is_worse,
-    floor_settings,
-    fullest,
-    has_goal,
-    horizon,
-    logs_alone_settings,
-    missions_unseen,
-    mistrust,
-    no_room,
-    no_ways,
-    node_refuses,
-    of_other_kinds,
-    possible_kinds,
-    practice_settings,
-    proposed_from,
-    robot_line,
-    several_kinds,
-    updates_settings,
-    wrong_outline,
-)
+from restock.cli.start import decisions, stages
+from restock.cli.start.decisions import NO_ROOM, Stop
 from restock.cli.start.outcomes import Document
-from restock.cli.start.stages import Settings, Stop
-from restock.cli.start.work import Ended, Work, escape
+from restock.cli.start.stages import Settings
+from restock.cli.start.work import Ended, Work, escape, speaker
 from restock.errors import ConfigError, ExitCode, RecordingError, counted, quoted
 
 HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
 ODOMETRY = "--odometry-as-command"
 MAX_FLOORS = 6
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
-
-
-class Stopped(Exception):
-    """The way ends here: a person must decide."""
-
-    def __init__(self, why: str, *remedies: str) -> None:
-        super().__init__(why)
-        self.stop = Stop(why, remedies)
 
 
 class Way:
@@ -87,8 +57,8 @@ class Way:
             twin = self._twin()
             self._policy(twin, coverage, panel)
             self._judge(twin, panel)
-        except Stopped as stopped:
-            return stopped.stop
+        except Stop as stop:
+            return stop
         return None
 
     def _warn(self, text: str) -> None:
@@ -103,7 +73,7 @@ class Way:
             if any("cannot be read" in why for why in found.errors):
                 known = "see the message for each above, or give other recordings"
             damaged = any("--salvage" in why for why in found.errors)
-            raise Stopped("no recording can be read", SALVAGING if damaged else known)
+            raise Stop("no recording can be read", SALVAGING if damaged else known)
         if not found.good:
             intact = f"the {len(readable)} that can be read"
             self.work.say(f"   continuing with {intact}; or {SALVAGING}")
@@ -112,9 +82,9 @@ class Way:
     def _profile(self, readable: list[Document]) -> None:
         """Take the user's profile or propose one, and check it against a recording."""
         requested, to = self.requested, self.to
-        recording = fullest({"recordings": readable}) or self.first
+        recording = decisions.fullest(readable) or self.first
         own = requested.profile is not None
-        proposed = not own and not edited(to.profile, requested.out)
+        proposed = not own and not decisions.edited(to.profile, requested.out)
         if proposed:
             self._propose(requested.paths if len(readable) != 1 else (recording,))
         elif requested.urdf is not None:
@@ -122,26 +92,25 @@ class Way:
             self._warn(
                 f"{to.profile} was {why}: --urdf can only change a proposal, and has no effect"
             )
-        others = [] if own or self.work.plan else of_other_kinds(requested.out)
-        mine = [row for row in readable if row["path"] not in others]
+        left_out, base = ([], None) if own or self.work.plan else decisions.proposal(requested.out)
+        mine = [row for row in readable if row["path"] not in left_out]
         if len(mine) < len(readable):
             self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
-            recording = fullest({"recordings": mine}) or recording
-        if not (own or self.work.plan):
-            recording = proposed_from(requested.out) or recording
+            recording = decisions.fullest(mine) or recording
+        recording = base or recording
         checked = self.work.do(stages.check(to, recording))
         if not checked.good:
             known = "; if it is of another robot, give only the recordings of this one"
-            raise Stopped(
+            raise Stop(
                 f"the profile does not fit {recording}",
                 f"edit {to.profile}{known if len(readable) > 1 else ''}",
                 self.again,
             )
-        outline = wrong_outline(checked.document, to.profile)
+        outline = decisions.wrong_outline(checked.document, to.profile)
         if outline is not None and not requested.accept:
-            raise Stopped(outline.why, *outline.remedies)
+            raise outline
         if not self.work.plan:
-            self.work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
+            self.work.say(f"   the robot in the twin: {escape(decisions.robot_line(to.profile))}")
 
     def _propose(self, sources: tuple[str, ...]) -> None:
         requested, to = self.requested, self.to
@@ -149,11 +118,11 @@ class Way:
         flags.append("--hindsight-goals")  # without a goal there is no success to train for
         proposed = self.work.do(stages.propose(to, sources, flags, requested.urdf))
         if not proposed.good:
-            raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
+            raise Stop("no profile can be proposed", f"write {to.profile}: docs/profile.md")
         document = proposed.document
         if not document.get("wheeled", True):
             Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
-            raise Stopped("; ".join(document["problems"]), "give recordings of a robot on wheels")
+            raise Stop("; ".join(document["problems"]), "give recordings of a robot on wheels")
         if problems := document.get("problems"):
             reported = f"edit {to.profile}: its first lines list what is missing"
             if document.get("missing"):
@@ -167,14 +136,13 @@ class Way:
                     f" --hindsight-goals --out FILE.toml`, and add --profile FILE.toml to this"
                     f" command; or {reported}"
                 )
-            raise Stopped("; ".join(problems), reported, self.again)
+            raise Stop("; ".join(problems), reported, self.again)
         if requested.accept:
             return
         if kinds := document.get("kinds"):
-            stop = several_kinds(kinds, requested)
-            raise Stopped(stop.why, *stop.remedies)
+            raise decisions.several_kinds(kinds, requested)
         if driving := document.get("commands", []):
-            raise Stopped(
+            raise Stop(
                 f"several topics may be the command that drives the robot: {', '.join(driving)}; "
                 "the profile uses the first",
                 f"edit `topic` of [inputs.command] in {to.profile}, and run the same command again",
@@ -185,15 +153,15 @@ class Way:
         """Ingest and mix; return the documents of coverage and panel."""
         to, do = self.to, self.work.do
         if not do(stages.ingest(to)).good:
-            raise Stopped("nothing could be ingested", f"edit {to.profile}", self.again)
+            raise Stop("nothing could be ingested", f"edit {to.profile}", self.again)
         covered = do(stages.coverage(to))
         if not self.work.plan:
-            for line in evidence_lines(to):
+            for line in decisions.evidence_lines(to):
                 self._warn(line)
         do(stages.audit(to))
         mixed = do(stages.mix(to))
         if not mixed.good:
-            raise Stopped(
+            raise Stop(
                 "the mixture does not fit these logs",
                 "write one that fits (docs/mixture.md), and add --mixture FILE to the command",
                 self.again,
@@ -210,7 +178,7 @@ class Way:
             sized = (
                 f"measure the robot, and edit length_m and width_m of [task.body] in {to.profile}"
             )
-            raise Stopped(
+            raise Stop(
                 f"{to.map} cannot be the floor of these recordings",
                 *([sized] if any("[task.body]" in why for why in floor.errors) else ()),
                 "give the map.yaml in which the robot was localised, or leave out --map: the "
@@ -218,19 +186,23 @@ class Way:
                 self.again,
             )
         to = self.to = replace(to, further_floors=self._further_floors(floor))
-        settings = practice_settings(to.profile)
+        settings = decisions.practice_settings(to.profile)
         if floor.good:
-            kinds = possible_kinds(to, floor.document)
-            settings += floor_settings(to, kinds)
-            if (unseen := missions_unseen(to, floor.document)) is not None:
-                self._warn(unseen)
+            kinds, unseen = decisions.possible_kinds(to, floor.document)
+            settings += decisions.floor_settings(to, kinds)
+            if unseen:
+                names = ", ".join(unseen).replace("_", " ")
+                self._warn(
+                    f"no missions of {names}: without a lidar, a robot finds it by driving into it"
+                )
                 to = replace(to, kinds=tuple(kinds))
         gap, fitted = self._fit()
         if fitted:
             settings.append(f"env.perturbation={to.fitted}")
-        why, remedy = no_room(floor), ""
+        nothing = floor.good and floor.document.get("episodes") == []
+        why, remedy = NO_ROOM if nothing else None, ""
         if why is None and requested.twin != "yes" and not self.work.plan:
-            why, remedy = mistrust(floor, gap), " (--twin yes overrides)"
+            why, remedy = decisions.mistrust(floor, gap), " (--twin yes overrides)"
         if why is not None:
             self._warn(f"no training in the twin{remedy}: {why}")
             return None
@@ -263,34 +235,36 @@ class Way:
 
     def _fit(self) -> tuple[Ended, bool]:
         """Return the gap of the twin that is used, and whether that is the fitted one."""
-        horizon_s = horizon(self.to.profile)
+        horizon_s = decisions.horizon(self.to.profile)
         fitted = self.work.do(stages.fit(self.to, horizon_s))
         gap = self.work.do(stages.gap(self.to, horizon_s, fitted=fitted.good))
-        if not (fitted.good and gap.good) or (why := fit_is_worse(gap.document)) is None:
+        if not (fitted.good and gap.good) or (why := decisions.fit_is_worse(gap.document)) is None:
             return gap, fitted.good
         self._warn(f"the fit is not used: {why}")
         return self.work.do(stages.gap(self.to, horizon_s, fitted=False)), False
 
     def _policy(self, floor: Ended | None, coverage: Document, panel: Document) -> None:
         requested, twin = self.requested, floor is not None
-        settings = [*self.to.train] if twin else logs_alone_settings(coverage)
-        settings += updates_settings(panel, requested.minutes, twin=twin, seconds=self.to.seconds)
+        settings = [*self.to.train] if twin else decisions.logs_alone_settings(coverage)
+        settings += decisions.updates_settings(
+            panel, requested.minutes, twin=twin, seconds=self.to.seconds
+        )
         self.to = replace(self.to, train=tuple(settings))
         trained = self.work.do(stages.train(self.to, twin=twin))
         if not trained.good:
-            raise Stopped("training did not finish", *trained.errors[:2], self.again)
+            raise Stop("training did not finish", *trained.errors[:2], self.again)
 
     def _judge(self, floor: Ended | None, panel: Document) -> None:
         """Evaluate in the twin and on held-out logs, and write one page."""
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
-            if floor.good and has_goal(to.profile):
-                why = None if self.work.plan else no_ways(to)
+            if floor.good and decisions.has_goal(to.profile):
+                why = None if self.work.plan else decisions.no_ways(to)
                 if why is None:
                     judged.append(do(stages.evaluate_on_ways(to)))
                 else:
                     self._warn(f"no evaluation on the routes of the logs: {why}")
-            judged.append(do(stages.evaluate(to, beside_logs=True)))
+            judged.append(do(stages.evaluate(to, "cloned")))
         if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
             judged.append(do(stages.judge(to)))
         else:
@@ -299,13 +273,11 @@ class Way:
                 f"be evaluated{'' if floor is None else ' on logs'}. Ingest more recordings.[/]"
             )
         if not do(stages.report(to)).good:
-            raise Stopped("there is no report", self.again)
+            raise Stop("there is no report", self.again)
         if failed := [ended for ended in judged if not ended.good]:
             why_failed = [one for ended in failed for one in ended.errors[:1]]
             names = " and ".join(f"`{ended.command}`" for ended in failed)
-            raise Stopped(
-                f"the report lacks the stages that failed: {names}", *why_failed, self.again
-            )
+            raise Stop(f"the report lacks the stages that failed: {names}", *why_failed, self.again)
 
 
 @dataclass
@@ -372,12 +344,7 @@ class StartCommand:
             raise ConfigError(f"must be a number above 0, got {self.minutes:g}", where="--minutes")
         self._check()
         first = self._expect_a_recording()
-        console = stderr() if self.json else stdout()
-
-        def say(line: str) -> None:
-            console.print(line, soft_wrap=True)
-            console.file.flush()  # what is on stderr comes after it
-
+        say = speaker(stderr() if self.json else stdout())
         work = Work(self.out, main, say, plan=self.dry_run)
         stopped = Way(self, work, first).go()
         page = self.out / "run" / "report.html"
@@ -385,8 +352,8 @@ class StartCommand:
         if self.json:
             print_json(
                 {
-                    "stages": work.summary(),
-                    "stopped": None if stopped is None else asdict(stopped),
+                    "stages": [ended.summary() for ended in work.ended],
+                    "stopped": stopped and {"why": stopped.why, "remedies": list(stopped.remedies)},
                     "report": str(page) if page.exists() and reported else None,
                 }
             )
@@ -394,7 +361,9 @@ class StartCommand:
             if not self.dry_run:
                 onnx = f"restock export {quoted(self.out / 'run')} --to onnx --out policy.onnx"
                 say(f"\nThe policy, for the robot: {escape(onnx)} (docs/deploy.md)")
-                if (needs := node_refuses(self.profile or self.out / "profile.toml")) is not None:
+                if (
+                    needs := decisions.node_refuses(self.profile or self.out / "profile.toml")
+                ) is not None:
                     say(f"   {escape(needs)} (docs/deploy.md#without-the-node)")
                 say(f"The report: [bold]{escape(str(page))}[/bold] (open it in a browser)")
             return int(ExitCode.OK)
@@ -469,6 +438,3 @@ class StartCommand:
             from restock.train.twin.floors.floor_files import read_grid
 
             read_grid(self.map)
-
-
-__all__ = ["StartCommand", "Way"]

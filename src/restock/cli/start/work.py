@@ -15,16 +15,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from restock.cli.start.outcomes import Document, errors
 from restock.cli.start.stages import Stage
 from restock.errors import ExitCode, RestockError, visible
 from restock.files import read_json, write_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 FOLDER, RECORD = "start", "stages.json"
 SMALL_BYTES = 1_000_000  # files up to this size are hashed; larger ones are known by size and time
@@ -52,12 +55,16 @@ class Ended:
         """Return whether the next stages can build on it."""
         return self.status != "failed"
 
+    def summary(self) -> dict[str, Any]:
+        """Return the result without the document of its verb."""
+        return {key: value for key, value in asdict(self).items() if key != "document"}
+
 
 class Work:
     """Runs stages in a folder of its own, and remembers them.
 
-    `say` prints a line. With `plan` nothing is run: the commands are said. With `explain` each
-    stage says why it is there.
+    `say` prints a line. With `plan` nothing is run: the commands are said. `why` says of a stage by
+    its name why it is there.
     """
 
     def __init__(
@@ -67,10 +74,10 @@ class Work:
         say: Callable[[str], None],
         *,
         plan: bool = False,
-        explain: bool = False,
+        why: Mapping[str, str] | None = None,
     ) -> None:
-        self.out, self.dispatch, self.say = out, dispatch, say
-        self.plan, self.explain = plan, explain
+        self.out, self.dispatch, self.say, self.plan = out, dispatch, say, plan
+        self.why = why or {}
         self.ended: list[Ended] = []
         self._stamps: list[str] = []
         self._known: dict[str, Any] = {}
@@ -94,8 +101,8 @@ class Work:
             KeyboardInterrupt: it was interrupted; the same stage then goes on, or begins again.
         """
         self.say(f"\n[bold]{len(self.ended) + 1}  {stage.title}[/bold]")
-        if self.explain:
-            self.say(f"[dim]{stage.why}[/dim]")
+        if (why := self.why.get(stage.name)) is not None:
+            self.say(f"[dim]{why}[/dim]")
         if self.plan:
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
             return self._note(Ended(stage.name, stage.line(), "planned"))
@@ -111,10 +118,10 @@ class Work:
             stage = replace(stage, command=command)
         began = self._known.get(stage.name, {})
         goes_on = bool(stage.resume) and began.get("stamp") == stamp and _resumable(stage)
-        if not goes_on:
-            self._clear(stage)
         if goes_on:
-            stage = _resumed(stage)
+            stage = replace(stage, command=list(stage.resume))
+        else:
+            self._clear(stage)
         self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
         # Begun, not ended: if this process dies now, the stage is run again.
         self._known[stage.name] = {"stamp": stamp, "status": "begun"}
@@ -152,13 +159,9 @@ class Work:
         )
         if document:
             write_text(self._document(stage), text)
-        self._known[stage.name] = _without_document(ended)
+        self._known[stage.name] = ended.summary()
         self._keep()
         return ended
-
-    def summary(self) -> list[dict[str, Any]]:
-        """Return each stage as `--json` prints it, without the document of its verb."""
-        return [_without_document(ended) for ended in self.ended]
 
     def _note(self, ended: Ended, *, reported: bool = False) -> Ended:
         """Report the result of a stage, and its complaints unless they were `reported` before."""
@@ -179,12 +182,10 @@ class Work:
             return None
         if any(ended.status == "done" for ended in self.ended):  # an earlier stage has changed
             return None
-        if not all(path.exists() for path in stage.writes) or not self._document(stage).exists():
+        document = self._document(stage)
+        if not all(path.exists() for path in (*stage.writes, document)):
             return None
-        document = _parsed(self._document(stage).read_text(encoding="utf-8"))
-        ended = Ended(**known, document=document)
-        ended.status = "kept"
-        return ended
+        return Ended(**known | {"status": "kept"}, document=_parsed(document.read_text("utf-8")))
 
     def _stamp(self, stage: Stage) -> str:
         """Hash all that decides a result: the command, the user's files, and the stages before."""
@@ -199,10 +200,8 @@ class Work:
             if stage.resume:
                 aside = self.out / "earlier"
                 aside.mkdir(exist_ok=True)
-                number = 1 + sum(1 for _ in aside.iterdir())
-                path.rename(aside / f"{path.name}-{number}")
-                put = escape(str(aside / f"{path.name}-{number}"))
-                self.say(f"   [dim]the earlier one is now {put}[/dim]")
+                put = path.rename(aside / f"{path.name}-{1 + len([*aside.iterdir()])}")
+                self.say(f"   [dim]the earlier one is now {escape(str(put))}[/dim]")
             elif path.is_dir():
                 shutil.rmtree(path)
             else:
@@ -213,10 +212,6 @@ class Work:
 
     def _keep(self) -> None:
         write_text(self.out / FOLDER / RECORD, json.dumps(self._known, indent=1) + "\n")
-
-
-def _without_document(ended: Ended) -> dict[str, Any]:
-    return {key: value for key, value in asdict(ended).items() if key != "document"}
 
 
 @contextmanager
@@ -265,6 +260,16 @@ class _Both:
         return getattr(self._stream, name)
 
 
+def speaker(console: Console) -> Callable[[str], None]:
+    """Return what prints a line of markup on a console at once: what is on stderr comes after."""
+
+    def say(line: str) -> None:
+        console.print(line, soft_wrap=True)
+        console.file.flush()
+
+    return say
+
+
 def escape(text: str) -> str:
     """Escape text for a console that reads markup."""
     return visible(text, keep="\n").replace("[", r"\[")
@@ -282,23 +287,14 @@ def _resumable(stage: Stage) -> bool:
     return any(any((path / "checkpoints").glob("*.safetensors")) for path in stage.writes)
 
 
-def _resumed(stage: Stage) -> Stage:
-    return replace(stage, command=list(stage.resume))
-
-
 def _fingerprint(path: Path) -> str:
     """Return what a user's file or folder holds now, as a text to compare."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     parts = []
-    for file in files:
-        if not file.is_file():
-            continue
+    for file in filter(Path.is_file, files):
         status = file.stat()
         reported = f"{status.st_size} {status.st_mtime_ns}"
         if status.st_size <= SMALL_BYTES:
             reported = hashlib.blake2b(file.read_bytes(), digest_size=12).hexdigest()
         parts.append(f"{file} {reported}")
     return "\n".join(parts)
-
-
-__all__ = ["FOLDER", "RECORD", "Ended", "Work", "escape"]
