@@ -6,7 +6,7 @@
 Records logs of seeds that no rule was set on, on the default floor and on `generated:test` floors
 (`--part development`: the seeds and `generated:train` floors that the rules were set on; `seen`:
 logs that were looked at while they were), ingests them, and prints precision and recall of each
-condition with 95 % intervals, the share that is too near to call, and the reliability of the
+condition with 95 % intervals, the share of uncertain steps, and the reliability of the
 probabilities. `--bound` adds the best that any rule could do: `label_bound.py`. `--fit` prints the
 weights of a condition's `odds` that suit the development
 logs best. What is in FOLDER is not recorded again; labels follow the rules as they are now.

@@ -437,7 +437,7 @@ class LabelQuality:
 
     group: str  # the value of the column asked for, or "all"
     score: LabelScore
-    uncertain: float | None  # share of the steps that are too near to call
+    uncertain: float | None  # share of uncertain steps
     precision: ConfidenceInterval  # of steps
     recall: ConfidenceInterval
     event_precision: ConfidenceInterval

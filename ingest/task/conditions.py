@@ -8,16 +8,16 @@ says what it may look at:
 - `pre`: known before acting at step t; looks at step t and earlier ones only;
 - `post`: about the outcome of step t; may look at t + 1 and later.
 
-What an expression computes may be named first: each `let` is a column for those after it, so that a
-window can look over another's results.
+Intermediate results may be named first: each `let` is a column that later ones may use, so that a
+window function can look over another's results.
 
-A condition may have a **probability** beside its label: an expression of the same kind that gives
-0 to 1, from how far the signals are from the rule's limits against the noise of the sensors. A step
-whose probability lies within the condition's `uncertain` band is too near to call.
+A condition may have a **probability** beside its label: an expression of the same kind with values
+from 0 to 1, computed from the distance of the signals to the rule's limits and the noise of the
+sensors. A step whose probability lies within the condition's `uncertain` band is uncertain.
 
 Its limits may follow the robot: its SQL may name the profile's [noise], and `Task.condition_limits`
 (how near is near, how much is slip, the control period); a number of steps may be written as a
-time, `{1.6 s}`, or as the way of a robot at its highest speed, `{0.2 m}`.
+time, `{1.6 s}`, or as a distance that the robot drives at its highest speed, `{0.2 m}`.
 
 A condition is of one of two kinds. An **outcome** (the default) names what came of it, and gives a
 row its one `condition`. An **exposure** names the situation, whatever came of it: someone close by,

@@ -303,7 +303,7 @@ def read_candidates(
 ) -> pa.Table:
     """Read every row of the connection's `transitions`, by recording, episode and step.
 
-    META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is too near to call), and one
+    META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is uncertain), and one
     boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0` …, and `state_0` …
     where the row's state alone has one of its own; text columns come as dictionaries, in order of
     appearance; `store` (int) says which store a row is from. Predicates see `conditions` as the

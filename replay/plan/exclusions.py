@@ -93,7 +93,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
     if mixture.unlabelled == "drop":
         out.add("without a coverage label", bare)
     if mixture.uncertain == "drop":
-        out.add("with a condition too near to call", bools(table, "uncertain"))
+        out.add("with an uncertain condition", bools(table, "uncertain"))
     return out
 
 

@@ -204,7 +204,7 @@ class PanelPlan:
     newest_ns: int  # when the newest row was logged
     as_of_ns: int | None  # what max_age_days counted to, where there is one
     others: tuple[PinnedStore, ...] = ()  # besides the first store
-    uncertain_rows: int = 0  # with a condition too near to call, of those admitted
+    uncertain_rows: int = 0  # with an uncertain condition, of those admitted
     ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
     warnings: tuple[str, ...] = ()  # of a source that may be an archive, or of the split
 

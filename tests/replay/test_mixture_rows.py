@@ -254,7 +254,7 @@ def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions):
     assert sum(row["condition"] == "wheel_slip" for row in condition) >= len(slips)
     assert all(row["condition"] in [*by_id[row["transition_id"]], "nominal"] for row in condition)
     plan, rows = planned_as("uncertain = 'drop'\n")
-    assert plan.left_out == {"with a condition too near to call": len(doubtful)}
+    assert plan.left_out == {"with an uncertain condition": len(doubtful)}
     assert rows["wheel_slip"] == before["wheel_slip"] - len(slips[::3])
     older = table.drop_columns(["uncertain"])
     assert planned(older, "uncertain = 'drop'\n" + NO_SPLIT + EVERY).left_out == {}

@@ -255,7 +255,7 @@ def _summary(document: dict[str, Any]) -> list[str]:
         )
     if document["uncertain_rows"]:
         lines.append(
-            f"{document['uncertain_rows']:,} rows have a condition too near to call: "
+            f"{document['uncertain_rows']:,} rows have an uncertain condition: "
             f"{_UNCERTAIN[document['uncertain']]}"
         )
     rules = dict.fromkeys(line["within"] for line in document["strata"])
