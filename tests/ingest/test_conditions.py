@@ -20,8 +20,7 @@ from restock.ingest.task.conditions import (
     shipped,
 )
 from restock.ingest.task.schema import SIGNAL_COLUMNS
-from restock.ingest.task.signals import Noise
-from restock.ingest.task.task import STAND_IN_LIMITS
+from restock.ingest.task.task import STAND_IN_LIMITS, Noise
 
 SHIPPED = list(shipped().values())
 
