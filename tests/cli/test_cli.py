@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from support.paths import ROOT
@@ -39,9 +38,7 @@ def test_every_verb_is_in_the_docs(command: str) -> None:
 
 
 @pytest.mark.parametrize("verb", RENAMED)
-def test_an_old_verb_is_answered_with_the_new_one(
-    verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_old_verb_is_answered_with_the_new_one(verb, capsys):
     assert cli.main([verb, "store"]) == ExitCode.USAGE
     said = capsys.readouterr().err
     assert RENAMED[verb] in said
@@ -50,9 +47,7 @@ def test_an_old_verb_is_answered_with_the_new_one(
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_removed_option_is_answered_with_the_new_way(
-    option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_removed_option_is_answered_with_the_new_way(option, capsys):
     command = option.rpartition(" ")[0] or "sql"
     assert cli.main([*command.split(), "place", f"--{option.partition('--')[2]}=1"]) == 2
     assert OPTIONS[option] in capsys.readouterr().err
@@ -164,9 +159,7 @@ def sample_rows(tmp_path):
     ],
     ids=" ".join,
 )
-def test_an_option_that_would_do_nothing_is_refused(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_that_would_do_nothing_is_refused(words, capsys):
     assert cli.main(words) == 2
     *_, last = (word for word in words if word.startswith("--"))
     assert last in capsys.readouterr().err
@@ -182,12 +175,7 @@ def test_an_option_that_would_do_nothing_is_refused(
     ],
     ids=" ".join,
 )
-def test_an_empty_path_is_not_the_working_directory(
-    words: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_empty_path_is_not_the_working_directory(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(words) == 2
     assert "variable of the shell not set" in capsys.readouterr().err

@@ -22,8 +22,6 @@ def test_a_script_has_every_verb(shell: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["bash"], ["perl", "-"]], ids=" ".join)
-def test_a_shell_and_a_file_are_needed(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_shell_and_a_file_are_needed(words, capsys):
     assert cli.main([cli.COMPLETION, *words]) == 2
     assert cli.COMPLETION in capsys.readouterr().err

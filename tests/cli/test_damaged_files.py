@@ -117,9 +117,7 @@ def check(
     ("name", "turn"),
     one_in(6 * len(DAMAGES) + 1, [(name, turn) for name in FILES for turn in range(len(DAMAGES))]),
 )
-def test_a_damaged_run_is_said_by_every_verb(
-    name: str, turn: int, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_run_is_said_by_every_verb(name, turn, root, tmp_path, capsys):
     whole = run_verbs(root / "run", root, tmp_path)
     for number, verb in enumerate(whole):
         if number % len(DAMAGES) != turn:  # every verb meets every file, each damage in turn
@@ -131,9 +129,7 @@ def test_a_damaged_run_is_said_by_every_verb(
 
 
 @pytest.mark.parametrize("how", DAMAGES)
-def test_what_a_verb_needs_is_named_by_its_file(
-    how: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_verb_needs_is_named_by_its_file(how, root, tmp_path, capsys):
     needed = {
         "report": "strata.parquet",
         "train": "checkpoints/latest.safetensors",
@@ -155,14 +151,7 @@ def test_what_a_verb_needs_is_named_by_its_file(
     ("key", "value", "before"),
     [("optimizer.learning_rate", 0.5, "0.001"), ("network.hidden", [9], "[8]"), ("seed", 3, "0")],
 )
-def test_a_config_that_was_edited_is_not_resumed(
-    key: str,
-    value: object,
-    before: str,
-    root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_config_that_was_edited_is_not_resumed(key, value, before, root, tmp_path, capsys):
     run = edited(root, tmp_path, {key: value, "schedule.env_steps": 41})
     assert check(run_verbs(run, root, tmp_path)["train"], run, capsys, said := []) == 2
     assert f"{run}/config.json: {key} is {value}, but the run was trained with {before}" in said[0]
@@ -197,9 +186,7 @@ def store_verbs(store: Path, out: Path) -> list[list[str]]:
 
 @pytest.mark.parametrize("table", ["recordings", "transitions"])
 @pytest.mark.parametrize("how", [*DAMAGES, "a page"])
-def test_a_store_with_a_damaged_file_is_said(
-    table: str, how: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_with_a_damaged_file_is_said(table, how, root, tmp_path, capsys):
     store = tmp_path / "store"
     shutil.copytree(root / "store", store)
     file = sorted((store / table).glob("*.parquet"))[0]
@@ -215,9 +202,7 @@ def test_a_store_with_a_damaged_file_is_said(
 
 
 @pytest.mark.parametrize("task", ["a key", "{", ""])
-def test_a_task_of_another_restock_is_said(
-    task: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_task_of_another_restock_is_said(task, root, tmp_path, capsys):
     store = tmp_path / "store"
     shutil.copytree(root / "store", store)
     for file in (store / "recordings").glob("*.parquet"):
@@ -246,9 +231,7 @@ def writers(root: Path, out: Path) -> list[list[str]]:
     ]
 
 
-def test_a_target_that_cannot_be_written_is_said(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_target_that_cannot_be_written_is_said(root, tmp_path, capsys):
     (tmp_path / "file").write_text("a file, where a folder is asked for")
     for argv in [*writers(root, tmp_path / "file"), ["train", "--out", str(tmp_path / "file/run")]]:
         assert check(argv, tmp_path / "file", capsys) == 2
@@ -259,13 +242,8 @@ def test_a_target_that_cannot_be_written_is_said(
     ("limit", "remedy"), [("0GB", 'write it like "4GB"'), ("1MB", "RESTOCK_MEMORY_LIMIT")]
 )
 def test_a_memory_limit_that_is_too_small_is_said(
-    limit: str,
-    remedy: str,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    limit, remedy, root, tmp_path, monkeypatch, capsys
+):
     store = str(root / "store")
     monkeypatch.setenv("RESTOCK_MEMORY_LIMIT", limit)
     for argv in (
@@ -282,9 +260,7 @@ def test_a_memory_limit_that_is_too_small_is_said(
         assert "damaged" not in said, argv
 
 
-def test_a_path_that_is_not_utf_8_is_no_bug(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_path_that_is_not_utf_8_is_no_bug(tmp_path, capsys):
     place = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")
     assert cli.main(["audit", place]) == 2
     said = " ".join(capsys.readouterr().err.split())
@@ -292,9 +268,7 @@ def test_a_path_that_is_not_utf_8_is_no_bug(
     assert r"/caf\xe9/transitions rename the folder" in said
 
 
-def test_what_nobody_foresaw_exits_2_and_developers_see_where(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_nobody_foresaw_exits_2_and_developers_see_where(monkeypatch, capsys):
     def broken(args: list[str]) -> int:
         return {}["a key"]  # type: ignore[no-any-return]
 

@@ -43,9 +43,7 @@ def test_it_names_the_worn_wheel(store: Path, capsys: pytest.CaptureFixture[str]
     assert cli.main(["coverage", "drift", str(store), "--exit-code"]) == 1
 
 
-def test_the_page_says_the_same_and_trusts_no_name(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_says_the_same_and_trusts_no_name(store, tmp_path, capsys):
     page = tmp_path / "pages" / "coverage.html"
     assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -61,9 +59,7 @@ def test_the_page_says_the_same_and_trusts_no_name(
     assert "link" not in read.tags
 
 
-def test_a_fleet_with_nothing_to_compare_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fleet_with_nothing_to_compare_says_so(tmp_path, capsys):
     store = fleet_store(tmp_path / "store", [SyntheticRobot(None)], weeks=1, episodes=2)
     page = tmp_path / "coverage.html"
     assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
@@ -80,9 +76,7 @@ def test_a_fleet_with_nothing_to_compare_says_so(
         assert "no change that matters" not in text.lower()
 
 
-def test_no_change_is_said_with_its_number_of_tests(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_change_is_said_with_its_number_of_tests(tmp_path, capsys):
     store = fleet_store(tmp_path / "store", [SyntheticRobot("amr-1")], recordings=3)
     page = tmp_path / "coverage.html"
     assert cli.main(["coverage", str(store), "--out", str(page)]) == 0

@@ -45,9 +45,7 @@ def check(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, dict[
     return code, {f"{one['part']}.{one['audit']}": one["status"] for one in checks}
 
 
-def test_what_was_lost_since_the_last_store_fails(
-    stores: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_lost_since_the_last_store_fails(stores, tmp_path, capsys):
     capsys.readouterr()
     junit = tmp_path / "check.xml"
     code, found = check(capsys, stores["one"], "--against", stores["both"], "--junit", junit)
@@ -66,9 +64,7 @@ def test_what_was_lost_since_the_last_store_fails(
     assert "fail" not in {status for name, status in found.items() if name.startswith("diff")}
 
 
-def test_an_audit_that_fails_fails_the_check(
-    stores: dict[str, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_audit_that_fails_fails_the_check(stores, capsys):
     capsys.readouterr()
     code, found = check(capsys, stores["both"], "--audits", stores["strict"])
     assert code == 1
@@ -77,9 +73,7 @@ def test_an_audit_that_fails_fails_the_check(
     assert found["audit.few_rows"] == "pass"
 
 
-def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
-    stores: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(stores, tmp_path, capsys):
     capsys.readouterr()
     code, found = check(capsys, stores["one"], "--against", tmp_path / "gone")
     assert code == 1
@@ -99,9 +93,7 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
         *(("coverage", "--out"), ("report", "--out")),
     ],
 )
-def test_a_folder_as_output_file_is_refused_early(
-    verb: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_as_output_file_is_refused_early(verb, option, tmp_path, capsys):
     """Before it is even looked whether there is a store."""
     capsys.readouterr()
     assert main([*verb.split(), str(tmp_path / "gone"), option, str(tmp_path)]) == 2
@@ -132,9 +124,7 @@ def test_a_run_must_have_passed_its_gate(tmp_path: Path, verdict: str, status: s
     assert finding.status == status
 
 
-def test_a_gate_of_something_else_fails_the_check(
-    stores: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gate_of_something_else_fails_the_check(stores, tmp_path, capsys):
     run = kept_run(tmp_path / "run")
     capsys.readouterr()
 

@@ -23,9 +23,7 @@ def lines_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
 
 
 @pytest.mark.parametrize("command", [name for name in cli.FOLDER_OF if name != "study"])
-def test_prose_is_wrapped_and_parted_by_single_empty_lines(
-    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prose_is_wrapped_and_parted_by_single_empty_lines(command, monkeypatch, capsys):
     for columns in COLUMNS:
         monkeypatch.setenv("COLUMNS", str(columns))
         lines = lines_of(capsys, *command.split())

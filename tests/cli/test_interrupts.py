@@ -54,9 +54,7 @@ def test_a_kill_does_what_ctrl_c_does_at_that_moment(number: int) -> None:
 
 
 @pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
-def test_a_process_ends_with_the_block_that_waits_for_it(
-    ctrl_c: Any,
-) -> None:
+def test_a_process_ends_with_the_block_that_waits_for_it(ctrl_c):
     """Also where Ctrl-C is ignored, as in the background of a script."""
 
     def waiting() -> subprocess.Popen[bytes]:
@@ -98,11 +96,8 @@ def usual_ctrl_c() -> Iterator[None]:
 
 @pytest.mark.usefixtures("usual_ctrl_c")
 def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
-    store_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    store_path, tmp_path, monkeypatch, capsys
+):
     def stopped(*_: Any, **__: Any) -> None:
         with duckdb.connect(config={"threads": 1}) as connection:
             connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
@@ -116,9 +111,7 @@ def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")
-def test_a_second_interrupt_ends_a_training_at_once(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_second_interrupt_ends_a_training_at_once(capsys):
     with kill_as_interrupt(), _stop_on_interrupt() as stop:
         assert not stop()
         os.kill(os.getpid(), signal.SIGTERM)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,9 +21,7 @@ def reported(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
     return code, {one["name"]: one for one in found}
 
 
-def test_a_machine_on_which_the_tests_run_is_well(
-    store_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_machine_on_which_the_tests_run_is_well(store_path, capsys):
     code, found = reported(capsys, str(store_path))
     assert code == 0
     assert " transitions of 3 recordings in 3 Parquet files" in found["rows"]["what"]
@@ -35,9 +32,7 @@ def test_a_machine_on_which_the_tests_run_is_well(
     assert not {"ruff", "mypy", "pytest"} & set(found)  # what developers need is no extra
 
 
-def test_what_is_missing_or_too_old_is_named_with_its_remedy(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_missing_or_too_old_is_named_with_its_remedy(monkeypatch, capsys):
     wanted = [
         *("duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"),
         "of-another-machine>=1; platform_machine == 'pdp11'",
@@ -65,9 +60,7 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(
         ),
     ],
 )
-def test_an_extra_is_added_to_the_restock_that_is_installed(
-    direct_url: str | None, command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_extra_is_added_to_the_restock_that_is_installed(direct_url, command, monkeypatch):
     monkeypatch.setattr(metadata.PathDistribution, "read_text", lambda *_: direct_url)
     assert install_command("onnx") == command
     with pytest.raises(ConfigError, match=re.escape(f"{command}, or do without")):

@@ -43,9 +43,7 @@ def test_training_records_no_success(run: Path) -> None:
 
 
 @pytest.mark.long
-def test_eval_report_card_and_compare_say_no_goal(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_report_card_and_compare_say_no_goal(run, capsys):
     evaluate = ["eval", str(run), "--episodes", "1", "--perturbations", "none"]
     assert cli.main([*evaluate, "--policies", "agent,planner", "--json"]) == 0
     results = json.loads(capsys.readouterr().out)["results"]

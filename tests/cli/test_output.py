@@ -31,9 +31,7 @@ def test_a_pipe_gets_all_of_a_table_in_120_columns(capsys: pytest.CaptureFixture
     assert "\x1b" not in text
 
 
-def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(monkeypatch, capsys):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "72")
@@ -52,9 +50,7 @@ def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(
     assert max(map(len, bare.splitlines())) <= 72
 
 
-def test_a_long_recording_shows_how_far_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_long_recording_shows_how_far_it_is(monkeypatch, capsys, tmp_path):
     """On stderr, if that is a terminal: what is read of a recording, and of how much."""
     reported: list[tuple[str, int, int]] = []
     original = output.Advance.part

@@ -21,9 +21,7 @@ def cut(tmp_path: Path) -> Path:
     return bag
 
 
-def test_losses_are_reported_by_new_and_by_check(
-    tmp_path: Path, cut: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_losses_are_reported_by_new_and_by_check(tmp_path, cut, capsys):
     """Of a bag whose ingest ended with 3, `new` said nothing, and both ended with 0."""
     file = tmp_path / "robot.toml"
     assert cli.main(["profile", "new", str(cut), "--out", str(file), "--salvage"]) == 3

@@ -436,9 +436,7 @@ def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
 
 
-def test_the_verb_writes_the_page_and_its_figures(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_writes_the_page_and_its_figures(run, tmp_path, capsys):
     out, folder = tmp_path / "deep" / "page.html", tmp_path / "deep" / "figures"
     words = ["report", str(run), "--out", str(out), "--figures", str(folder), "--json"]
     assert cli.main(words) == 0
@@ -452,9 +450,7 @@ def test_the_verb_writes_the_page_and_its_figures(
     ElementTree.parse(folder / "map-where-the-logs-have-been.svg")
 
 
-def test_no_command_writes_into_a_store_or_another_run(
-    run: Path, store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path, capsys):
     own = tmp_path / "run"
     shutil.copytree(run, own)
     before = sorted([*store_path.rglob("*"), *run.rglob("*")])

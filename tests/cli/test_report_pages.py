@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from support.finished_runs import document, make_run
 from support.page_scripts import charts_of
 from support.stores import recording_transitions, write_store
@@ -120,9 +119,7 @@ def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
     assert HOSTILE in found.text  # shown, as text
 
 
-def test_a_store_has_a_page_of_what_it_holds(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, capsys):
     page = tmp_path / "page.html"
     argv = ["coverage", str(store_path), "--out", str(page)]
     assert main(argv) == 0

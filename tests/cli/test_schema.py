@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -106,9 +105,7 @@ def test_what_restock_refuses_is_underlined(name: str, toml: str, said: str) -> 
     assert said in "; ".join(problems(name, tomllib.loads(toml)))
 
 
-def test_the_command_prints_lists_and_writes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_lists_and_writes(tmp_path, capsys):
     assert cli.main(["profile", "schema", "--json"]) == 0
     assert [row["name"] for row in json.loads(capsys.readouterr().out)] == list(CONFIGS)
     assert cli.main(["profile", "schema", "study"]) == 0

@@ -98,9 +98,7 @@ def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_a_dry_run_prints_commands_and_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, capsys):
     out, bags = tmp_path / "out", tmp_path / "bags"
     recording = write_bag(Drive(), bags / "drive")
     assert cli.main(["start", str(bags), "--out", str(out), "--dry-run"]) == 0
@@ -113,9 +111,7 @@ def test_a_dry_run_prints_commands_and_writes_nothing(
     assert not out.exists()
 
 
-def test_a_dry_run_refuses_what_the_run_would(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_refuses_what_the_run_would(tmp_path, capsys):
     recording = str(write_bag(Drive(), tmp_path / "drive"))
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "thesis.tex").touch()
@@ -178,9 +174,7 @@ class Parked(Drive):
         return topics
 
 
-def test_a_bag_without_commands_stops_at_the_proposal(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bag_without_commands_stops_at_the_proposal(tmp_path, capsys):
     recording = write_bag(Parked(), tmp_path / "parked")
     out = tmp_path / "out"
     code, document = start(capsys, str(recording), "--out", str(out))
@@ -199,9 +193,7 @@ class Lost(Drive):
         return {name: topics[name] for name in ("/cmd_vel", "/scan")}
 
 
-def test_commands_and_poses_in_different_recordings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_and_poses_in_different_recordings(tmp_path, capsys):
     """Of a Nav2 cart only the one was told as missing, though the other recording has it."""
     write_bag(Lost(), tmp_path / "bags" / "commands")
     write_bag(Parked(), tmp_path / "bags" / "poses")
@@ -212,9 +204,7 @@ def test_commands_and_poses_in_different_recordings(
     assert "give recordings that contain it" in document["stopped"]["remedies"][0]
 
 
-def test_an_edited_profile_is_taken_and_never_replaced(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_edited_profile_is_taken_and_never_replaced(tmp_path, capsys):
     recording = write_bag(Drive(), tmp_path / "drive")
     out = tmp_path / "out"
     argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))
@@ -232,9 +222,7 @@ def test_an_edited_profile_is_taken_and_never_replaced(
     assert profile.read_text() == mine
 
 
-def test_a_copy_of_a_recording_is_not_counted_twice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_copy_of_a_recording_is_not_counted_twice(tmp_path, capsys):
     """The store had half of the transitions that were told."""
     bags = tmp_path / "bags"
     recording = write_bag(Drive(), bags / "drive")
@@ -251,9 +239,7 @@ def test_a_copy_of_a_recording_is_not_counted_twice(
 
 
 @pytest.mark.long
-def test_without_a_trusted_twin_the_policy_is_from_logs_alone(
-    tmp_path: Path, quick_models: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_trusted_twin_the_policy_is_from_logs_alone(tmp_path, quick_models, capsys):
     recording = write_bag(Drive(12.0), tmp_path / "drive")
     out = tmp_path / "out"
     argv = (str(recording), "--out", str(out), "--minutes", "0.02")
@@ -272,9 +258,7 @@ def test_without_a_trusted_twin_the_policy_is_from_logs_alone(
 
 
 @pytest.mark.long
-def test_a_person_chooses_among_command_topics(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_person_chooses_among_command_topics(tmp_path, capsys):
     recording = write_bag(Drive(proposals="/base/cmd_vel"), tmp_path / "drive")
     out = tmp_path / "out"
     argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))

@@ -41,9 +41,7 @@ def test_a_worse_fit_is_reported_with_its_figures() -> None:
     assert fit_is_worse(gap(described, ("heading", "calibrated", 0.9, 0.9))) is None
 
 
-def test_a_lidar_that_sees_into_the_robot_stops_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_lidar_that_sees_into_the_robot_stops_it(tmp_path, capsys):
     """A robot of 4 x 3 m in a small room went all the way to a policy."""
     recording, out = write_bag(Drive(), tmp_path / "drive"), tmp_path / "out"
     argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))

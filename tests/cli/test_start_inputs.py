@@ -60,9 +60,7 @@ def damaged(tmp_path: Path) -> Path:
     return bag
 
 
-def test_salvage_reads_a_damaged_recording_as_far_as_intact(
-    tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, damaged, capsys):
     """And its map of another frame stops it at the floor."""
     out, hall = tmp_path / "out", tmp_path / "hall.yaml"
     write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
@@ -105,9 +103,7 @@ WHEEL = """<link name='{0}'><collision><geometry><cylinder radius='0.09' length=
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, capsys):
     urdf, hall, out = tmp_path / "cart.urdf", tmp_path / "hall.yaml", tmp_path / "out"
     urdf.write_text(CART.format(WHEEL.format("left", 0.22) + WHEEL.format("right", -0.22)))
     write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
@@ -144,9 +140,7 @@ def test_a_robots_own_types_are_read_by_their_definitions(tmp_path: Path) -> Non
     assert "--definitions" in recording["topics"]["/accel"]["skipped"]
 
 
-def test_what_is_no_recording_is_refused_and_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("text.mcap").write_text("text\n")
     Path("bags").mkdir()
@@ -169,9 +163,7 @@ def test_what_is_no_recording_is_refused_and_nothing_is_written(
 
 
 @pytest.mark.long
-def test_unread_recordings_are_sorted_by_kind_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unread_recordings_are_sorted_by_kind_too(tmp_path, monkeypatch, capsys):
     """The small drive of another robot was ingested with the others."""
     monkeypatch.setattr(drives, "drives_by_kind", partial(drives.drives_by_kind, most=2))
     bags, out = tmp_path / "bags", tmp_path / "out"
@@ -223,13 +215,8 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
     ],
 )
 def test_wrong_options_are_refused_before_the_first_stage(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    option: str,
-    value: str,
-    why: str,
-) -> None:
+    tmp_path, monkeypatch, capsys, option, value, why
+):
     monkeypatch.chdir(tmp_path)
     Path("a_file").touch()
     Path("box.urdf").write_text("<robot name='box'><link name='base_link'/></robot>")
@@ -241,9 +228,7 @@ def test_wrong_options_are_refused_before_the_first_stage(
 
 
 @pytest.mark.parametrize("lidar", [True, False])
-def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(
-    tmp_path: Path, lidar: bool
-) -> None:
+def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(tmp_path, lidar):
     profile = tmp_path / "robot.toml"
     text = profile_toml(load_profile("turtlebot3"))
     if not lidar:

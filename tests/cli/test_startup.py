@@ -75,9 +75,7 @@ def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     ],
     ids=["ingest", "sql"],
 )
-def test_missing_paths_are_reported_before_heavy_imports(
-    command: tuple[str, ...], unused: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_paths_are_reported_before_heavy_imports(command, unused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert loaded(*command, codes=(2,)) & unused == set()
 
@@ -121,9 +119,7 @@ def test_pandas_works_once_it_is_imported() -> None:
     ("verb", "environment", "threads"),
     [("audit", {}, "1"), ("audit", {"OPENBLAS_NUM_THREADS": "3"}, "3"), ("train", {}, "")],
 )
-def test_a_short_command_starts_no_threads_of_blas(
-    verb: str, environment: dict[str, str], threads: str
-) -> None:
+def test_a_short_command_starts_no_threads_of_blas(verb, environment, threads):
     code = (
         "import os, sys; from restock.cli import main; main(sys.argv[1:]);"
         "sys.stderr.write(os.environ.get('OPENBLAS_NUM_THREADS', ''))"

@@ -83,9 +83,7 @@ def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
     ],
     ids=" ".join,
 )
-def test_verbs_refuse_damaged_rows(
-    verb: list[str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_verbs_refuse_damaged_rows(verb, store, tmp_path, capsys):
     file, out = rows_file(store), tmp_path / "out.npz"
     flip(file, 1000)
     argv = [{"STORE": str(store), "OUT": str(out)}.get(word, word) for word in verb]

@@ -102,18 +102,14 @@ def run_part(
 
 @pytest.mark.docs
 @pytest.mark.parametrize("part", PARTS_RUN, ids=part_name)
-def test_a_page_runs_as_printed(
-    part: tuple[Path, int], server: Reader, prepared: Path, tmp_path: Path
-) -> None:
+def test_a_page_runs_as_printed(part, server, prepared, tmp_path):
     run_part(part, server, prepared, tmp_path / "reader", slow=False)
 
 
 @pytest.mark.docs
 @pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS_SLOW, ids=part_name)
-def test_a_page_runs_with_its_slow_blocks(
-    part: tuple[Path, int], server: Reader, prepared: Path, tmp_path: Path
-) -> None:
+def test_a_page_runs_with_its_slow_blocks(part, server, prepared, tmp_path):
     run_part(part, server, prepared, tmp_path / "reader", slow=True)
 
 

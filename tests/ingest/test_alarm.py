@@ -63,9 +63,7 @@ def test_alarms_a_second_apart_count_as_two() -> None:
         (0.1, 17, 1, "needs 2 episodes without a failure, there are 1"),
     ],
 )
-def test_a_rate_that_cannot_be_stated_is_refused(
-    miss_rate: float, failures: int, safe: int, why: str
-) -> None:
+def test_a_rate_that_cannot_be_stated_is_refused(miss_rate, failures, safe, why):
     with pytest.raises(ConfigError, match=why):
         fitted(np.random.default_rng(0), failures, miss_rate, safe)
 

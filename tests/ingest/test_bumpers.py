@@ -69,9 +69,7 @@ def bumper(kind: str) -> tuple[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["Bumper", "HazardDetectionVector", "SensorState", "BumperEvent"])
-def test_a_bumper_of_a_known_type_is_proposed_and_read(
-    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bumper_of_a_known_type_is_proposed_and_read(kind, tmp_path, capsys):
     topics = typed_topics(Drive(SECONDS))
     del topics["/bumper"]
     bag = write_topics(topics | {"/touch": bumper(kind)}, tmp_path / "bag", storage="mcap")

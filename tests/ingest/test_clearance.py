@@ -49,9 +49,7 @@ def scans(beams: list[int], firsts: list[float], seed: int) -> dict[str, FieldCo
     st.sampled_from([1, 100, 1 << 18]),
     st.integers(0, 99),
 )
-def test_a_scan_by_itself_gives_what_it_gives_among_others(
-    kinds: list[tuple[int, float]], at: int, values: int, seed: int
-) -> None:
+def test_a_scan_by_itself_gives_what_it_gives_among_others(kinds, at, values, seed):
     fields = scans([beams for beams, _ in kinds], [first for _, first in kinds], seed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(needs, "_VALUES", values)

@@ -76,9 +76,7 @@ def test_a_route_is_seen_alike(seed: int, count: int, points: int, share: float)
 
 @many
 @given(seeds, sizes, sector_counts, spoilt)
-def test_returns_on_a_plan_are_found_alike(
-    seed: int, count: int, sectors: int, share: float
-) -> None:
+def test_returns_on_a_plan_are_found_alike(seed, count, sectors, share):
     rng = np.random.default_rng(seed)
     task = msgspec.structs.replace(TASK, sectors=sectors)
     clearance, plan = rng.uniform(0, 9, (count, sectors)), plans_of(rng, count, 7)
@@ -92,9 +90,7 @@ def test_returns_on_a_plan_are_found_alike(
 
 @many
 @given(seeds, sizes, sector_counts, st.integers(1, 12), spoilt)
-def test_who_came_nearer_is_found_alike(
-    seed: int, count: int, sectors: int, steps: int, share: float
-) -> None:
+def test_who_came_nearer_is_found_alike(seed, count, sectors, steps, share):
     rng = np.random.default_rng(seed)
     task = msgspec.structs.replace(TASK, sectors=sectors)
     walls = rng.uniform(0.0, 5.0, (count, sectors))

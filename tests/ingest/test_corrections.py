@@ -85,9 +85,7 @@ def soon(store: Path) -> list[int]:
     return [step for step, holds in found if holds]
 
 
-def test_corrections_survive_relabelling_and_ingest(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_corrections_survive_relabelling_and_ingest(store, tmp_path, capsys):
     before = soon(store)
     said(store, 2, 4, True)
     said(store, before[0], before[1], False)
@@ -178,9 +176,7 @@ STRETCHES = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 6), st.boolean
 
 @settings(max_examples=80)
 @given(STRETCHES, STRETCHES)
-def test_what_is_said_last_counts_and_nothing_is_said_twice(
-    first: list[tuple[int, int, bool]], second: list[tuple[int, int, bool]]
-) -> None:
+def test_what_is_said_last_counts_and_nothing_is_said_twice(first, second):
     moments = Moments(np.zeros(20, np.int64), np.arange(20) * 100)
     painted = np.full(20, -1)
 
@@ -219,9 +215,7 @@ def test_episodes_tell_repeated_times_apart() -> None:
     assert moments.covered(moved).tolist() == [True, False, True, False]
 
 
-def test_label_uses_the_profile_kept_in_the_store(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_label_uses_the_profile_kept_in_the_store(store, tmp_path, capsys):
     text = (tmp_path / "amr.toml").read_text().replace('name = "warehouse_amr"', 'name = "own"', 1)
     (tmp_path / "amr.toml").write_text(text)
     assert ingest(tmp_path, force=True) == 0

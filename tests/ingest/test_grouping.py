@@ -93,17 +93,8 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     whole=st.one_of(st.none(), st.floats(0.3, 0.99)),
 )
 def test_any_grouping_of_an_mcap_gives_the_same_columns(
-    tmp_path_factory: pytest.TempPathFactory,
-    sample: Path,
-    chunk_size: int,
-    size: int,
-    rows: int,
-    seed: int,
-    chunked: bool,
-    compression: CompressionType,
-    index: IndexType,
-    whole: float | None,
-) -> None:
+    tmp_path_factory, sample, chunk_size, size, rows, seed, chunked, compression, index, whole
+):
     path = shuffled(
         sample,
         tmp_path_factory.mktemp("shuffled") / "run.mcap",
@@ -161,9 +152,7 @@ def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None
     parts=st.lists(st.lists(st.lists(st.integers(0, 9), max_size=4), max_size=5), max_size=6),
     expected=st.integers(0, 40),
 )
-def test_a_column_that_grows_is_its_parts_one_after_the_other(
-    parts: list[list[list[int]]], expected: int
-) -> None:
+def test_a_column_that_grows_is_its_parts_one_after_the_other(parts, expected):
     def column(rows: list[list[int]]) -> Ragged:
         flat = np.array([value for row in rows for value in row], np.int32)
         return Ragged(flat, offsets_of(np.array([len(row) for row in rows], np.int64)))

@@ -42,9 +42,7 @@ def one(
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
-def test_limited_speeds_never_grow_or_turn_round(
-    of: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
-) -> None:
+def test_limited_speeds_never_grow_or_turn_round(of, command, clearance, before):
     found = one(of, command, clearance, before)
     allowed, proposed = found.command[0], np.array(command)
     assert np.isfinite(allowed).all()
@@ -59,9 +57,7 @@ def test_limited_speeds_never_grow_or_turn_round(
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, clearances, speeds)
-def test_more_room_never_means_less_speed(
-    of: Limits, command: tuple[float, float], near: F64, more: F64, before: tuple[float, float]
-) -> None:
+def test_more_room_never_means_less_speed(of, command, near, more, before):
     tight = one(of, command, near, before).command
     roomy = one(of, command, np.minimum(near + more, TASK.range_max_m), before).command
     assert (np.abs(roomy) >= np.abs(tight) - 1e-9).all()
@@ -69,9 +65,7 @@ def test_more_room_never_means_less_speed(
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
-def test_what_was_allowed_is_allowed_again(
-    of: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
-) -> None:
+def test_what_was_allowed_is_allowed_again(of, command, clearance, before):
     once = one(of, command, clearance, before).command[0]
     again = one(of, tuple(once.tolist()), clearance, before).command[0]
     np.testing.assert_allclose(again, once, atol=2e-6)

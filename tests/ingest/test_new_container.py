@@ -6,8 +6,6 @@ import json
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-import pytest
-
 from restock.ingest.containers import open_recording as opening
 from restock.ingest.containers.open_recording import open_recording, recordings_in
 from restock.ingest.containers.storage import (
@@ -62,9 +60,7 @@ ROW = Container(
 )
 
 
-def test_a_container_is_one_class_and_one_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_container_is_one_class_and_one_row(tmp_path, monkeypatch):
     monkeypatch.setattr(opening, "CONTAINERS", (*opening.CONTAINERS, ROW))
     lines = [json.dumps({"ns": ns, "message": {"mps": ns / 10}}) for ns in (10, 20, 30)]
     path = tmp_path / "run.jsonl"

@@ -170,9 +170,7 @@ def test_configured_again_it_has_the_new_limits(tmp_path: Path) -> None:
     assert (limits.fastest[0], limits.stop_m) == (0.3, 0.5)
 
 
-def test_silence_stale_inputs_and_a_stalled_timer_are_stops(
-    policy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silence_stale_inputs_and_a_stalled_timer_are_stops(policy, monkeypatch):
     graph, node = started(policy)
     node.trigger_activate()
     graph.fire()
@@ -319,9 +317,7 @@ def test_parameters_choose_the_command_and_its_limits(policy: Path) -> None:
     assert {message.data for message in graph.of(LIMITER)} & {1}
 
 
-def test_in_shadow_it_commands_nothing(
-    policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_in_shadow_it_commands_nothing(policy, tmp_path, capsys):
     graph, node = started(policy, drive=False)
     node.trigger_activate()
     robot, twist = TwinRobot(graph, SPEC), message_class("geometry_msgs/msg/Twist")
@@ -363,9 +359,7 @@ def test_in_shadow_it_commands_nothing(
     assert policies == [PROFILE.behaviour_policy]
 
 
-def test_a_takeover_silences_it_and_its_rows_are_the_operators(
-    policy: Path, tmp_path: Path
-) -> None:
+def test_a_takeover_silences_it_and_its_rows_are_the_operators(policy, tmp_path):
     graph, node = started(policy)
     node.trigger_activate()
     robot = TwinRobot(graph, SPEC)

@@ -175,9 +175,7 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_policy_is_refused(
-    name: str, policy: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_hostile_policy_is_refused(name, policy, run, tmp_path, capsys):
     change, why = HOSTILE[name]
     file = changed_policy(policy, tmp_path / "p.onnx", change)
     assert run_node([str(file), "--on", str(BAG)]) == 2
@@ -191,9 +189,7 @@ def test_hostile_policy_is_refused(
 @pytest.mark.parametrize(
     "argv", [["gate", "--baseline"], ["eval", "--policies"]], ids=lambda argv: argv[0]
 )
-def test_every_verb_refuses_a_damaged_policy(
-    argv: list[str], policy: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_verb_refuses_a_damaged_policy(argv, policy, run, tmp_path, capsys):
     damaged = bytearray(policy.read_bytes())
     damaged[len(damaged) // 2] ^= 1
     file = tmp_path / "damaged.onnx"

@@ -46,9 +46,7 @@ def documented() -> dict[str, dict[str, str]]:
         (Zone, "`[frames]`, `[motion]` and `[[zone]]`", "zone."),
     ],
 )
-def test_the_page_has_every_key_and_its_default(
-    kind: type[msgspec.Struct], heading: str, prefix: str
-) -> None:
+def test_the_page_has_every_key_and_its_default(kind, heading, prefix):
     rows = documented()[heading]
     fields = {field.encode_name: field.default for field in msgspec.structs.fields(kind)}
     keys = {key.removeprefix(prefix) for key in rows if key.startswith(prefix)}

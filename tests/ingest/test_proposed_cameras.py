@@ -12,9 +12,7 @@ from restock.ingest.propose.candidates import camera_topics
 from restock.ingest.propose.propose import propose_profile
 
 
-def test_an_uncommented_proposed_camera_works(
-    tmp_path: Path,
-) -> None:
+def test_an_uncommented_proposed_camera_works(tmp_path):
     with open_recording(camera_bag(tmp_path / "bag")) as recording:
         text = propose_profile(recording, "robot").toml
     assert parse_profile(text, where="test").cameras == {}

@@ -77,9 +77,7 @@ def both(path: Path, monkeypatch: pytest.MonkeyPatch, **options: bool) -> Iterat
         yield content(path, **options)
 
 
-def test_the_messages_are_the_same_in_the_same_order(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_messages_are_the_same_in_the_same_order(recording, monkeypatch):
     ahead, plain = both(recording, monkeypatch)
     assert ahead == plain
     messages, reported = ahead  # type: ignore[misc]
@@ -88,9 +86,7 @@ def test_the_messages_are_the_same_in_the_same_order(
     assert inflating() == []
 
 
-def test_damage_is_told_in_the_same_words_and_order(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damage_is_told_in_the_same_words_and_order(recording, monkeypatch):
     ahead, plain = both(spoilt(recording, 4), monkeypatch)
     assert ahead == plain
     _, (damage, *_) = ahead  # type: ignore[misc]

@@ -225,9 +225,7 @@ def test_finding_recordings(tmp_path: Path) -> None:
         recordings_in(tmp_path / "empty")
 
 
-def test_an_unreadable_folder_costs_itself_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, capsys):
     """A folder that is somebody else's, and a link to a disk that is not mounted any more."""
     locked = tmp_path / "locked"
     locked.mkdir()

@@ -164,9 +164,7 @@ def test_a_base_of_another_name_is_the_link_that_no_joint_places(base: str) -> N
         max_size=6,
     )
 )
-def test_any_tree_of_joints_ends_in_values_or_a_sentence(
-    parts: list[tuple[str, str, str, str, str]],
-) -> None:
+def test_any_tree_of_joints_ends_in_values_or_a_sentence(parts):
     """Loops, orphans, numbers that are none: nothing raises, and what is taken is finite."""
     body = "".join(
         link(f"l{i}", shape) + joint(f"l{i}", xyz, axis, kind, parent)

@@ -96,9 +96,7 @@ def episode(graph: RosGraph, hand: range = range(0)) -> Iterator[TwinRobot]:
             return
 
 
-def test_it_drives_the_twin_to_its_goal_but_for_a_takeover(
-    policy: Path, graph: RosGraph, tmp_path: Path
-) -> None:
+def test_it_drives_the_twin_to_its_goal_but_for_a_takeover(policy, graph, tmp_path):
     with node_process(tmp_path / "log", str(policy), *DRIVES):
         *_, robot = drives = list(episode(graph, hand := range(20, 30)))
     assert bool(robot.info["success"][0])
@@ -126,9 +124,7 @@ def test_it_drives_the_twin_to_its_goal_but_for_a_takeover(
         (("configure", "shutdown"), signal.SIGINT),
     ],
 )
-def test_a_signal_ends_it_in_every_state(
-    policy: Path, graph: RosGraph, tmp_path: Path, to: tuple[str, ...], number: int
-) -> None:
+def test_a_signal_ends_it_in_every_state(policy, graph, tmp_path, to, number):
     log = tmp_path / "log"
     with node_process(log, str(policy)) as process:
         graph.until(lambda: "waits for" in log.read_text(encoding="utf-8"))
@@ -140,9 +136,7 @@ def test_a_signal_ends_it_in_every_state(
     assert not graph.of(COMMAND)
 
 
-def test_a_signal_while_it_drives_ends_with_a_stop(
-    policy: Path, graph: RosGraph, tmp_path: Path
-) -> None:
+def test_a_signal_while_it_drives_ends_with_a_stop(policy, graph, tmp_path):
     with node_process(tmp_path / "log", str(policy), *DRIVES) as process:
         for _ in episode(graph):
             if graph.of(COMMAND)[-1].linear.x > 0:

@@ -87,9 +87,7 @@ def test_a_wrong_length_that_leads_astray(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
-def test_without_a_summary_chunks_show_themselves(
-    compression: CompressionType, tmp_path: Path
-) -> None:
+def test_without_a_summary_chunks_show_themselves(compression, tmp_path):
     path = write_mcap(tmp_path / "run.mcap", compression=compression)
     places = chunks_of(path)
     held = sum(McapFile(path)._contents.chunks[2].counts().values())

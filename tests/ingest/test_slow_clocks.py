@@ -260,13 +260,8 @@ def stamp_of(message: Any) -> int:
     ],
 )
 def test_rows_of_slow_simulations_are_those_of_plain_loops(
-    bag: str,
-    odom: str,
-    command: str,
-    period: float,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    bag, odom, command, period, tmp_path, capsys
+):
     stamped = command == odom
     profile = tmp_path / "sim.toml"
     profile.write_text(

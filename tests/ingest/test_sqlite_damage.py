@@ -192,9 +192,7 @@ def test_a_lost_message_is_counted_once(whole: Path, tmp_path: Path) -> None:
     assert reported[1] == reported[2] == reported[0]
 
 
-def test_exit_codes_of_a_damaged_file(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exit_codes_of_a_damaged_file(whole, tmp_path, capsys):
     file = tmp_path / "run.db3"
     file.write_bytes(DAMAGE["a leaf is zeros"](bytearray(whole.read_bytes())))
     assert main(["info", str(file)]) == 2

@@ -133,9 +133,7 @@ def bag(folder: Path, *, pivots: bool) -> Path:
     )
 
 
-def test_a_proposal_names_a_robot_that_steers_with_its_evidence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path, capsys):
     file = tmp_path / "car.toml"
     source = bag(tmp_path / "bag", pivots=False)
     assert main(["profile", "new", str(source), "--out", str(file), "--json"]) == 0

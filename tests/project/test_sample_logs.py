@@ -104,9 +104,7 @@ def test_making_them_twice_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_make_sample_logs_reproduces_them_byte_for_byte(
-    tmp_path: Path, manifest: dict[str, Any]
-) -> None:
+def test_make_sample_logs_reproduces_them_byte_for_byte(tmp_path, manifest):
     command = [sys.executable, str(MAKE), "--out", str(tmp_path), "--check"]
     done = subprocess.run(command, capture_output=True, text=True)
     made = json.loads((tmp_path / "manifest.json").read_text(encoding="utf-8"))

@@ -105,9 +105,7 @@ IN_FILES: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("values", "message"), REFUSED, ids=lambda value: str(value)[:40])
-def test_a_file_and_python_refuse_a_value_in_the_same_words(
-    values: dict[str, Any], message: str
-) -> None:
+def test_a_file_and_python_refuse_a_value_in_the_same_words(values, message):
     with pytest.raises(ValueError) as in_python:  # noqa: PT011
         Config(**values)
     assert str(in_python.value) == message
@@ -135,9 +133,7 @@ def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: s
         ({"strata": [{"name": "a", "wher": "true"}]}, Mixture, "strata[0].where"),
     ],
 )
-def test_an_unknown_key_names_the_one_that_was_likely_meant(
-    values: dict[str, Any], kind: type, meant: str
-) -> None:
+def test_an_unknown_key_names_the_one_that_was_likely_meant(values, kind, meant):
     for remedy, rest in (("see the docs", " see the docs"), (None, "")):
         with pytest.raises(ConfigError, match="unknown key") as refused:
             typed(values, kind, where="config.toml", remedy=remedy)

@@ -40,7 +40,6 @@ from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
 from restock.train.judge.fed_rows import FedRows, judged
 from restock.train.judge.row_checks import values
-from restock.train.judge.windows import Cause
 from restock.train.twin.calibration.twin_gap import (
     TrustLimits,
     TwinGap,
@@ -213,9 +212,7 @@ def test_only_a_sure_opposite_sign_is_called_mirrored(high: float, named: str) -
         ("groups of recordings", False, "m28 and the next 10"),
     ],
 )
-def test_a_fault_of_one_robot_is_named_with_its_recording(
-    kind: str, tagged: bool, part: str, logs: FedRows, twin: FedRows
-) -> None:
+def test_a_fault_of_one_robot_is_named_with_its_recording(kind, tagged, part, logs, twin):
     """Check that a fault in a third of the rows is named with its recording.
 
     A robot that logs a recording a mission is known by its tag; without it, by when it drove.
@@ -250,9 +247,7 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(
 
 @pytest.mark.long
 @pytest.mark.parametrize("logged", ["ice", "random driver"])
-def test_ice_and_aimless_driving_are_no_faults(
-    twin: FedRows, logged: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ice_and_aimless_driving_are_no_faults(twin, logged, monkeypatch):
     """Check that ice and aimless driving are not named as faults of a sensor."""
     if logged == "ice":
         monkeypatch.setattr(before_training, "KINDS", ("nominal", "wheel_slip"))
@@ -408,9 +403,7 @@ def _rewrite(panel: Panel, **columns: list[Any]) -> None:
     ("of_run", "together"),
     [("HEALTHY", "BUFFER"), ("TARGET", "BOTH"), ("DIVERGENCE", "DIVERGENCE")],
 )
-def test_a_run_is_judged_with_its_rows(
-    logs: FedRows, twin: FedRows, of_run: Cause, together: Cause
-) -> None:
+def test_a_run_is_judged_with_its_rows(logs, twin, of_run, together):
     alone = Diagnosis(of_run, [of_run], [], [], ["a figure"], "none needed")
     assert with_rows(alone, diagnose_rows(logs, twin)) == alone
     both = with_rows(alone, diagnose_rows(_swapped(logs), twin))

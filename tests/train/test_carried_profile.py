@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -93,9 +92,7 @@ def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
     assert run.document["config"]["profile"] == "mine"
 
 
-def test_a_run_is_evaluated_and_resumed_without_its_profile(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, capsys):
     drive = ["eval", str(folder / "run"), "--episodes", "1", "--perturbations", "none"]
     assert main([*drive, "--policies", "agent", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["results"]
@@ -119,9 +116,7 @@ def test_a_run_is_evaluated_and_resumed_without_its_profile(
         ("unknown = 1\n", "unknown"),
     ],
 )
-def test_a_carried_text_may_do_no_more_than_a_profile_file(
-    folder: Path, text: str, problem: str
-) -> None:
+def test_a_carried_text_may_do_no_more_than_a_profile_file(folder, text, problem):
     whole = profile_toml(load_profile("warehouse_amr")).replace("condition = []\n", "")
     text = whole + text if "[[" in text else text + whole
     with pytest.raises(ConfigError, match=problem):
@@ -138,9 +133,7 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(
     age_s=st.one_of(st.none(), st.floats(1e-9, 1e9)),
     values=st.dictionaries(st.text(), st.floats(allow_nan=False, allow_infinity=False)),
 )
-def test_a_profile_comes_back_from_its_text_as_it_was(
-    doc: str, age_s: float | None, values: dict[str, Any]
-) -> None:
+def test_a_profile_comes_back_from_its_text_as_it_was(doc, age_s, values):
     signal = CustomSignal("/a", "a/msg/B", "data", "V", max_age_s=age_s, values=values, doc=doc)
     profile = msgspec.structs.replace(
         load_profile("warehouse_amr"), signals={"voltage_v": signal}, doc=doc

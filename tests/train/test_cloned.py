@@ -85,9 +85,7 @@ def test_a_clone_acts_as_the_drivers_did_and_says_how_well(panel: Panel, tmp_pat
     assert (other != action).any()
 
 
-def test_a_clone_is_kept_and_not_trained_again(
-    panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clone_is_kept_and_not_trained_again(panel, tmp_path, monkeypatch):
     run = Run.open(kept_run(tmp_path / "run", panel=panel))
     first = load_cloned(run, "cloned:teleop")
     assert first.quality.drivers == ["teleop"]
@@ -121,9 +119,7 @@ def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
     assert "the quality of the clone is not known" in reported.text
 
 
-def test_eval_drives_and_compares_the_clone(
-    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_drives_and_compares_the_clone(panel, tmp_path, capsys):
     run = kept_run(tmp_path / "run", panel=panel)
     line = ["eval", str(run), "--episodes", "nominal=2", "--perturbations", "none", "--json"]
     assert main([*line, "--policies", "agent,cloned"]) == 0
@@ -144,9 +140,7 @@ def test_eval_drives_and_compares_the_clone(
         ("cloned:", "there is no 'cloned:'"),
     ],
 )
-def test_a_clone_of_nobody_is_refused(
-    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str], policy: str, said: str
-) -> None:
+def test_a_clone_of_nobody_is_refused(panel, tmp_path, capsys, policy, said):
     run = kept_run(tmp_path / "run", panel=panel)
     assert main(["eval", str(run), "--policies", policy, "--dry-run"]) == 2
     assert said in capsys.readouterr().err

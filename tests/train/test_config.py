@@ -80,17 +80,13 @@ def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> 
         ("teacher.source=no_such_module:foo", r"no_such_module:foo cannot be imported"),
     ],
 )
-def test_impossible_run_is_refused_before_its_folder_is_made(
-    tmp_path: Path, override: str, message: str
-) -> None:
+def test_impossible_run_is_refused_before_its_folder_is_made(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, None, [override])
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_that_cannot_be_opened_leaves_no_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_cannot_be_opened_leaves_no_folder(tmp_path, monkeypatch):
     def refuse(*_: Any, **__: Any) -> None:
         raise MemoryError
 

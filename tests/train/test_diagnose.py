@@ -260,9 +260,7 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
     ],
 )
 @pytest.mark.parametrize("cause", ["TARGET", "BOTH"])
-def test_the_experiment_on_a_target_changes_its_rule(
-    tmp_path: Path, rule: TargetRule, tau: float, cause: Any
-) -> None:
+def test_the_experiment_on_a_target_changes_its_rule(tmp_path, rule, tau, cause):
     run = make_run(tmp_path / "r", lag=0.9, every=5000, target=rule)
     changed = parse_config(
         apply_overrides(run.document["config"], swapped(run, cause)), where="test"
@@ -281,9 +279,7 @@ def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
     assert "--out" not in said
 
 
-def test_an_experiment_repeats_a_run_without_a_teacher(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_experiment_repeats_a_run_without_a_teacher(tmp_path, monkeypatch):
     """Its config has the other settings of `teacher`, resolved, which nobody may give."""
     run = make_run(tmp_path / "r", lag=0.9)
     run.document["config"]["teacher"] |= {"source": "none", "successes": False, "ratio": 0.2}
@@ -309,12 +305,8 @@ def test_an_experiment_repeats_a_run_without_a_teacher(
     ],
 )
 def test_of_two_faults_the_experiment_answers_for_the_target(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    after: dict[str, Any],
-    cause: str,
-    confirmed: bool | None,
-) -> None:
+    tmp_path, monkeypatch, after, cause, confirmed
+):
     run = make_run(tmp_path / "r", lag=0.9, gap={"blocked_aisle": 6.0})
     found = diagnose([run])
     assert found.cause == "BOTH"

@@ -22,9 +22,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.missions import KINDS
 
 
-def test_a_policy_of_another_task_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_policy_of_another_task_is_refused(tmp_path, capsys):
     run = kept_run(tmp_path / "a")
     other = kept_run(tmp_path / "b", profile="turtlebot3")
     assert main(["eval", str(run), "--policies", f"run:{other}", "--dry-run"]) == 2
@@ -34,9 +32,7 @@ def test_a_policy_of_another_task_is_refused(
     assert "was trained on task" in capsys.readouterr().err
 
 
-def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(tmp_path, capsys):
     run = kept_run(tmp_path / "a")
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
@@ -55,9 +51,7 @@ def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(
     assert "has no room for episodes of nominal" in capsys.readouterr().err
 
 
-def test_what_was_recorded_is_shown_again_or_its_lack_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_recorded_is_shown_again_or_its_lack_is_said(tmp_path, capsys):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "0", "--json"]
     assert main(line) == 2
@@ -78,9 +72,7 @@ def test_what_was_recorded_is_shown_again_or_its_lack_is_said(
 
 
 @pytest.mark.long
-def test_evaluations_add_up_and_the_newest_floors_are_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, capsys):
     run = kept_run(tmp_path / "a")
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
@@ -114,9 +106,7 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(
     assert json.loads(capsys.readouterr().out) == [{"n": 10}]
 
 
-def test_references_drive_the_same_missions(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_references_drive_the_same_missions(tmp_path, capsys):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--json"]
     line += ["--episodes", "nominal=1"]
@@ -138,9 +128,7 @@ def test_references_drive_the_same_missions(
     assert alone["random", "nominal"]["time_lost_s"] is None  # it did not arrive
 
 
-def test_episodes_may_be_asked_for_by_kind(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_episodes_may_be_asked_for_by_kind(tmp_path, capsys):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--policies", "agent", "--perturbations", "none", "--dry-run"]
     assert main([*line, "--episodes", "nominal=1000, wheel_slip=300"]) == 0
@@ -164,9 +152,7 @@ def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
     assert "among those by which the run's policy was chosen (90000 to 90009)" in said
 
 
-def test_limiter_interventions_are_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_limiter_interventions_are_counted(tmp_path, capsys):
     run, limits = kept_run(tmp_path / "a"), tmp_path / "limits.toml"
     limits.write_text("[limiter]\nmax_speed_mps = 0.5\n", encoding="utf-8")
     line = ["eval", str(run), "--policies", "planner", "--perturbations", "none", "--json"]

@@ -71,9 +71,7 @@ def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
         assert end[:2] == pytest.approx([recorded["end_x_m"], recorded["end_y_m"]], abs=0.3)
 
 
-def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, capsys):
     table = read_evaluations(run)
     rows = table.to_pylist()
     for one in rows:  # as if another episode had been recorded

@@ -60,9 +60,7 @@ def test_only_rows_of_unended_episodes_have_no_condition(live: Session) -> None:
         ("actions", "condition", "drawn_rows"),
     ],
 )
-def test_every_table_counts_the_same_rows(
-    live: Session, table: str, condition: str, measure: str
-) -> None:
+def test_every_table_counts_the_same_rows(live, table, condition, measure):
     every = live.config.record.every_updates
     assert rows(
         live,

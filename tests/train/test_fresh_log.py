@@ -89,9 +89,7 @@ def collecting(tmp_path: Path) -> Collecting:
     return made
 
 
-def test_a_flushed_run_is_a_recording_like_any_other(
-    collecting: Collecting, tmp_path: Path
-) -> None:
+def test_a_flushed_run_is_a_recording_like_any_other(collecting, tmp_path):
     done = flush(collecting.folder, StoreWriter(tmp_path / "store"), collecting.profile)
     assert (done.status, done.episodes) == ("written", 2 * ENVS)
     store = restock.open(tmp_path / "store")
@@ -134,9 +132,7 @@ def test_a_flushed_run_is_a_recording_like_any_other(
     assert (np.diff(stamps) > 0).all()
 
 
-def test_truncated_episodes_bootstrap_at_their_last_step(
-    tmp_path: Path,
-) -> None:
+def test_truncated_episodes_bootstrap_at_their_last_step(tmp_path):
     """The ring's rows of three steps against the single steps that the twin returned."""
     made = Collecting(tmp_path / "run", n_step=3)
     step_of: dict[tuple[int, int], tuple[Any, ...]] = {}
@@ -313,9 +309,7 @@ def test_a_step_that_blew_up_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_flushing_to_a_store_twice_changes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_flushing_to_a_store_twice_changes_nothing(tmp_path, capsys):
     small = ["env.num_envs=4", "evaluation.episodes=1", "network.hidden=[16]"]
     keys = [word for key in (*small, "record.tensorboard=false") for word in ("--set", key)]
     run, store = str(tmp_path / "a"), str(tmp_path / "store")

@@ -220,9 +220,7 @@ def test_a_budget_too_short_for_an_evaluation_is_refused(tmp_path: Path) -> None
     live.close()
 
 
-def test_a_budget_in_seconds_is_planned_from_the_measured_speed(
-    panel: Panel, tmp_path: Path
-) -> None:
+def test_a_budget_in_seconds_is_planned_from_the_measured_speed(panel, tmp_path):
     settings = config(
         replay={"logs_share": None}, schedule={"seconds": 100.0, "env_steps": 10_000_000}
     )

@@ -90,9 +90,7 @@ def test_equal_policies_pass_before_the_budget(run: Path, driven: Any) -> None:
     assert "was not measured" in page  # the twin's gap
 
 
-def test_a_policy_spoilt_in_one_condition_is_named(
-    run: Path, driven: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_policy_spoilt_in_one_condition_is_named(run, driven, capsys):
     driven(spoilt)
     assert main(["gate", str(run), "--baseline", "planner", "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
@@ -141,9 +139,7 @@ def test_each_measure_that_is_asked_is_judged(run: Path, driven: Any) -> None:
         (["--baseline", "nobody"], "--policies"),
     ],
 )
-def test_what_cannot_give_a_verdict_is_refused(
-    run: Path, options: list[str], where: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_give_a_verdict_is_refused(run, options, where, capsys):
     base = [] if "--baseline" in options else ["--baseline", "planner"]
     assert main(["gate", str(run), *base, *options]) == 2
     assert capsys.readouterr().err.startswith(f"restock: {where}: ")
@@ -161,9 +157,7 @@ def test_a_floor_without_room_for_a_condition_is_refused(run: Path, tmp_path: Pa
     assert main(["gate", str(run), "--baseline", "planner", "--layouts", str(hall)]) == 2
 
 
-def test_a_twin_that_is_not_trusted_gives_no_verdict(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_twin_that_is_not_trusted_gives_no_verdict(run, monkeypatch, capsys):
     class Gap:
         untrusted = ("wheel_slip",)
         verdicts = ()
@@ -185,9 +179,7 @@ def test_an_interrupted_run_is_refused(run: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_the_planner_is_not_worse_than_itself_in_the_twin(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_planner_is_not_worse_than_itself_in_the_twin(run, monkeypatch):
     from restock.train.evaluation.eval_run import reference
 
     monkeypatch.setattr(gate, "make_policy", lambda name, plan: reference("planner"))

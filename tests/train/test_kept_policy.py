@@ -30,9 +30,7 @@ def interrupted(live: Session, stop: Callable[[], bool]) -> Session:
     return live
 
 
-def test_run_interrupted_before_evaluation_has_latest_policy(
-    tmp_path: Path,
-) -> None:
+def test_run_interrupted_before_evaluation_has_latest_policy(tmp_path):
     """Its best was that of step 0, from the logs alone, and was said to be all that it learned."""
     live = session(tmp_path / "a", config())
     interrupted(live, lambda: live.progress.env_steps >= 700)
@@ -51,9 +49,7 @@ def test_run_interrupted_before_evaluation_has_latest_policy(
 @pytest.mark.parametrize(
     ("phase", "chosen", "step"), [("offline", "latest", 0), ("warmup", "best", 0)]
 )
-def test_a_run_interrupted_before_it_learned_in_the_twin(
-    phase: str, chosen: str, step: int, tmp_path: Path
-) -> None:
+def test_a_run_interrupted_before_it_learned_in_the_twin(phase, chosen, step, tmp_path):
     """On the logs nothing is evaluated yet; in the warm-up, all that it learned is."""
     live = session(tmp_path / "a", config())
 
@@ -80,9 +76,7 @@ def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
     assert now.env_steps >= 800
 
 
-def test_the_latest_policy_is_driven_and_named_until_another_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, capsys):
     path = tmp_path / "run"
     settings = [
         *("network.hidden=[16]", "env.num_envs=4", "replay.batch_size=16", "schedule.env_steps=80"),

@@ -49,9 +49,7 @@ def batch(rng: np.random.Generator, logged: int, fresh: int, weighted: bool) -> 
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.booleans()), max_size=8),
     st.integers(0, 8),
 )
-def test_compiled_code_keeps_what_numpy_does(
-    seed: int, sizes: list[tuple[int, int, bool]], cleared_after: int
-) -> None:
+def test_compiled_code_keeps_what_numpy_does(seed, sizes, cleared_after):
     rng = np.random.default_rng(seed)
     ring = ring_of(rng)
     both = [(SampledRows(LOGGED), SampledRows(FRESH)) for _ in range(2)]

@@ -61,9 +61,7 @@ def test_dqn_leaves_a_run_that_says_what_it_was_fed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("library", ["sb3-dqn", "sb3-ppo"])
-def test_an_arm_whose_network_is_not_finite_ends_with_an_error(
-    library: str, tmp_path: Path
-) -> None:
+def test_an_arm_whose_network_is_not_finite_ends_with_an_error(library, tmp_path):
     own = {"sb3-ppo": {"n_steps": 40, "batch_size": 20, "n_epochs": 2}}.get(library, {})
     with pytest.raises(NotFinite, match="not finite"):
         trained(tmp_path / "run", library, learning_rate=float("inf"), **own)
@@ -81,9 +79,7 @@ def test_an_arm_whose_network_is_not_finite_ends_with_an_error(
         ],
     ),
 )
-def test_what_is_kept_acts_as_the_library_does(
-    tmp_path: Path, monkeypatch, library: str, name: str, own: dict
-) -> None:
+def test_what_is_kept_acts_as_the_library_does(tmp_path, monkeypatch, library, name, own):
     pytest.importorskip("stable_baselines3")
     from restock.train.libraries import sb3_drive
 

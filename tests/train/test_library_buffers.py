@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,9 +45,7 @@ def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
     assert sum(row["updates"] for row in tables["progress"]) == feed.batches
 
 
-def test_a_nonfinite_network_stops_and_names_the_rows(
-    tmp_path: Path,
-) -> None:
+def test_a_nonfinite_network_stops_and_names_the_rows(tmp_path):
     """Where the buffer is told of TD errors; what was recorded before stays whole."""
     trained = trained_sb3(tmp_path, 80)
     updates = trained.feed.batches

@@ -66,9 +66,7 @@ def test_windows_end_before_the_first_failure_begins(tmp_path: Path) -> None:
     }
 
 
-def test_an_exported_policy_has_the_alarm_of_its_panel(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_exported_policy_has_the_alarm_of_its_panel(tmp_path, capsys):
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     panel = panel_with(["goal"] * 4 + ["bump", "takeover"] * 5, tmp_path)

@@ -47,9 +47,7 @@ def rows_toward(goal: F64, places: F64) -> F64:
     bearing=st.floats(-3.1, 3.1),
     nearest=st.floats(0.1, 6.0),
 )
-def test_a_goal_is_told_by_the_last_look_or_by_distances(
-    goal: tuple[float, float], bearing: float, nearest: float
-) -> None:
+def test_a_goal_is_told_by_the_last_look_or_by_distances(goal, bearing, nearest):
     at, ahead = np.array(goal), np.array([np.cos(bearing), np.sin(bearing)])
     along = np.linspace(12.0, nearest, 40)[:, None]
     curved = at - along * ahead + 0.8 * np.sin(along) * np.array([-ahead[1], ahead[0]])
@@ -131,9 +129,7 @@ def test_each_way_is_a_mission_of_its_recordings_floor(panel: Panel) -> None:
     np.testing.assert_allclose(ends[:12], ends[12:], atol=2e-3)
 
 
-def test_eval_drives_the_ways_of_the_logs(
-    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_drives_the_ways_of_the_logs(panel, tmp_path, capsys):
     run = kept_run(tmp_path / "run", panel=panel)
     line = ["eval", str(run), "--policies", "planner", "--perturbations", "none", "--json"]
     assert main([*line, "--missions", "logged", "--episodes", "nominal=3"]) == 0
@@ -175,9 +171,7 @@ def test_a_runs_evaluations_drive_logged_ways_on_request(panel: Panel, tmp_path:
     assert "chosen on such routes" in said
 
 
-def test_a_run_on_another_floor_cannot_evaluate_on_them(
-    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_on_another_floor_cannot_evaluate_on_them(panel, tmp_path, capsys):
     write_floor(replace(FLOOR, name="away", map_origin=(900.0, 0.0, 0.0)), tmp_path / "away.toml")
     other = [f"--set=env.layouts={tmp_path / 'away.toml'}", "--out", str(tmp_path / "other")]
     assert main([*LOGGED_TRAINING, "--panel", str(panel.path), *other]) == 2

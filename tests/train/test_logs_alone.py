@@ -35,12 +35,8 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 def test_nothing_drives_and_what_was_learnt_last_is_kept(
-    panel: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    quick_models: None,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    panel, tmp_path, monkeypatch, quick_models, capsys
+):
     def refuse(*given: object, **named: object) -> None:
         raise AssertionError("a twin was made")
 
@@ -68,9 +64,7 @@ def test_nothing_drives_and_what_was_learnt_last_is_kept(
     assert main(["report", str(out), "--card"]) == 0
 
 
-def test_without_logs_there_is_nothing_to_learn_from(
-    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_logs_there_is_nothing_to_learn_from(panel, tmp_path, capsys):
     argv = ["train", "--out", str(tmp_path / "run")]
     assert main([*argv, *flags("env.twin=false")]) == 2
     assert "there is no panel" in capsys.readouterr().err

@@ -52,9 +52,7 @@ def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_logs", [True, False])
-def test_run_out_of_time_still_makes_an_interval_of_updates(
-    tmp_path: Path, with_logs: bool
-) -> None:
+def test_run_out_of_time_still_makes_an_interval_of_updates(tmp_path, with_logs):
     """There is a policy to keep and something to report, however slow the machine."""
     settings = config(schedule={"seconds": 1e-9, "offline_updates": 1000, "env_steps": 6000})
     live = run_to_end(tmp_path / "a", settings, **({} if with_logs else {"logs": None}))
@@ -96,9 +94,7 @@ class AtOnce(Executor):
         return future
 
 
-def test_simulating_on_another_thread_changes_nothing(
-    undisturbed: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_simulating_on_another_thread_changes_nothing(undisturbed, tmp_path, monkeypatch):
     monkeypatch.setattr("restock.train.session.ThreadPoolExecutor", lambda *_: AtOnce())
     assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config()))
 
@@ -114,9 +110,7 @@ def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_run_without_its_kept_policy_is_refused(
-    undisturbed: Session, tmp_path: Path, damage: str
-) -> None:
+def test_run_without_its_kept_policy_is_refused(undisturbed, tmp_path, damage):
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
     best = path / "checkpoints" / "best.safetensors"
     content = best.read_bytes()
@@ -281,9 +275,7 @@ def test_the_best_checkpoint_is_by_evaluation_not_the_last(undisturbed: Session)
     assert {row["episode_seed"] for row in rows} == {90_000, 90_001, 90_002}
 
 
-def test_warmup_collects_without_learning(
-    tmp_path: Path,
-) -> None:
+def test_warmup_collects_without_learning(tmp_path):
     settings = config(schedule={"env_steps": 400, "warmup_env_steps": 400})
     live = session(tmp_path / "a", settings, logs=None)
     said = no_update(train(live), settings)
@@ -354,9 +346,7 @@ def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
     assert undisturbed.learner.gradient_steps == 60 + progress.online_updates
 
 
-def test_the_policy_that_is_kept_is_an_average_of_the_weights(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_policy_that_is_kept_is_an_average_of_the_weights(monkeypatch):
     rows = logs().rows[:32].clone()
     for rate in (1.0, 0.25):
         monkeypatch.setattr("restock.train.dqn.network.AVERAGING", rate)

@@ -41,9 +41,7 @@ def made_native(held: QNetwork, *, wide: bool = True) -> Kernel:
 @pytest.mark.parametrize("hidden", SHAPES)
 @pytest.mark.parametrize("layer_norm", [False, True])
 @pytest.mark.parametrize("batch", [1, 37])
-def test_values_and_gradients_are_autograds(
-    hidden: tuple[int, ...], layer_norm: bool, batch: int
-) -> None:
+def test_values_and_gradients_are_autograds(hidden, layer_norm, batch):
     """Of the same network in double precision; and the same bits, how wide vectors ever are."""
     held = network(hidden, layer_norm)
     exact = clone(held).double().requires_grad_()
@@ -142,9 +140,7 @@ def test_the_compiled_way_is_that_of_one_thread() -> None:
     ("value", "used"),
     [("0", False), ("no", False), ("False", False), ("OFF", False), ("1", True), ("", True)],
 )
-def test_the_usual_words_switch_it_off(
-    value: str, used: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_usual_words_switch_it_off(value, used, monkeypatch):
     monkeypatch.setenv(native.SWITCH, value)
     assert native.is_used() == used
     assert native.state().startswith("in use") == used

@@ -42,9 +42,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_changed_byte_of_the_panel_is_refused_first(
-    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, capsys):
     out = tmp_path / "run"
     rows = panel / "rows.f32"
     whole = rows.read_bytes()
@@ -74,9 +72,7 @@ def test_changed_byte_of_the_panel_is_refused_first(
         rows.write_bytes(whole)
 
 
-def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(
-    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(panel, tmp_path, capsys):
     out = tmp_path / "run"
     argv = ["train", "--panel", str(panel), "--out", str(out), *TINY]
     assert main([*argv, "--set", "optimizer.learning_rate=1e30"]) == 2
@@ -151,9 +147,7 @@ def test_nonfinite_network_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("at", one_in(2, [0.3, 0.7]))
-def test_a_damaged_checkpoint_is_refused_by_name(
-    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at: float
-) -> None:
+def test_a_damaged_checkpoint_is_refused_by_name(panel, tmp_path, capsys, at):
     out = tmp_path / "run"
     assert main(["train", "--panel", str(panel), "--out", str(out), *TINY]) == 0
     run = Run.open(out)

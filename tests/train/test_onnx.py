@@ -77,9 +77,7 @@ def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, capsys) 
     assert [row[:3] for row in by["agent"]] == [row[:3] for row in by[f"onnx:{out}"]]
 
 
-def test_policy_is_written_into_no_store_or_other_run(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_policy_is_written_into_no_store_or_other_run(run, tmp_path, capsys):
     store = write_store(tmp_path / "store", [recording_transitions(1)])
     other = kept_run(tmp_path / "other")
     for place, said in ((store, "the store"), (other, "the run")):

@@ -134,9 +134,7 @@ def test_held_out_end_is_measured_from_its_own_start(tmp_path: Path) -> None:
     assert not steps.bumped_before[first].any()
 
 
-def test_weights_use_logged_or_else_cloned_probabilities(
-    panel: Panel,
-) -> None:
+def test_weights_use_logged_or_else_cloned_probabilities(panel):
     dataset = load_ope_dataset(panel, TASK)
     network = kept_network(NETWORK)
     rows = evaluate_off_policy(network, dataset, discount=0.97, config=CONFIG)
@@ -165,13 +163,7 @@ def _known(steps: OpeSteps) -> OpeSteps:
     return replace(steps, probability=np.full(len(steps.rows), 0.3))
 
 
-def test_the_verb_evaluates_and_says_why_it_refuses(
-    store: Path,
-    panel: Panel,
-    tmp_path: Path,
-    quick_models: None,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_verb_evaluates_and_says_why_it_refuses(store, panel, tmp_path, quick_models, capsys):
     run = kept_run(tmp_path / "a", NETWORK, panel)
     argv = ["eval", str(run), "--on-logs", "own"]
     assert main([*argv, "--dry-run"]) == 0  # fits nothing: it is asked what would be done
@@ -211,9 +203,7 @@ def test_a_horizon_gives_an_answer_where_the_whole_was_refused(panel: Panel) -> 
     assert all(value is not None for value in whole.values())
 
 
-def test_training_evaluates_off_policy_before_it_drives(
-    panel: Panel, tmp_path: Path, quick_models: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_evaluates_off_policy_before_it_drives(panel, tmp_path, quick_models, capsys):
     path = tmp_path / "run"
     argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]
     small = ["schedule.offline_updates=3", "network.hidden=[8]", "evaluation.episodes=1"]

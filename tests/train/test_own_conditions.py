@@ -59,9 +59,7 @@ def train(folder: Path, run: str, *more: str) -> int:
     return main(["train", *given, *profile, *settings, *more])
 
 
-def test_dry_run_names_conditions_the_twin_cannot_evaluate(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dry_run_names_conditions_the_twin_cannot_evaluate(folder, capsys):
     capsys.readouterr()
     assert train(folder, "dry", "--dry-run") == 0
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
@@ -70,9 +68,7 @@ def test_dry_run_names_conditions_the_twin_cannot_evaluate(
 
 
 @pytest.mark.long
-def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, capsys):
     capsys.readouterr()
     assert train(folder, "run", "--flush-fresh", str(folder / "store")) == 0
     said = capsys.readouterr().err

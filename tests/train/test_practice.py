@@ -85,9 +85,7 @@ def test_fixed_rules_give_what_they_say() -> None:
     assert practice(rule="even").shares.tolist() == [0.25] * 4
 
 
-def test_success_practises_what_fails_once_it_is_believed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_success_practises_what_fails_once_it_is_believed(monkeypatch):
     monkeypatch.setattr(practice_module, "MAX_CHANGE", 1.0)
     found = practice(rule="success", floor=0.1)
     np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
@@ -171,9 +169,7 @@ def test_a_run_too_short_for_its_shares_to_move_says_so() -> None:
         ("practice={rule='success', floor=0.5}", "above 1"),
     ],
 )
-def test_nothing_is_written_for_a_practice_that_cannot_be(
-    tmp_path: Path, override: str, message: str
-) -> None:
+def test_nothing_is_written_for_a_practice_that_cannot_be(tmp_path, override, message):
     shares = "env.conditions={nominal=1, wheel_slip=1, blocked_aisle=1, near_collision=0}"
     with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, load_config(None, [shares, override]))

@@ -61,9 +61,7 @@ def test_every_sampled_row_is_a_record(run: Path) -> None:
         assert (record.age_days is None) == (row["source"] == "fresh")
 
 
-def test_one_clock_says_what_was_collected_before_the_last_sync(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_clock_says_what_was_collected_before_the_last_sync(tmp_path, capsys):
     hard = {"rule": "hard", "every": 30}
     path = tmp_path / "hard"
     run_to_end(path, config(schedule={"env_steps": 800}, target=hard))
@@ -116,9 +114,7 @@ def test_the_view_is_the_record(run: Path, capsys: pytest.CaptureFixture[str]) -
     "actions",
     [load_profile("warehouse_amr").task.actions, ((0.0, 0.0), (-0.125, 0.3456), (12.0, -1 / 3))],
 )
-def test_a_store_names_actions_as_runs_do(
-    tmp_path: Path, actions: tuple[tuple[float, float], ...]
-) -> None:
+def test_a_store_names_actions_as_runs_do(tmp_path, actions):
     task = Task(body=load_profile("warehouse_amr").task.body, actions=actions)
     with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as store:
         text = store.connection.sql("SELECT sql FROM duckdb_views() WHERE view_name = 'actions'")

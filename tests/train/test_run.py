@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import duckdb
@@ -57,9 +56,7 @@ def select_policies(run: Path) -> list[dict[str, object]]:
 
 
 @pytest.mark.parametrize("read", [read_policies, select_policies])
-def test_no_flipped_bit_of_a_table_is_read_in_silence(
-    tmp_path: Path, read: Callable[[Path], list[dict[str, object]]]
-) -> None:
+def test_no_flipped_bit_of_a_table_is_read_in_silence(tmp_path, read):
     run = Run.create(tmp_path / "a", {})
     counts = {**policies(0, 0), "rows": np.arange(40) ** 2, "env_steps": np.arange(40)}
     run.append_columns("policies", counts)

@@ -14,9 +14,7 @@ from restock.train.judge.compare import diff_runs
 from restock.train.run.run import Run
 
 
-def test_what_moved_is_shown_where_compare_refuses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_moved_is_shown_where_compare_refuses(tmp_path, capsys):
     first = make_run(tmp_path / "a", document(0), success=0.2)
     second = make_run(
         tmp_path / "b", document(1, config__network__layer_norm=False), success=0.7, slip_share=0.1

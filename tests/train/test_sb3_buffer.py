@@ -67,9 +67,7 @@ def test_fresh_rows_are_what_the_environment_gave(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("given", ["table", "store"])
-def test_sac_trains_on_the_continuous_face_with_logs(
-    panel: Panel, store: Path, tmp_path: Path, given: str
-) -> None:
+def test_sac_trains_on_the_continuous_face_with_logs(panel, store, tmp_path, given):
     commands = logged_commands(panel.path, store) if given == "store" else None
     model = sb3.SAC(
         "MlpPolicy",

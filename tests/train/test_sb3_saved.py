@@ -85,9 +85,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def test_a_model_acts_without_its_panel_and_leaves_its_run_alone(
-    saved: Any, tmp_path: Path
-) -> None:
+def test_a_model_acts_without_its_panel_and_leaves_its_run_alone(saved, tmp_path):
     saved.replay_buffer.close()
     before, observation = content(tmp_path / "run"), saved.env.reset()
     shutil.rmtree(tmp_path / "panel")

@@ -123,9 +123,7 @@ def draws_of(panel: Panel, planned: PlannedDraws, batch_size: int = 64) -> Logge
 
 
 @pytest.mark.parametrize("within", ["without_replacement", "uniform", "per"])
-def test_no_row_is_drawn_more_often_than_it_may_be(
-    table: pa.Table, tmp_path: Path, within: str
-) -> None:
+def test_no_row_is_drawn_more_often_than_it_may_be(table, tmp_path, within):
     text = f"max_replays_per_row = 9\nwithin = '{within}'\n[each_condition]\nshare = 'equal'\n"
     built = panel(table, tmp_path / "p", text)
     draws = draws_of(built, PlannedDraws(offline=4_000))

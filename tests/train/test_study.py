@@ -225,9 +225,7 @@ def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_after_a_failed_run_none_is_begun(
-    tmp_path: Path, capsys, monkeypatch, interrupted: bool
-) -> None:
+def test_after_a_failed_run_none_is_begun(tmp_path, capsys, monkeypatch, interrupted):
     begun, running, ended = [], Event(), Event()
 
     def job(plan, job, say):

@@ -214,9 +214,7 @@ def test_half_of_the_rows_are_mirrored_with_their_action(tmp_path: Path) -> None
     assert np.array_equal(ring.rows[:, ring.columns["observation"]], observed)
 
 
-def test_rows_are_mirrored_if_the_operator_teaches(
-    tmp_path: Path,
-) -> None:
+def test_rows_are_mirrored_if_the_operator_teaches(tmp_path):
     def mirror(*settings: str) -> bool | None:
         return prepare_new(tmp_path / "run", None, None, settings).config.teacher.mirror
 
@@ -247,9 +245,7 @@ def test_rows_are_mirrored_if_the_operator_teaches(
         ([[1], [1, 2], [0], [1]], "returned a list that is no array"),
     ],
 )
-def test_a_teacher_that_gives_no_action_is_refused(
-    answer: Any, message: str, tmp_path: Path
-) -> None:
+def test_a_teacher_that_gives_no_action_is_refused(answer, message, tmp_path):
     live = session(tmp_path / "a", config(**TAUGHT), teacher=lambda env, observation: answer)
     with pytest.raises(ConfigError, match=message):
         train(live)
@@ -282,9 +278,7 @@ class Made:
         ("unreadable:act", "importing unreadable:act raised SyntaxError", 2),
     ],
 )
-def test_an_error_of_the_users_teacher_names_its_line(
-    source: str, message: str, line: int, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_an_error_of_the_users_teacher_names_its_line(source, message, line, tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(TEACHERS)
     (tmp_path / "unreadable.py").write_text("\ndef act(:\n")
     monkeypatch.chdir(tmp_path)
@@ -341,9 +335,7 @@ def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:
     ("parts", "message"),
     [({"logs": None}, "this run has no logs"), ({}, "the logs have planner, operator\n")],
 )
-def test_logs_without_a_row_to_clone_are_refused(
-    parts: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_logs_without_a_row_to_clone_are_refused(parts, message, tmp_path):
     settings = config(teacher={"source": "logs", "policies": ["teleop"]})
     with pytest.raises(ConfigError, match=f"clones the rows of teleop, but {message}"):
         session(tmp_path / "a", settings, **parts)

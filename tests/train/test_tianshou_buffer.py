@@ -41,9 +41,7 @@ def panel(trained: TrainedBuffer) -> Panel:
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_targets_are_of_single_logged_and_of_n_fresh_steps(
-    trained: TrainedBuffer, panel: Panel, n_step: int
-) -> None:
+def test_targets_are_of_single_logged_and_of_n_fresh_steps(trained, panel, n_step):
     buffer, algorithm = trained.buffer, tianshou_dqn(n_step)
     batch, index = buffer.sample(64)
     with torch.no_grad():

@@ -68,9 +68,7 @@ def follow(run: Run, name: str) -> Events:
     return events
 
 
-def test_training_ends_as_ever_where_a_tracker_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_ends_as_ever_where_a_tracker_fails(tmp_path, monkeypatch, capsys):
     def refuses() -> Broken:
         raise OSError("no route to host")
 
@@ -91,9 +89,7 @@ def test_training_ends_as_ever_where_a_tracker_fails(
     assert "wandb failed, training goes on" in capsys.readouterr().err
 
 
-def test_tracker_that_is_not_installed_is_refused_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tracker_that_is_not_installed_is_refused_first(tmp_path, monkeypatch, capsys):
     find = importlib.util.find_spec
 
     def absent(name: str, package: str | None = None) -> Any:
@@ -108,9 +104,7 @@ def test_tracker_that_is_not_installed_is_refused_first(
     assert not (tmp_path / "run").exists()
 
 
-def test_mlflow_has_the_curves_config_and_panel(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mlflow_has_the_curves_config_and_panel(tmp_path, monkeypatch):
     pytest.importorskip("mlflow", reason="mlflow is not installed: restock[track]")
     from mlflow.tracking import MlflowClient
 

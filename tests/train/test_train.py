@@ -87,9 +87,7 @@ def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> N
     assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
 
 
-def test_quota_that_nothing_can_fill_is_named_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys):
     task = load_profile("warehouse_amr").task
     text = (
         "max_replays_per_row = 4\n[[strata]]\nname = 'nominal'\nshare = 0.5\n"
@@ -115,9 +113,7 @@ def test_quota_that_nothing_can_fill_is_named_first(
 
 
 @pytest.mark.long  # test_loop shows it on the corridor
-def test_resuming_in_the_twin_is_bit_exact(
-    tmp_path: Path, panel: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, capsys):
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
     assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
@@ -145,9 +141,7 @@ def test_resuming_in_the_twin_is_bit_exact(
     assert whole["exploration"] == parts["exploration"]
 
 
-def test_a_run_that_is_being_trained_is_not_resumed(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_is_being_trained_is_not_resumed(trained, capsys):
     before = {file: file.read_bytes() for file in trained.rglob("*.safetensors")}
     lock = RunLock(trained)
     assert main(["train", "--resume", str(trained), "--env-steps", "440"]) == 2
@@ -240,13 +234,8 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
     ],
 )
 def test_wrong_input_gives_one_clear_message_and_writes_nothing(
-    argv: list[str],
-    complaint: str,
-    trained: Path,
-    panel: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    argv, complaint, trained, panel, tmp_path, capsys
+):
     if "cuda" in argv and torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     places = {"new": tmp_path / "new", "missing": tmp_path / "no"}
@@ -258,9 +247,7 @@ def test_wrong_input_gives_one_clear_message_and_writes_nothing(
     assert not (tmp_path / "new").exists()
 
 
-def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(
-    trained: Path, panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(trained, panel, tmp_path, capsys):
     run, moved = tmp_path / "run", tmp_path / "moved"
     shutil.copytree(trained, run)
     text = (run / "config.json").read_text().replace(str(panel), str(tmp_path / "panel"))
@@ -273,9 +260,7 @@ def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(
     assert main(resume) == 0
 
 
-def test_a_panel_of_a_task_that_no_profile_has_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_panel_of_a_task_that_no_profile_has_is_refused(tmp_path, capsys):
     build_panel(recording_transitions(1, episodes=40), MIXTURE, tmp_path / "panel")
     argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
     assert main(argv) == 2
@@ -290,9 +275,7 @@ def test_a_panel_of_a_task_that_no_profile_has_is_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_dry_run_writes_nothing(
-    tmp_path: Path, panel: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_writes_nothing(tmp_path, panel, capsys):
     argv = ["train", "--panel", str(panel), "--out", str(tmp_path / "run"), "--seed", "7"]
     assert main([*argv, "--dry-run"]) == 0
     shown = json.loads(capsys.readouterr().out)

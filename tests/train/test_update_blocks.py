@@ -112,9 +112,7 @@ def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("mixture", ["sampling = 'chunked'\n", "within = 'per'\n"])
-def test_panels_of_all_kinds_feed_blocks_as_they_feed_one_by_one(
-    mixture: str, device: str, tmp_path: Path
-) -> None:
+def test_panels_of_all_kinds_feed_blocks_as_they_feed_one_by_one(mixture, device, tmp_path):
     """Read in chunks, their rows are sent; by priority, a draw follows the TD errors before it."""
     text = f"discount = 0.9\n{mixture}[each_condition]\nshare = 'equal'\n"
     table = recording_transitions(1, task=TASK)

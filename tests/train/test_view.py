@@ -207,9 +207,7 @@ def test_what_cannot_be_shown_is_said_and_leaves_nothing(event: Event, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_names_the_file_and_its_layout(
-    event: Event, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_names_the_file_and_its_layout(event, tmp_path, capsys):
     row, path = str(event.row["transition_id"]), tmp_path / "m.mcap"
     words = ["trace", str(event.store), row, "--view", str(path), "--json"]
     assert cli.main(words) == 0

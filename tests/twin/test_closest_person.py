@@ -45,9 +45,7 @@ def closest(
 
 @settings(max_examples=60)
 @given(places, places, angles, places, places, angles, st.booleans())
-def test_the_distance_is_that_of_the_outlines(
-    x: float, y: float, yaw: float, px: float, py: float, heading: float, truck: bool
-) -> None:
+def test_the_distance_is_that_of_the_outlines(x, y, yaw, px, py, heading, truck):
     found = closest((x, y, yaw), {PEOPLE if truck else 0: (px, py, heading)}).closest_m[0]
     mine = outline(x, y, yaw, ROBOT_HALF_M)
     if truck:

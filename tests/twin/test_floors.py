@@ -86,9 +86,7 @@ def test_the_splits_share_no_floor() -> None:
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
 @settings(max_examples=6)
-def test_a_floor_survives_toml_and_an_occupancy_map(
-    seed: int, kind: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_a_floor_survives_toml_and_an_occupancy_map(seed, kind, tmp_path_factory):
     folder = tmp_path_factory.mktemp("floor")
     floor = replace(generate(seed, RECIPES[kind]), map_origin=(-3.0, 2.0, 0.5))
     write_floor(floor, folder / "floor.toml")
@@ -108,9 +106,7 @@ def test_a_floor_survives_toml_and_an_occupancy_map(
 
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
 @pytest.mark.parametrize("negate", [0, 1])
-def test_every_mode_of_a_map_reads_the_same_free_space(
-    tmp_path: Path, mode: str, negate: int
-) -> None:
+def test_every_mode_of_a_map_reads_the_same_free_space(tmp_path, mode, negate):
     free = np.zeros((80, 120), np.bool_)
     free[10:70, 10:110] = True
     free[30:50, 40:80] = False
@@ -226,9 +222,7 @@ def test_a_floor_with_racks_alone_gets_its_aisles_and_goals(tmp_path: Path) -> N
         read_floor(tmp_path / "hall.toml")
 
 
-def test_what_does_not_fit_a_floor_is_refused_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_does_not_fit_a_floor_is_refused_first(tmp_path, capsys):
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
     message = "has no room for episodes of blocked_aisle"

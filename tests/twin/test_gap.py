@@ -95,9 +95,7 @@ def position(gap: TwinGap, condition: str, source: str, horizon_s: float) -> dic
 
 
 @pytest.mark.parametrize("horizon_s", [3.0, 6.0])
-def test_the_true_parameters_close_the_gap_to_near_the_floor(
-    gap: TwinGap, horizon_s: float
-) -> None:
+def test_the_true_parameters_close_the_gap_to_near_the_floor(gap, horizon_s):
     before, after, floor = (
         position(gap, "nominal", source, horizon_s)["median"] for source in (BEFORE, AFTER, FLOOR)
     )
@@ -275,9 +273,7 @@ FINE, WORSE = ConfidenceInterval(0.3, 0.2, 0.4), ConfidenceInterval(1.5, 1.2, 1.
         (BAD, WORSE, 19, UNKNOWN),
     ],
 )
-def test_the_rule(
-    position_p90: ConfidenceInterval, reward: ConfidenceInterval, segments: int, verdict: str
-) -> None:
+def test_the_rule(position_p90, reward, segments, verdict):
     found = trust_verdict(
         "wheel_slip",
         limits=TrustLimits(),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -57,9 +56,7 @@ def both(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.nd
         st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(-7, 7)), min_size=8, max_size=8
     ),
 )
-def test_compiled_ranges_are_those_of_mujoco(
-    which: int, places: list[tuple[float, float, float]], environments: list[WarehouseVectorEnv]
-) -> None:
+def test_compiled_ranges_are_those_of_mujoco(which, places, environments):
     env = environments[which]
     for index, (x, y, yaw) in enumerate(places):
         floor = env.floor_of(index)
@@ -71,9 +68,7 @@ def test_compiled_ranges_are_those_of_mujoco(
 
 
 @needs_native
-def test_people_pallets_and_forklifts_are_seen(
-    environments: list[WarehouseVectorEnv], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_people_pallets_and_forklifts_are_seen(environments, monkeypatch):
     simulation, floor = environments[0].simulation, environments[0].floor_of(0)
     moving = simulation.scenery
     x, y = floor.goals[0]
@@ -148,9 +143,7 @@ def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) 
     assert info["signals"]["sector_clearance_m"][0, 0] > 0.5  # straight behind
 
 
-def test_the_lidars_place_and_what_lies_outside_is_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_lidars_place_and_what_lies_outside_is_shown(tmp_path, capsys):
     robot = "[robot]\ncasters_m = [[0.6, 0.0]]\n[robot.lidar]\nangle_max_rad = 1.5\n"
     text = WAREHOUSE.replace("lidar_x_m = 0.0", "lidar_x_m = -0.5") + robot
     (tmp_path / "amr.toml").write_text(text)

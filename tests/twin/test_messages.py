@@ -33,9 +33,7 @@ STAMP_NS = 1_760_000_000_123_456_789
     ranges=st.lists(st.floats(width=32, allow_nan=False), max_size=5),
 )
 @settings(max_examples=60)
-def test_any_shape_packs_as_rosbags_serialises_it(
-    frame: str, names: list[str], ranges: list[float]
-) -> None:
+def test_any_shape_packs_as_rosbags_serialises_it(frame, names, ranges):
     """Check alignment after strings and sequences of any length, empty ones too."""
     numbers = np.arange(len(names), dtype=float)
     for shape, columns in [

@@ -95,9 +95,7 @@ def test_missions_of_a_robot_are_those_of_its_tag() -> None:
     assert RecordingPlan(missions=file, tags={"robot": "amr_8"}).orders() == [SLIP]
 
 
-def test_a_dry_run_or_a_wrong_file_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_or_a_wrong_file_writes_nothing(tmp_path, capsys):
     out, file = tmp_path / "next.mcap", tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\n')
     args = ["twin", "record", "--out", str(out), "--missions", str(file)]
@@ -115,9 +113,7 @@ def test_a_dry_run_or_a_wrong_file_writes_nothing(
     assert not out.exists()
 
 
-def test_missions_are_counted_by_what_they_met(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missions_are_counted_by_what_they_met(tmp_path, capsys):
     file = tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "nominal"\nmissions = 1\n')
     out = tmp_path / "next.mcap"
@@ -128,9 +124,7 @@ def test_missions_are_counted_by_what_they_met(
 
 
 @pytest.mark.slow
-def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_list_that_is_driven_and_ingested_closes_its_gaps(tmp_path, capsys):
     """Drive what is missing and measure again: gaps are closed, or within their intervals."""
 
     def run(*args: str) -> dict[str, object]:

@@ -113,9 +113,7 @@ def test_it_travels_in_the_profile_without_its_file(tmp_path: Path) -> None:
         load_profile(tmp_path / "mine.toml")
 
 
-def test_a_warning_of_mujoco_writes_no_log_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_warning_of_mujoco_writes_no_log_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     parent, child = mujoco.MjSpec(), mujoco.MjSpec()
     child.option.gravity = [0, 0, 0]

@@ -101,9 +101,7 @@ def test_a_slow_localisation_keeps_its_pose_and_the_stamp_of_it() -> None:
         ("accel_bias_mps2", 0.3, "accel_x_mps2", 0.3),
     ],
 )
-def test_a_bias_moves_its_signal_and_no_other(
-    field: str, bias: float, signal: str, shift: float
-) -> None:
+def test_a_bias_moves_its_signal_and_no_other(field, bias, signal, shift):
     plain, biased = drive(2)[-1], drive(2, **{field: bias})[-1]
     assert (biased[signal] - plain[signal])[0] == pytest.approx(shift)
     for other in ("pose_x_m", "clearance_m", "gyro_yaw_rate_radps", "accel_x_mps2"):

@@ -162,9 +162,7 @@ def test_a_bump_between_two_ticks_is_in_their_interval_alone(messages: list[Mess
     assert np.searchsorted(ticks, pressed).tolist() == [6]  # after tick 5 (1.0 s), before 6
 
 
-def test_odometry_follows_the_wheels_and_tf_leads_to_the_map(
-    drive: Drive, messages: list[Message]
-) -> None:
+def test_odometry_follows_the_wheels_and_tf_leads_to_the_map(drive, messages):
     by_topic = _decoded(messages)
     last = by_topic["/odom"][-1][1].pose.pose.position
     assert (last.x, last.y) == pytest.approx(drive.motion.pose[-1, :2], abs=5e-3)

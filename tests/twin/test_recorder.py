@@ -103,9 +103,7 @@ def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["--layouts", "moon"], "moon"),
     ],
 )
-def test_a_wrong_value_is_one_clear_message(
-    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_value_is_one_clear_message(flags, message, tmp_path, capsys):
     code = cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap"), *flags])
     captured = capsys.readouterr()
     assert code == ExitCode.USAGE
@@ -114,9 +112,7 @@ def test_a_wrong_value_is_one_clear_message(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(tmp_path, capsys):
     words = ["twin", "record", "--out", str(tmp_path / "drive.txt"), "--minutes", "0.01"]
     assert cli.main(words) == ExitCode.USAGE
     assert "ends in .mcap" in capsys.readouterr().err
@@ -125,9 +121,7 @@ def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
     assert cli.main(["twin", "record", "--out", dated, "--dry-run"]) == ExitCode.OK
 
 
-def test_a_recording_is_never_overwritten(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_is_never_overwritten(tmp_path, capsys):
     (tmp_path / "log.mcap").write_text("precious")
     assert cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap")]) == ExitCode.USAGE
     assert "never overwritten" in capsys.readouterr().err

@@ -79,9 +79,7 @@ def test_its_wheels_turn_no_faster_than_they_steer() -> None:
         ((0.4, 0.8), r"a circle of 0.5 m, and the robot's tightest has 0.731 m"),
     ],
 )
-def test_an_action_that_it_cannot_steer_is_refused(
-    action: tuple[float, float], message: str
-) -> None:
+def test_an_action_that_it_cannot_steer_is_refused(action, message):
     task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=((0.0, 0.0), action))
     with pytest.raises(ConfigError, match=message):
         WarehouseVectorEnv(1, task=task, robot=CAR)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from rosbags.highlevel import AnyReader
 from support.long import one_in
 from support.paths import ROOT
 
-from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.recorder import HARDWARE, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import (
     MARKERS,
@@ -26,9 +24,7 @@ LATCHED = {"/tf_static", "/map", "/behaviour_policy", "/amcl_pose", PERTURBATION
 
 
 @pytest.mark.parametrize(("file_format", "name"), one_in(2, [("mcap", "a.mcap"), ("rosbag2", "a")]))
-def test_a_recording_holds_frames_map_and_scene(
-    tmp_path: Path, file_format: Format, name: str
-) -> None:
+def test_a_recording_holds_frames_map_and_scene(tmp_path, file_format, name):
     kinds = {"near_collision": 1.0, "blocked_aisle": 1.0}
     done = record(
         tmp_path / name, RecordingPlan(format=file_format, missions=2, seed=4, conditions=kinds)

@@ -165,9 +165,7 @@ def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("late_s", "frame"), [(0.0, "laser"), (1.5, "laser"), (0.0, "base_link"), (0.0, "/base_scan")]
 )
-def test_scans_make_the_map_by_the_clock_that_fits(
-    tmp_path: Path, late_s: float, frame: str
-) -> None:
+def test_scans_make_the_map_by_the_clock_that_fits(tmp_path, late_s, frame):
     known = OccupancyGrid(hall(), CELL_M)
     scans: dict[str, Any] = {"scanned": hall(), "scans_late_s": late_s, "scan_frame": frame}
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, **scans)
@@ -193,9 +191,7 @@ def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
     assert right.agreement > 0.95 > wrong.agreement
 
 
-def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, capsys):
     origin = (-3.0, 2.0, 0.0)
     poses = lap(origin)[:-30]  # not the whole way round
     bag = write_bag(tmp_path / "bag", poses=poses, grid=OccupancyGrid(hall(), CELL_M, origin))
@@ -238,9 +234,7 @@ def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path)
         survey(bag)
 
 
-def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
     """Refuse a larger, empty room: all poses are on its free floor, but its walls are elsewhere."""
     room = np.zeros((240, 200), np.int8)
     room[[0, -1]] = room[:, [0, -1]] = 100
@@ -269,13 +263,8 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(
     ],
 )
 def test_a_map_that_is_none_is_refused_with_its_reason(
-    tmp_path: Path,
-    shape: tuple[int, int],
-    resolution: float,
-    origin: tuple[float, float, float],
-    data: np.ndarray | None,
-    message: str,
-) -> None:
+    tmp_path, shape, resolution, origin, data, message
+):
     cells = np.broadcast_to(np.int8(0), shape)
     bag = write_bag(tmp_path / "bag", grid=OccupancyGrid(cells, resolution, origin), data=data)
     with pytest.raises((RecordingError, ConfigError), match=message):
@@ -342,9 +331,7 @@ def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
     assert extent(PLACE) == pytest.approx((7.1, 5.1), abs=0.6)
 
 
-def test_a_store_gives_the_floor_of_its_recording(
-    tmp_path: Path,
-) -> None:
+def test_a_store_gives_the_floor_of_its_recording(tmp_path):
     bag = write_bag(tmp_path / "bag", poses=lap()[:60], grid=OccupancyGrid(hall(), CELL_M))
     recordings = []
     for recording, part in ((1, slice(0, 60)), (2, slice(60, 200))):
@@ -381,9 +368,7 @@ def lapped(recording: int, away_m: float) -> pa.Table:
     return rows
 
 
-def test_recordings_in_other_frames_get_floors_of_their_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path, capsys):
     tables = [lapped(1, 0.0), lapped(2, 40.0), lapped(3, 0.0)]
     store = write_store(tmp_path / "store", tables)
     names = [table["recording_id"][0].as_py() for table in tables]

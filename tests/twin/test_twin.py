@@ -86,9 +86,7 @@ def test_an_episode_is_the_same_in_any_place_and_company() -> None:
 
 
 @pytest.mark.long
-def test_state_continues_bit_for_bit_through_a_file(
-    env: WarehouseVectorEnv, tmp_path: Path
-) -> None:
+def test_state_continues_bit_for_bit_through_a_file(env, tmp_path):
     env.reset(seed=2)
     env.simulation.apply(0, Perturbation(payload_kg=10.0))  # restored by the episode's own
     env.reset(seed=2)
@@ -160,9 +158,7 @@ def test_disabled_autoreset_resets_only_the_masked() -> None:
     assert made.steps.tolist() == [5, 0, 5]
 
 
-def test_every_signal_is_filled_and_the_tasks_functions_used(
-    env: WarehouseVectorEnv,
-) -> None:
+def test_every_signal_is_filled_and_the_tasks_functions_used(env):
     env.reset(seed=6)
     names = {signal.name for signal in SIGNALS}
     rng = np.random.default_rng(0)
@@ -216,9 +212,7 @@ def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
     assert sorted(made.episode_number.tolist()) == [-1, 2]
 
 
-def test_a_blow_up_truncates_the_episode_and_is_counted(
-    env: WarehouseVectorEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_blow_up_truncates_the_episode_and_is_counted(env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env.reset(seed=8)
     count = env.diverged
