@@ -68,14 +68,6 @@ def test_an_unknown_verb_suggests_the_near_one(capsys: pytest.CaptureFixture[str
     assert "restock ingest" in captured.err
 
 
-def test_an_interrupt_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(args: list[str]) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "_dispatch", interrupted)
-    assert cli.main(["info"]) == ExitCode.INTERRUPTED
-
-
 def test_the_version_is_printed() -> None:
     done = restock("--version")
     assert done.returncode == 0

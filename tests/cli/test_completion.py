@@ -19,9 +19,3 @@ def test_a_script_has_every_verb(shell: str, tmp_path: Path) -> None:
     assert "--trust-position-m" in text  # of a job
     if shell == "bash":
         assert subprocess.run(["bash", "-n", str(script)], capture_output=True).stderr == b""
-
-
-@pytest.mark.parametrize("words", [[], ["bash"], ["perl", "-"]], ids=" ".join)
-def test_a_shell_and_a_file_are_needed(words, capsys):
-    assert cli.main([cli.COMPLETION, *words]) == 2
-    assert cli.COMPLETION in capsys.readouterr().err

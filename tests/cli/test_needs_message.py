@@ -14,23 +14,8 @@ from restock.ingest.steps.needs import field_paths, wanted_fields
 SCAN, PATH = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Path"
 
 
-def topics(**types: str) -> dict[str, SimpleNamespace]:
-    return {f"/{name}": topic(kind) for name, kind in types.items()}
-
-
 def topic(kind: str, skipped: str | None = None) -> SimpleNamespace:
     return SimpleNamespace(type=kind, expected=9, skipped=skipped)
-
-
-def test_a_recording_that_does_not_fit_is_told_how_to_go_on() -> None:
-    profile = load_profile("warehouse_amr")
-    with pytest.raises(RecordingError) as error:
-        wanted_fields(profile, topics(scan=SCAN), {"/scan": []})
-    assert "no topic /plan (plan)" in str(error.value)
-    assert "did you mean" not in str(error.value)
-    assert "`restock profile new RECORDING`" in str(error.value)
-    assert "`restock start RECORDING" in str(error.value)
-    assert "its topics are /scan; choose" in str(error.value)
 
 
 def test_a_topic_that_was_skipped_is_not_called_absent() -> None:

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
 from support.paths import ROOT
 
 from restock import cli
@@ -19,16 +18,6 @@ ROWS = [
     {"audit": "aisles", "status": "fail", "rows": 12_345, "what": "words of it " * 20},
     {"audit": "batteries", "status": "pass", "rows": 0, "what": "short"},
 ]
-
-
-def test_a_pipe_gets_all_of_a_table_in_120_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    output.print_table(ROWS, title="found")
-    text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= 120
-    assert text.count("words of it") + text.count("words of\n") >= 18
-    assert text.split().count("words") == 20
-    assert "12,345" in text
-    assert "\x1b" not in text
 
 
 def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(monkeypatch, capsys):

@@ -67,15 +67,6 @@ def arms(tmp_path: Path, success: tuple[float, float], **changes: Any) -> tuple[
     )
 
 
-def test_a_comparison_has_a_page_with_the_verdict_first(tmp_path: Path) -> None:
-    plain, dueling = arms(tmp_path, (0.2, 0.7), config__network__layer_norm=False)
-    page = tmp_path / "deep" / "page.html"
-    assert main(["compare", *plain, "--against", *dueling, "--page", str(page)]) == 0
-    found = read(page)
-    assert found.text.index("gate passed: comparable") < found.text.index("dueling is better in")
-    assert found.tags.count("figure") == 3  # differences, improvement, curves
-
-
 def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
     plain, other = arms(tmp_path, (0.2, 0.7), config__replay__batch_size=7)
     page = tmp_path / "page.html"
