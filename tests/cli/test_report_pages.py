@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from support.finished_runs import document, make_run
-from support.page_scripts import charts_of
+from support.page_scripts import Page
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
@@ -24,34 +23,8 @@ from restock.report.look.write import Charts
 HOSTILE = "</script><script>alert(1)</script><!--"
 
 
-class Read(HTMLParser):
-    """Tags, what is fetched, and the text that is shown."""
-
-    def __init__(self, page: Path) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.fetched: list[str] = []
-        self.text = ""
-        self._hidden = False
-        self.feed(page.read_text(encoding="utf-8"))
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self._hidden = tag in ("style", "script")
-        self.fetched += [v for k, v in attributes if k in ("src", "href") and v and v[0] != "#"]
-
-    def handle_endtag(self, tag: str) -> None:
-        self._hidden = False
-
-    def handle_data(self, data: str) -> None:
-        self.text += "" if self._hidden else " ".join(data.split()) + " "
-
-
-def read(page: Path) -> Read:
-    found = Read(page)
-    assert found.fetched == []
-    assert "link" not in found.tags
-    charts_of(page.read_text(encoding="utf-8"))
+def read(page: Path) -> Page:
+    found = Page(page.read_text(encoding="utf-8"))
     assert "wheel_slip" not in found.text
     return found
 

@@ -10,10 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.bag_samples import STORE
-from support.paths import SHARED
 
-from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import CannotDecode, Channel, Leaf, MessageBatch, Ragged, equal
+from restock.ingest.decoding.columns import CannotDecode, Channel, Leaf, MessageBatch, equal
 from restock.ingest.decoding.decoders import ColumnDecoder
 from restock.ingest.decoding.definitions import RosType, message_type
 from restock.ingest.decoding.row_by_row import RowDecoder
@@ -171,42 +169,6 @@ def test_both_byte_orders_in_one_batch():
     agree(message, payloads)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "every-common-type/test_bag_mcap",
-        "turtlebot3-sim-humble",
-        "jazzy-mcap-backsteps",
-        "rosbag2-tests/mcap/cdr_test",
-        "ros1/husky_robot_localization.bag",
-    ],
-)
-def test_other_peoples_messages_decode_as_rosbags_does(name):
-    with open_recording(SHARED / name) as recording:
-        for topic, info in recording.topics.items():
-            if info.skipped:
-                continue
-            (stream, *_) = recording._streams[topic]
-            message = message_type(stream.channel, "humble")
-            for _, messages in stream.storage.batches([stream.channel.id]):
-                few = slice(None, 40)
-                part = MessageBatch(
-                    messages.buffer,
-                    messages.start[few],
-                    messages.stop[few],
-                    *[messages.log_time_ns[few]] * 2,
-                )
-                ros1 = info.encoding == "ros1"
-                leaves = message.leaves()
-                columnar = ColumnDecoder(message, leaves, ros1=ros1).decode(part)
-                rosbags = RowDecoder(message, leaves, ros1=ros1).decode(part)
-                assert len(columnar.rows) == len(part)
-                for path, column in rosbags.fields.items():
-                    assert equal(columnar.fields[path], column), (topic, path)
-                break
-
-
 # -- golden bytes ---------------------------------------------------------------------------
 
 
@@ -217,23 +179,6 @@ def one(kind: str, definition: str = "") -> RosType:
 
 def leaf(message: RosType, path: str) -> Leaf:
     return message.leaf(path)
-
-
-def test_alignment_is_relative_to_the_byte_after_the_header():
-    message = one("pkg/msg/T", "uint8 a\nfloat64 b\nuint8 c\nuint16 d")
-    payload = bytes.fromhex("00010000 07 00000000000000 000000000000f83f 09 00 3412")
-    decoded = ColumnDecoder(message, message.leaves()).decode(batch([payload])).fields
-    assert [column[0] for column in decoded.values()] == [7, 1.5, 9, 0x1234]
-
-
-def test_an_empty_sequence_takes_no_padding():
-    message = one("pkg/msg/T", "float64[] a\nuint8 b")
-    empty = bytes.fromhex("00010000 00000000 07")
-    full = bytes.fromhex("00010000 01000000 00000000 000000000000f03f 08")
-    decoded = ColumnDecoder(message, message.leaves()).decode(batch([empty, full])).fields
-    assert decoded["b"].tolist() == [7, 8]
-    assert isinstance(decoded["a"], Ragged)
-    assert [row.tolist() for row in (decoded["a"][0], decoded["a"][1])] == [[], [1.0]]
 
 
 def test_xcdr2_and_parameter_lists_are_refused_by_name():

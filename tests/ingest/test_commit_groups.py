@@ -147,22 +147,6 @@ def test_the_same_drive_twice_in_a_group_is_found(store, group, tmp_path, repeat
     assert len(shown(tmp_path / "s")) == (2 if repeated == "refuse" else 3)
 
 
-@pytest.mark.parametrize("repeated", ["refuse", "keep"])
-def test_of_a_part_and_the_whole_the_part_is_to_go(store, group, tmp_path, repeated):
-    """As of a bag that the night before was still being written."""
-    rows = recording_transitions(2, episodes=5)
-    part = replaced(rows.slice(0, len(rows) // 2), {"recording_id": f"{7:016x}", "ingest_id": "z"})
-    group.add(0, waiting(store, (manifest(part), part), repeated))
-    group.add(1, waiting(store, (manifest(rows), rows), repeated))
-    group.commit()
-    result, removal = group.results[1], f"`restock store remove {tmp_path / 's'} {7:016x}` takes"
-    if isinstance(result, IngestResult):
-        assert f"{removal} out that one, which holds less" in result.notes[-1]
-    else:
-        assert f"{removal} that one out; then ingest this one again" in str(result)
-    assert isinstance(result, IngestResult) == (repeated == "keep")
-
-
 def test_a_recording_given_twice_is_unchanged_the_second_time(tmp_path):
     for number in (1, 2):
         write_bag(Drive(duration_s=3.0 + number, truth="nominal"), tmp_path / f"bag{number}")

@@ -105,12 +105,6 @@ def test_a_probability_keeps_the_rules_of_a_label(text, said):
         probabilities(steps([0.5, 0.7, 0.9]), [condition(text)])
 
 
-def test_a_band_that_is_none_is_refused():
-    for band in ((0.8, 0.2), (-0.1, 0.5), (0.5, 1.5)):
-        with pytest.raises(ValueError, match="uncertain must be"):
-            Condition("fast", "pre", "true", uncertain=band)
-
-
 def test_noise_of_a_profile_does_not_change_rows():
     usual = parse_profile(WAREHOUSE, where="a")
     noisy = parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0.05\n", where="b")

@@ -14,7 +14,6 @@ from restock.ingest.task import conditions
 from restock.ingest.task.conditions import (
     Condition,
     label,
-    labels_version,
     let_values,
     primary,
     shipped,
@@ -235,7 +234,8 @@ def test_a_pre_condition_does_not_change_when_the_future_does(table, data):
         pa.array((np.arange(len(future)) + until + 1) * 200_000_000),
     )
     altered = pa.concat_tables([table.slice(0, until + 1), future], promote_options="default")
-    pre = [condition for condition in SHIPPED if condition.timing == "pre"]
+    every = [*SHIPPED, *shipped(kind="exposure").values()]
+    pre = [condition for condition in every if condition.timing == "pre"]
     before, after = label(table, pre), label(altered, pre)
     for name, holds in before.items():
         assert np.array_equal(holds[: until + 1], after[name][: until + 1]), name
@@ -359,13 +359,6 @@ def test_a_condition_has_a_plain_name(name):
 def test_null_is_false():
     found = label(steps(3), [Condition("n", "post", "lead(bumped) OVER episode")])["n"]
     assert found.tolist() == [False, False, False]
-
-
-def test_the_version_names_what_the_conditions_say():
-    one = Condition("a", "pre", "true")
-    assert labels_version([one]) == labels_version([one])
-    assert labels_version([one]) != labels_version([Condition("a", "post", "true")])
-    assert labels_version([one, SHIPPED[0]]) == labels_version([SHIPPED[0], one])
 
 
 def test_what_a_rule_goes_by_can_be_looked_at():

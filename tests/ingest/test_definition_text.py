@@ -93,21 +93,6 @@ def test_files_of_a_folder_are_read_alike(tmp_path: Path) -> None:
         folder_types(str(folder))  # another name, as they are read once
 
 
-@pytest.mark.parametrize(
-    ("form", "text", "place"),
-    [
-        ("ros2msg", MSG.replace("float32 left", "float32 == left"), " at 'float32 == left float64"),
-        ("ros2idl", IDL.replace("uint8 level", "fooo bar level"), " at 'level; a_msgs::msg"),
-        ("ros2idl", IDL.replace("double right", "double right[N]"), ": Cannot resolve constant 'N"),
-    ],
-)
-def test_what_cannot_be_parsed_is_quoted(tmp_path: Path, form: str, text: str, place: str) -> None:
-    with open_recording(recorded(tmp_path / "run.mcap", form, text)) as recording:
-        skipped = recording.topics["/twist"].skipped
-        assert skipped is not None
-        assert skipped.startswith(f"its definition cannot be parsed{place}")
-
-
 @pytest.mark.parametrize("name", ["a_msgs/Twist", "a_msgs/msg/Twist"])
 def test_a_type_has_one_name_with_or_without_msg(tmp_path: Path, name: str) -> None:
     with open_recording(recorded(tmp_path / "run.mcap", "ros2msg", MSG, name)) as recording:

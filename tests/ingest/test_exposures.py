@@ -23,7 +23,6 @@ from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.replay.store.store import Store
 
 SHIPPED = list(shipped().values())
-EXPOSURES = list(shipped(kind="exposure").values())
 LISTED = 'exposures = ["closing_traffic", "plan_blocked", "slippery_floor"]'
 assert LISTED in TEXT
 OWN = """
@@ -71,21 +70,6 @@ def test_each_situation_is_told_by_what_is_known_before_acting():
     ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, slice(10, 12)))
     assert exposed(ice, "slippery_floor") == list(range(11, 17))
     assert exposed(steps(20), "slippery_floor") == []
-
-
-def test_no_exposure_looks_ahead():
-    """A row's exposures are the same whatever comes after it."""
-    rng = np.random.default_rng(0)
-    signals = {
-        "came_nearer_m": rng.uniform(0, 0.2, 40),
-        "plan_return_m": rng.uniform(1, 4, 40),
-        "wheel_speed_mps": rng.uniform(0, 1, 40),
-    }
-    whole = label(steps(40, **signals), EXPOSURES)
-    part = label(steps(25, **{name: column[:25] for name, column in signals.items()}), EXPOSURES)
-    assert any(held.any() for held in whole.values())
-    for name, held in part.items():
-        assert held.tolist() == whole[name][:25].tolist()
 
 
 def test_an_exposure_takes_no_row_from_a_condition():

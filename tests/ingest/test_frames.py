@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -122,13 +120,6 @@ def test_each_transform_is_held_from_when_it_was_measured_on():
     assert found.stamp_ns[2] == START_NS + NS // 10  # of the newest on the way
 
 
-def test_static_transforms_never_age():
-    tree = tree_of(Frames(base="laser"), [], [(-600.0, "map", "laser", 1, 2, 3, 0)])
-    found = tree.place("laser", at(0.0, 10.0))
-    assert found.problem.tolist() == ["", ""]
-    assert found.translation_m.tolist() == [[1, 2, 3], [1, 2, 3]]
-
-
 def test_only_static_transforms_hold_across_a_clock_jump():
     log = np.arange(0, 10, 0.1)
     clock = columns(log, {})
@@ -182,12 +173,6 @@ def test_a_frame_with_a_new_parent_is_followed():
 def test_a_loop_ends():
     moving: list[Line] = [(0.0, "a", "base_link", 1, 0, 0, 0), (0.0, "base_link", "a", 1, 0, 0, 0)]
     assert "no transform" in tree_of(Frames(), moving, []).place("base_link", at(0.1)).problem[0]
-
-
-def test_a_slash_before_a_name_says_nothing():
-    moving: list[Line] = [(0.0, "/map", "/base_link", 3, 0, 0, 0)]
-    found = tree_of(Frames(), moving, []).place("base_link", at(0.1))
-    assert found.translation_m[0, 0] == 3.0
 
 
 @settings(max_examples=40)
@@ -329,20 +314,6 @@ def test_what_is_no_topic_of_transforms_is_named(topic, said, tmp_path, capsys):
     profile.write_text(framed(frames=frames))
     assert main(["profile", "check", str(profile), str(SAMPLE)]) == 2
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_on_the_sample_log_transforms_and_localisation_agree(tmp_path, capsys):
-    """Rows, labels and scores from /tf are those from /amcl_pose."""
-    profile = tmp_path / "p.toml"
-    profile.write_text(framed())
-    said = []
-    for name in ("warehouse_amr", str(profile)):
-        assert main(["ingest", str(SAMPLE), "--profile", name, "--dry-run", "--json"]) == 0
-        said.append(json.loads(capsys.readouterr().out)["recordings"][0])
-    for key in ("transitions", "episodes", "drops", "conditions", "named", "label_scores"):
-        assert said[0][key] == said[1][key], key
-    assert {"input": "pose", "instead": "from transforms, by [frames]"} in said[1]["stand_ins"]
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

@@ -92,19 +92,6 @@ def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, caps
     assert [row["changed"] for row in again["recordings"]] == [0, 0]
 
 
-def test_an_ingest_after_a_relabel_finds_it_unchanged(store, tmp_path, capsys):
-    """By the same profile: its rows and labels are what they would be."""
-    shipped = tmp_path / "shipped.toml"
-    shipped.write_text(TEXT)
-    profile = str(tmp_path / "amr.toml")
-    assert main(["store", "label", str(store), "--profile", str(shipped)]) == 0
-    assert main(["store", "label", str(store), "--profile", profile]) == 0
-    capsys.readouterr()
-    command = ["ingest", str(tmp_path / "a"), "--store", str(store), "--profile", profile]
-    assert main([*command, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["recordings"][0]["status"] == "unchanged"
-
-
 def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
     writer = StoreWriter(store)
 

@@ -53,28 +53,6 @@ def test_a_row_of_several_conditions_is_scored_for_each():
     assert (after.precision, after.recall, after.labelled, after.support) == (1, 1, 1, 1)
 
 
-def in_one_episode(count: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros(count, np.int64), np.arange(count)
-
-
-def test_scores_by_hand():
-    given_ = {"slip": np.array([True, True, False, False, True, False])}
-    truth = ["slip", "nominal", "slip, blocked", "nominal", None, "slip"]
-    (one,) = score(given_, truth, *in_one_episode(6), 0.2)
-    assert (one.labelled, one.support, one.known) == (2, 3, 5)
-    assert one.precision == pytest.approx(1 / 2)
-    assert one.recall == pytest.approx(1 / 3)
-    assert one.shortfall == (
-        "precision 0.30 short of 0.8, recall 0.47 short of 0.8; true in 60.0% of steps"
-    )
-    # One event of the label, near the first true one and the second, not the third.
-    assert (one.event_labelled, one.event_right) == (1, 1)
-    assert (one.event_support, one.event_found) == (3, 2)
-    assert score(given_, [None] * 6, *in_one_episode(6), 0.2) == []
-    never = {"slip": np.zeros(2, np.bool_)}
-    assert score(never, ["nominal", "nominal"], *in_one_episode(2), 0.2) == []
-
-
 @st.composite
 def episodes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Labels and truth (N,) with their episode and step."""

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
-from support.driven_robot import Drive, columns, scans, transforms, without, write_topics
+from support.driven_robot import Drive, columns, scans, transforms, without, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -74,22 +74,7 @@ class Corridor(Drive):
         return columns(times_s, fields)
 
     def bag(self, folder: Path) -> Path:
-        kinds = {
-            "/cmd_vel": "geometry_msgs/msg/Twist",
-            "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-            "/odom": "nav_msgs/msg/Odometry",
-            "/imu": "sensor_msgs/msg/Imu",
-            "/goal_pose": "geometry_msgs/msg/PoseStamped",
-            "/plan": "nav_msgs/msg/Path",
-            "/bumper": "std_msgs/msg/Bool",
-            "/behaviour_policy": "std_msgs/msg/String",
-            "/tf_static": "tf2_msgs/msg/TFMessage",
-        }
-        topics = {
-            name: (kinds.get(name, "sensor_msgs/msg/LaserScan"), one)
-            for name, one in self.topics().items()
-        }
-        return write_topics(topics, folder, storage="mcap")
+        return write_bag(self, folder, storage="mcap")
 
 
 def cast(moved_m: float, place: Place, bearing: Any) -> Any:

@@ -116,20 +116,6 @@ def test_without_a_goal_its_topics_are_not_needed(tmp_path):
     assert ingest(bag, aimless, store=None).manifest["transitions"] == 14
 
 
-def test_a_name_that_is_nearly_one(tmp_path):
-    with pytest.raises(ConfigError, match="did you mean 'turtlebot3'"):
-        load_profile("turtlebot")
-    with pytest.raises(ConfigError, match="the shipped profiles are: turtlebot3, warehouse_amr"):
-        load_profile(tmp_path / "none.toml")
-
-
-def test_a_file_that_is_not_text(tmp_path):
-    file = tmp_path / "p.toml"
-    file.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="is not TOML: 'utf-8' codec"):
-        load_profile(file)
-
-
 def test_what_stands_in_is_said():
     assert load_profile("warehouse_amr").fallbacks == {}
     assert set(load_profile("turtlebot3").fallbacks) == {
@@ -181,16 +167,6 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     lines = out[out.index("# [inputs.pose]") : out.index("# [inputs.imu]")].splitlines()
     named = "\n".join(line[2:] for line in lines if "[inputs.wheels]" not in line)
     assert parse_profile(out + named, where="p").inputs.pose.fields["yaw_rad"] == "FIELD"
-
-
-def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):
-    file = tmp_path / "p.toml"
-    file.write_text(TEXT.replace('"/scan"', '"/front"').replace('"/odom"', '"/imu"'))
-    assert main(["profile", "check", str(file), str(bag)]) == 2
-    out, err = capsys.readouterr()
-    assert "no topic /front (scan)" in err
-    assert "/imu holds sensor_msgs/msg/Imu, not nav_msgs/msg/Odometry (wheels)" in err
-    assert "/amcl_pose" in out
 
 
 def test_a_profile_is_never_overwritten(bag, tmp_path, capsys):

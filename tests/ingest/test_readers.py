@@ -276,27 +276,6 @@ def test_a_file_that_is_no_recording_is_refused(content: bytes | None, says: str
     assert caught.value.where is not None
 
 
-def test_a_missing_distribution_and_an_empty_path_are_named(mcap):
-    with pytest.raises(RecordingError, match="definitions named 'hamble'"):
-        open_recording(mcap, definitions="hamble")
-    with pytest.raises(RecordingError, match="the path of a recording is empty"):
-        open_recording("")
-
-
-@pytest.mark.parametrize(
-    ("topic", "path", "says"),
-    [
-        ("/odm", "x", "no topic named '/odm'"),
-        ("/odom", "twist.twist.linear.w", r"no value at 'twist\.twist\.linear\.w'"),
-        ("/odom", "pose.pose", "it is a message"),
-        ("/plan", "poses.pose.position.x", r"write poses\[\]"),
-    ],
-)
-def test_a_missing_topic_or_field_is_named(mcap: Path, topic: str, path: str, says: str):
-    with open_recording(mcap) as recording, pytest.raises(RecordingError, match=says):
-        recording.read({topic: [path]})
-
-
 @pytest.mark.parametrize("container", ["mcap, lz4", "sqlite3 bag", "mcap bag, zstd file"])
 def test_a_closed_recording_is_not_an_empty_one(container: str, tmp_path: Path) -> None:
     with open_recording(CONTAINERS[container](tmp_path)) as recording:

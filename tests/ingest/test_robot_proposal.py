@@ -10,12 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import Drive, columns, typed_topics, write_topics
 
-from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.description import Description, read_description
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.described_robot import DescribedRobot, described_robot, read_urdf
+from restock.ingest.propose.described_robot import DescribedRobot, described_robot
 from restock.ingest.propose.footprint import footprint_of
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import propose_robot
@@ -251,19 +250,3 @@ def test_robots_in_a_recording_have_their_own_outlines(said_of, outline, source,
     if found is not None:
         assert (found.length_m, found.width_m) == pytest.approx(outline)
         assert source in found.source
-
-
-def test_a_file_that_is_no_robot_is_refused(bag, tmp_path):
-    path = tmp_path / "arm.urdf"
-    for content, message in (
-        (robot().encode(), "has no wheels"),
-        (b"\xff\xfe<robot/>", "is not a URDF"),
-    ):
-        path.write_bytes(content)
-        with (
-            open_recording(bag) as recording,
-            pytest.raises(ConfigError, match=message),
-        ):
-            propose_profile(recording, "mine", urdf=path)
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_urdf(tmp_path / "none.urdf")

@@ -31,21 +31,10 @@ def test_look_ahead_goes_round_the_corner():
     assert view.look_ahead_m[0] == pytest.approx(np.array([[0.5, 0.5], [0.5, 1.7]]))
 
 
-def test_the_body_frame_turns_with_the_robot():
-    view = seen(L_SHAPE, 1.0, 0.0, np.pi / 2)
-    assert view.look_ahead_m[0, 0] == pytest.approx([0.0, -1.0])  # the plan goes to its right
-
-
 def test_beyond_the_end_is_the_end():
     view = seen(L_SHAPE, 4.0, 2.5, 0.0)
     assert view.look_ahead_m[0] == pytest.approx(np.array([[0.0, 0.5], [0.0, 0.5]]))
     assert view.remaining_m == pytest.approx([0.5])
-
-
-def test_a_plan_of_one_point():
-    view = seen([[2.0, 0.0]], 0.0, 0.0, 0.0)
-    assert view.look_ahead_m[0] == pytest.approx(np.array([[2.0, 0.0], [2.0, 0.0]]))
-    assert view.remaining_m == pytest.approx([0.0])
 
 
 coordinate = st.floats(-20, 20)

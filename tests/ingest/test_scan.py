@@ -22,15 +22,6 @@ def test_sectors_go_counter_clockwise_from_straight_behind():
     assert sectors.clearance(ranges, 0.05, 4.0)[0] == pytest.approx([3, 3, 1, 3])
 
 
-def test_clearance_is_what_lies_beyond_the_outline():
-    reach = outline_reach(np.array([0.0, np.pi / 2, np.pi, -np.pi / 2]), BODY)
-    assert reach == pytest.approx([0.35, 0.25, 0.35, 0.25])
-    ahead = Body(length_m=0.7, width_m=0.5, lidar_x_m=0.2)
-    assert outline_reach(np.array([0.0, np.pi]), ahead) == pytest.approx([0.15, 0.55])
-    corner = np.arctan2(0.25, 0.35)
-    assert outline_reach(np.array([corner]), BODY) == pytest.approx([np.hypot(0.35, 0.25)])
-
-
 @pytest.mark.filterwarnings("error")
 def test_a_range_that_is_a_signalling_nan_is_a_nan():
     ranges = np.full((1, 360), 3.0, np.float32)

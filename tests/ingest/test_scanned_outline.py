@@ -8,7 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import BEAMS, Drive, columns, pose, scans, transforms, write_topics
+from support.driven_robot import (
+    BEAMS,
+    KINDS,
+    Drive,
+    columns,
+    pose,
+    scans,
+    transforms,
+    typed_columns,
+    write_topics,
+)
 from support.paths import SHARED
 
 from restock.cli import main
@@ -16,14 +26,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.replay.store.store import Store
 
-TYPES = {
-    "/cmd_vel": "geometry_msgs/msg/Twist",
-    "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "/odom": "nav_msgs/msg/Odometry",
-    "/scan": "sensor_msgs/msg/LaserScan",
-    "/tf_static": "tf2_msgs/msg/TFMessage",
-    "/local_costmap/published_footprint": "geometry_msgs/msg/PolygonStamped",
-}
+KEPT = ("/cmd_vel", "/amcl_pose", "/odom", "/scan")
 
 
 @dataclass
@@ -35,7 +38,7 @@ class Turning(Drive):
     post_m: float | None = None  # of itself, straight behind: what its lidar always sees
 
     def topics(self) -> dict[str, TopicColumns]:
-        found = {name: c for name, c in super().topics().items() if name in TYPES}
+        found = {name: c for name, c in super().topics().items() if name in KEPT}
         stamps = (found["/amcl_pose"].fields["header.stamp"] - 1_700_000_000 * 10**9) * 1e-9
         yaw = stamps  # rad
         turned = pose("pose.pose", self.x_at(stamps), 1.0)
@@ -55,9 +58,7 @@ class Turning(Drive):
 
 
 def proposed(tmp_path: Any, capsys: Any, drive: Drive, **more: TopicColumns) -> tuple[Profile, str]:
-    topics = {name: (TYPES[name], c) for name, c in drive.topics().items()}
-    topics |= {name: (TYPES[name], c) for name, c in more.items()}
-    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    bag = write_topics(typed_columns(drive.topics() | more), tmp_path / "bag", storage="mcap")
     assert main(["profile", "new", str(bag), "--json"]) in (0, 3)
     text = json.loads(capsys.readouterr().out)["toml"]
     return parse_profile(text, where="p"), text
@@ -94,7 +95,7 @@ class Passing(Turning):
 def test_conditions_by_a_guessed_outline_are_uncertain(tmp_path, capsys):
     """A robot .33 m wide passes .16 m clear of poles: to a guess of .48 m each was too near."""
     drive = Passing(12.0, nearest_m=0.325)
-    topics = {name: (TYPES[name], c) for name, c in drive.topics().items()}
+    topics = typed_columns(drive.topics())
     bag = str(write_topics(topics, tmp_path / "bag", storage="mcap"))
     toml, store = tmp_path / "p.toml", tmp_path / "store"
     held = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
@@ -133,7 +134,7 @@ def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path, capsys):
     topics = drive.topics()
     straight = Drive(12.0).topics()["/amcl_pose"]
     topics["/amcl_pose"] = straight
-    bag = write_topics({n: (TYPES[n], c) for n, c in topics.items()}, tmp_path / "bag")
+    bag = write_topics(typed_columns(topics), tmp_path / "bag")
     main(["profile", "new", str(bag), "--json"])
     profile = parse_profile(json.loads(capsys.readouterr().out)["toml"], where="p")
     assert profile.task.range_min_m == pytest.approx(0.02)
@@ -170,8 +171,8 @@ def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsy
 
 def test_a_lidar_outside_the_outline_is_turned_by_transforms(tmp_path, capsys):
     """Its base frame is no middle, as that of a car, between its rear wheels."""
-    topics = {name: (TYPES[name], c) for name, c in Framed(12.0).topics().items()}
-    topics["/tf_static"] = (TYPES["/tf_static"], lidar_at(0.9, 0.0, 3.0))
+    topics = typed_columns(Framed(12.0).topics())
+    topics["/tf_static"] = (KINDS["/tf_static"], lidar_at(0.9, 0.0, 3.0))
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     assert main(["profile", "new", str(bag), "--footprint", "1.2x0.6", "--json"]) in (0, 3)
     text = json.loads(capsys.readouterr().out)["toml"]
@@ -185,12 +186,12 @@ def test_a_lidar_upside_down_gives_the_rows_of_an_upright_one(tmp_path, capsys):
     found, texts = [], []
     for roll, sign in ((0.0, 1), (np.pi, -1)):
         drive = Framed(12.0, near_scans=60)
-        topics = {name: (TYPES[name], c) for name, c in drive.topics().items()}
+        topics = typed_columns(drive.topics())
         scan = topics["/scan"][1].fields
         for angle in ("angle_min", "angle_max", "angle_increment"):
             if angle in scan:
                 scan[angle] = sign * np.asarray(scan[angle])
-        topics["/tf_static"] = (TYPES["/tf_static"], lidar_at(0.1, 0.0, 0.3, roll))
+        topics["/tf_static"] = (KINDS["/tf_static"], lidar_at(0.1, 0.0, 0.3, roll))
         bag = write_topics(topics, tmp_path / f"bag{sign}", storage="mcap")
         toml, store = tmp_path / f"{sign}.toml", tmp_path / f"store{sign}"
         assert main(["profile", "new", str(bag), "--out", str(toml)]) in (0, 3)

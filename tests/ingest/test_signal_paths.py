@@ -33,18 +33,6 @@ STATUS = {
 }
 
 
-def test_a_plain_field_and_elements_of_a_list():
-    assert values_at("voltage", {"voltage": np.array([1.0, 2.0])}) == [[1.0], [2.0]]
-    ranges = {"ranges": ragged([[1, 2, 3, 4, 5], [6], []])}
-    assert values_at("ranges[0]", ranges) == [[1], [6], []]
-    assert values_at("ranges[-1]", ranges) == [[5], [6], []]
-    assert values_at("ranges[4]", ranges) == [[5], [], []]
-    assert values_at("ranges[]", ranges) == [[1, 2, 3, 4, 5], [6], []]
-    assert values_at("ranges[::2]", ranges) == [[1, 3, 5], [6], []]
-    assert values_at("ranges[1:-1]", ranges) == [[2, 3, 4], [], []]
-    assert values_at("ranges[-2:]", ranges) == [[4, 5], [6], []]
-
-
 def test_elements_of_a_fixed_array():
     columns = {"covariance": np.arange(12.0).reshape(3, 4)}
     assert values_at("covariance[3]", columns) == [[3], [7], [11]]

@@ -25,6 +25,22 @@ MOVE_BASE = {
     "MoveBaseActionGoal": "std_msgs/Header header\nactionlib_msgs/GoalID goal_id\n"
     "move_base_msgs/MoveBaseGoal goal\n",
 }
+KINDS = {  # of topics: the types of their messages
+    "/cmd_vel": "geometry_msgs/msg/Twist",
+    "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/imu": "sensor_msgs/msg/Imu",
+    "/goal_pose": "geometry_msgs/msg/PoseStamped",
+    "/plan": "nav_msgs/msg/Path",
+    "/map": "nav_msgs/msg/OccupancyGrid",
+    "/bumper": "std_msgs/msg/Bool",
+    "/behaviour_policy": "std_msgs/msg/String",
+    "/ground_truth/condition": "std_msgs/msg/String",
+    "/battery": "sensor_msgs/msg/BatteryState",
+    "/robot_description": "std_msgs/msg/String",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/local_costmap/published_footprint": "geometry_msgs/msg/PolygonStamped",
+}
 ITEMS = {  # of lists: what they hold
     "poses": "geometry_msgs/msg/PoseStamped",
     "polygon.points": "geometry_msgs/msg/Point32",
@@ -195,24 +211,17 @@ def write_bags(folder: Path, count: int) -> Path:
 
 
 def typed_topics(drive: Drive) -> dict[str, tuple[str, TopicColumns]]:
-    """Return the drive's topics with the types of their messages, as `write_topics` takes them."""
-    names = {
-        "/cmd_vel": "geometry_msgs/msg/Twist",
-        "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "/odom": "nav_msgs/msg/Odometry",
-        "/imu": "sensor_msgs/msg/Imu",
-        "/scan": "sensor_msgs/msg/LaserScan",
-        "/goal_pose": "geometry_msgs/msg/PoseStamped",
-        "/plan": "nav_msgs/msg/Path",
-        "/bumper": "std_msgs/msg/Bool",
-        "/behaviour_policy": "std_msgs/msg/String",
-        "/ground_truth/condition": "std_msgs/msg/String",
-        "/battery": "sensor_msgs/msg/BatteryState",
-        "/robot_description": "std_msgs/msg/String",
-    }
+    """Return the drive's topics with the types of their messages."""
+    found = typed_columns(drive.topics())
     if drive.proposals is not None:
-        names[drive.proposals] = names["/cmd_vel"]
-    return {name: (names[name], columns) for name, columns in drive.topics().items()}
+        found[drive.proposals] = KINDS["/cmd_vel"], found[drive.proposals][1]
+    return found
+
+
+def typed_columns(topics: Mapping[str, TopicColumns]) -> dict[str, tuple[str, TopicColumns]]:
+    """Return topics as `write_topics` takes them; those that are none of `KINDS` are scans."""
+    scan = "sensor_msgs/msg/LaserScan"
+    return {name: (KINDS.get(name, scan), columns) for name, columns in topics.items()}
 
 
 def write_topics(

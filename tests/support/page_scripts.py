@@ -1,4 +1,4 @@
-"""The scripts of a page: that it has its own and no others, and what its charts were given."""
+"""A page: its text, that it fetches nothing and runs its own scripts alone, and its charts."""
 
 from __future__ import annotations
 
@@ -58,4 +58,34 @@ def charts_of(html: str) -> dict[str, Any]:
     return found
 
 
-__all__ = ["charts_of"]
+class Page(HTMLParser):
+    """A page's tags, what is fetched, and the text that is shown; its scripts are checked."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.fetched: list[str] = []
+        self.text = ""
+        self._hidden = False
+        self.feed(html)
+        assert "link" not in self.tags
+        assert self.fetched == []
+        assert "@import" not in html
+        assert "url(http" not in html
+        self.charts = charts_of(html)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self._hidden = tag in ("style", "script")
+        fetching = ("src", "href", "xlink:href", "srcset", "data")
+        named = [value for name, value in attributes if name in fetching and value]
+        self.fetched += [value for value in named if not value.startswith(("#", "data:"))]
+
+    def handle_endtag(self, tag: str) -> None:
+        self._hidden = False
+
+    def handle_data(self, data: str) -> None:
+        self.text += "" if self._hidden else " ".join(data.split()) + " "
+
+
+__all__ = ["Page", "charts_of"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from support.driven_robot import BEAMS, FREE_M, columns, scans, write_topics
+from support.driven_robot import BEAMS, FREE_M, columns, scans, typed_columns, write_topics
 from twin.test_robot_drives import CAR, CAR_ACTIONS, OUTLINE
 
 from restock import cli
@@ -57,7 +57,6 @@ def recorded(profile: Profile, folder: Path) -> Path:
     at = np.array([state.time_s[0] for state in states])
     yaw = np.array([state.yaw_rad[0] for state in states])
     wheels = np.array([robot.body_velocity(*state.wheel_speed_radps[0]) for state in states])
-    zero = np.zeros(len(at))
     ticks = np.arange(len(commands)) * 0.2
     commanded, slow = np.array(commands), slice(4, None, 5)
     place = {
@@ -66,41 +65,17 @@ def recorded(profile: Profile, folder: Path) -> Path:
         "pose.pose.orientation.z": np.sin(yaw / 2)[slow],
         "pose.pose.orientation.w": np.cos(yaw / 2)[slow],
     }
+    measured = {"angular_velocity.z": np.array([state.yaw_rate_radps[0] for state in states])}
+    told = {"linear.x": commanded[:, 0], "angular.z": commanded[:, 1]}
+    turned = {"twist.twist.linear.x": wheels[:, 0], "twist.twist.angular.z": wheels[:, 1]}
     topics = {
-        "/cmd_vel": (
-            "geometry_msgs/msg/Twist",
-            columns(
-                ticks + 0.003,
-                {"linear.x": commanded[:, 0], "angular.z": commanded[:, 1]},
-                stamped=False,
-            ),
-        ),
-        "/amcl_pose": (
-            "geometry_msgs/msg/PoseWithCovarianceStamped",
-            columns(at[slow], place),
-        ),
-        "/odom": (
-            "nav_msgs/msg/Odometry",
-            columns(
-                at, {"twist.twist.linear.x": wheels[:, 0], "twist.twist.angular.z": wheels[:, 1]}
-            ),
-        ),
-        "/imu": (
-            "sensor_msgs/msg/Imu",
-            columns(
-                at,
-                {
-                    "angular_velocity.z": np.array([state.yaw_rate_radps[0] for state in states]),
-                    "linear_acceleration.x": zero,
-                },
-            ),
-        ),
-        "/scan": (
-            "sensor_msgs/msg/LaserScan",
-            columns(ticks, scans(np.full((len(ticks), BEAMS), FREE_M))),
-        ),
+        "/cmd_vel": columns(ticks + 0.003, told, stamped=False),
+        "/amcl_pose": columns(at[slow], place),
+        "/odom": columns(at, turned),
+        "/imu": columns(at, measured | {"linear_acceleration.x": np.zeros(len(at))}),
+        "/scan": columns(ticks, scans(np.full((len(ticks), BEAMS), FREE_M))),
     }
-    return write_topics(topics, folder)
+    return write_topics(typed_columns(topics), folder)
 
 
 @pytest.mark.slow

@@ -14,13 +14,13 @@ import pyarrow as pa
 import pytest
 from deltalake import DeltaTable
 from PIL import Image
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from support.driven_robot import typed_columns, write_topics
 from support.profile_texts import WAREHOUSE
 from support.stores import recording_transitions, with_clear_view, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
+from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Zone
 from restock.ingest.propose.footprint import parse_footprint
@@ -39,8 +39,6 @@ from restock.train.twin.survey.picture import (
 )
 from restock.train.twin.survey.survey import survey
 
-TYPES = get_typestore(Stores.ROS2_HUMBLE)
-T = TYPES.types
 CELL_M = 0.05
 
 
@@ -66,18 +64,20 @@ def lap(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
     return poses
 
 
-def header(stamp_ns: int, frame: str) -> Any:
-    stamp = T["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    return T["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
-
-
-def pose(x: float, y: float, yaw: float) -> Any:
-    return T["geometry_msgs/msg/Pose"](
-        position=T["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
-        orientation=T["geometry_msgs/msg/Quaternion"](
-            x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2))
-        ),
+def topic(frame: str, count: int, fields: dict[str, Any], late_s: float = 0.0) -> TopicColumns:
+    """Return messages every .2 s, whose stamps are late by so much."""
+    log_ns = 10**9 + np.arange(count) * 2 * 10**8
+    stamped = {"header.stamp": log_ns + int(late_s * 1e9)}
+    return TopicColumns(
+        log_ns, log_ns, stamped | {"header.frame_id": np.full(count, frame, object)} | fields
     )
+
+
+def at(path: str, poses: np.ndarray) -> dict[str, Any]:
+    x, y, yaw = np.transpose(poses)
+    turned = {"orientation.z": np.sin(yaw / 2), "orientation.w": np.cos(yaw / 2)}
+    fields = {"position.x": x, "position.y": y, **turned}
+    return {f"{path}.{name}": column for name, column in fields.items()}
 
 
 def write_bag(
@@ -87,67 +87,34 @@ def write_bag(
     frame: str = "map",
     grid: OccupancyGrid | None = None,
     data: np.ndarray | None = None,
-    scanned: np.ndarray | None = None,
+    scanned: np.ndarray | None = None,  # cells (X, Y) that a lidar of 120 beams sees
     scanned_from: np.ndarray | None = None,
     scans_late_s: float = 0.0,
     scan_frame: str = "laser",
-    clockwise: bool = False,
+    clockwise: bool = False,  # as a lidar that hangs upside down
 ) -> Path:
-    """Write a rosbag2 folder with /amcl_pose every .2 s, and /map with the grid or `data`.
-
-    `scanned` are cells (X, Y) that a lidar of 120 beams sees from each pose, by ray marching; its
-    stamps may be late, and its angles those of one that hangs upside down.
-    """
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-
-        def send(topic: str, kind: str, messages: list[tuple[int, Any]]) -> None:
-            connection = writer.add_connection(topic, kind, typestore=TYPES)
-            for stamp_ns, message in messages:
-                writer.write(connection, stamp_ns, TYPES.serialize_cdr(message, kind))
-
-        if grid is not None:
-            kind = "nav_msgs/msg/OccupancyGrid"
-            info = T["nav_msgs/msg/MapMetaData"](
-                map_load_time=T["builtin_interfaces/msg/Time"](sec=0, nanosec=0),
-                resolution=grid.cell_m,
-                width=grid.occupancy.shape[0],
-                height=grid.occupancy.shape[1],
-                origin=pose(*grid.origin),
-            )
-            cells = np.ascontiguousarray(grid.occupancy.T).ravel() if data is None else data
-            message = T[kind](header=header(10**9, "map"), info=info, data=cells)
-            send("/map", kind, [(10**9, message)])
-        if poses is not None:
-            kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-            messages = []
-            for index, (x, y, yaw) in enumerate(poses.tolist()):
-                stamp_ns = 10**9 + index * 2 * 10**8
-                with_covariance = T["geometry_msgs/msg/PoseWithCovariance"](
-                    pose=pose(x, y, yaw), covariance=np.zeros(36)
-                )
-                message = T[kind](header=header(stamp_ns, frame), pose=with_covariance)
-                messages.append((stamp_ns, message))
-            send("/amcl_pose", kind, messages)
-        if scanned is not None and poses is not None:
-            kind = "sensor_msgs/msg/LaserScan"
-            messages = []
-            for index, at in enumerate(poses if scanned_from is None else scanned_from):
-                stamp_ns = 10**9 + index * 2 * 10**8
-                message = T[kind](
-                    header=header(stamp_ns + int(scans_late_s * 1e9), scan_frame),
-                    angle_min=np.pi if clockwise else -np.pi,
-                    angle_max=-np.pi if clockwise else np.pi,
-                    angle_increment=2 * np.pi / (-120 if clockwise else 120),
-                    time_increment=0.0,
-                    scan_time=0.2,
-                    range_min=0.1,
-                    range_max=12.0,
-                    ranges=seen_from(scanned, at),
-                    intensities=np.zeros(0, np.float32),
-                )
-                messages.append((stamp_ns, message))
-            send("/scan", kind, messages)
-    return folder
+    """Write a rosbag2 folder with /amcl_pose every .2 s, and /map with the grid or `data`."""
+    topics: dict[str, TopicColumns] = {}
+    if grid is not None:
+        width, height = grid.occupancy.shape
+        info = {"resolution": grid.cell_m, "width": width, "height": height}
+        fields = {f"info.{name}": np.array([value]) for name, value in info.items()}
+        cells = np.ascontiguousarray(grid.occupancy.T).ravel() if data is None else data
+        fields |= at("info.origin", np.array([grid.origin])) | {"data": cells[None]}
+        topics["/map"] = topic("map", 1, fields)
+    if poses is not None:
+        topics["/amcl_pose"] = topic(frame, len(poses), at("pose.pose", poses))
+    if scanned is not None and poses is not None:
+        seen = [
+            seen_from(scanned, one) for one in (poses if scanned_from is None else scanned_from)
+        ]
+        step = 2 * np.pi / (-120 if clockwise else 120)
+        angles = {"angle_min": -60 * step, "angle_max": 60 * step, "angle_increment": step}
+        given = angles | {"scan_time": 0.2, "range_min": 0.1, "range_max": 12.0}
+        fields = {name: np.full(len(seen), value) for name, value in given.items()}
+        fields["ranges"] = Ragged(np.concatenate(seen), offsets_of(np.full(len(seen), 120)))
+        topics["/scan"] = topic(scan_frame, len(seen), fields, scans_late_s)
+    return write_topics(typed_columns(topics), folder, storage="mcap")
 
 
 def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
