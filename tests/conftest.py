@@ -1,7 +1,5 @@
 """Fixtures that several rooms' tests share."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from functools import partial

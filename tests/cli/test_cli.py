@@ -1,7 +1,5 @@
 """The front door: help that teaches, one clear message for what is wrong, the right exit code."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

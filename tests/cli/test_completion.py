@@ -1,7 +1,5 @@
 """Completion: the scripts that `restock --tyro-write-completion` writes."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

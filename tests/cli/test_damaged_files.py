@@ -1,9 +1,4 @@
-"""What is missing, cut or of other bytes is said by every verb: its path, a remedy, exit 2.
-
-No traceback and no exit 1: that one means that an audit failed or a comparison was refused.
-"""
-
-from __future__ import annotations
+"""Missing, cut or changed files: every verb names the path, a remedy, and exits 2, never 1."""
 
 import json
 import os
@@ -91,15 +86,9 @@ def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
 
 
 def check(
-    argv: list[str],
-    named: Path,
-    capsys: pytest.CaptureFixture[str],
-    heard: list[str] | None = None,
+    argv: list[str], named: Path, capsys: pytest.CaptureFixture[str], heard: list[str] | None = None
 ) -> int:
-    """Run a command: 0, or 2 with a message that names the place; 1 for a refused comparison.
-
-    What it says is put into `heard`.
-    """
+    """Run a command: 0, 1 for a refused comparison, or 2 with the place in what is `heard`."""
     code = cli.main(argv)
     said = capsys.readouterr().err
     if heard is not None:

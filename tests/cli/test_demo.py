@@ -1,7 +1,5 @@
 """The demo: stages in order, each a command that a user could type; `make test-slow` runs it."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the demo tells at its end, of a store, a panel and runs as its stages leave them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`restock coverage drift`: names what changed, as text, JSON and a page."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`restock audit`: a store and a run that may go on, and those that may not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from xml.etree import ElementTree
@@ -87,11 +85,7 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(stores, tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("verb", "option"),
-    [
-        ("audit", "--junit"),
-        *(("coverage", "--out"), ("report", "--out")),
-    ],
+    ("verb", "option"), [("audit", "--junit"), *(("coverage", "--out"), ("report", "--out"))]
 )
 def test_a_folder_as_output_file_is_refused_early(verb, option, tmp_path, capsys):
     """Before it is even looked whether there is a store."""

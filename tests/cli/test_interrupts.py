@@ -1,7 +1,5 @@
 """A kill is an interrupt, and what waits for a process in a thread can be interrupted too."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

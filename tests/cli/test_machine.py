@@ -1,7 +1,5 @@
 """`restock info` without a recording: this machine, its packages, a store."""
 
-from __future__ import annotations
-
 import json
 import re
 from importlib import metadata

@@ -1,7 +1,5 @@
 """What `restock ingest` says of a recording of another robot: what to do, and no wrong guesses."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

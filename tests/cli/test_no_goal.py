@@ -1,7 +1,5 @@
 """A task without a goal has no success: null and "no goal" everywhere, in place of 0 %."""
 
-from __future__ import annotations
-
 import json
 import re
 from importlib.resources import files

@@ -1,7 +1,5 @@
 """Tables and messages: for a terminal, without colours, and for a pipe."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """`restock profile`: what it says of data that was lost, and the exit codes."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report: one page that opens offline, says what the run's tables say, and trusts no name."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -226,11 +224,7 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     position |= {f"{q}{end}": 0.5 for q in ("median", "p90") for end in ("", "_low", "_high")}
     far = ConfidenceInterval(0.5, 0.4, 0.6)
     gap = TwinGap(
-        about={
-            "limits": asdict(TrustLimits()),
-            "store_version": 7,
-            "twins": {"nominal": {}},
-        },
+        about={"limits": asdict(TrustLimits()), "store_version": 7, "twins": {"nominal": {}}},
         paths=[position],
         observations=[],
         rewards=[],

@@ -1,7 +1,5 @@
 """Pages of a comparison, a study and a store: verdict first, nothing fetched, no name trusted."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """`restock profile schema`: an editor accepts what Restock reads, and nothing else."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import tomllib

@@ -1,7 +1,5 @@
 """What `restock start` decides between its stages, and what it says of it at the end."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `restock start` takes beside recordings: damaged ones, definitions, tags, a URDF, a map."""
 
-from __future__ import annotations
-
 import json
 import os
 from functools import partial

@@ -1,7 +1,5 @@
 """Starting up: a command imports what it uses, and none of what only other commands need."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

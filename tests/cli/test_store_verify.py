@@ -1,7 +1,5 @@
 """Bytes of a store that changed are found before rows are taken from it, and by `store verify`."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

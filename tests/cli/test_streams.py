@@ -1,7 +1,5 @@
 """Where what is printed cannot be shown, stored or read, the work is done all the same."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,9 +1,4 @@
-"""Every block of the documentation runs as it is printed, in the folder of a reader.
-
-`support.pages` says what a page may say about its blocks, `support.reader` how they are run.
-"""
-
-from __future__ import annotations
+"""Every block of the documentation runs as it is printed, in the folder of a reader."""
 
 import re
 import shutil
@@ -170,10 +165,7 @@ max_age_s = 0.2
 
 
 def check_profile(block: Block, folder: Path) -> None:
-    """Check a part of a profile as an addition to the shipped one.
-
-    It replaces the inputs of the same names.
-    """
+    """Check a part of a profile in place of the shipped inputs of the same names."""
     shipped = (files("restock.ingest.profile") / "profiles/warehouse_amr.toml").read_text("utf-8")
     tables = re.split(r"^(?=\[)", shipped, flags=re.MULTILINE)
     own = [rf"\[inputs\.{name}[].]" for name in tomllib.loads(block.text).get("inputs", {})]

@@ -1,7 +1,5 @@
 """The documentation as a site: its references are filled in, and it opens without a network."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The tutorial: one source for page and notebook, executed as it is, with nothing cut short."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

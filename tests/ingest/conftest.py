@@ -1,7 +1,5 @@
 """Fixtures that several of ingest's tests share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The alarm of a policy file: its miss rate holds, and no rate is stated that cannot be."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

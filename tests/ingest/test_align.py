@@ -1,7 +1,5 @@
 """One clock, causal holds with maximum ages, and clocks that jump."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from typing import Any

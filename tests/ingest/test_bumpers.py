@@ -1,7 +1,5 @@
 """Bumpers of common types, with several fields, bits or detections: pressed if any of them is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Frames of cameras: those in force at steps are kept as recorded, the others counted."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import struct
@@ -193,10 +191,7 @@ def test_an_image_type_with_other_fields_is_refused(tmp_path, fields, named):
 
 
 def test_frames_go_and_stay_with_their_recording(bag, tmp_path):
-    """Check that ingesting again replaces frames and that labelling again keeps them.
-
-    The old file outlives its rows by the retention window.
-    """
+    """Check that ingesting again replaces frames and that labelling again keeps them."""
     store = tmp_path / "store"
     written(bag, store)
     (first,) = (store / "frames").rglob("*.parquet")

@@ -1,7 +1,5 @@
 """The columnar decoder gives what rosbags gives, for any definition, in either byte order."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

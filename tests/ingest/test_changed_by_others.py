@@ -1,7 +1,5 @@
 """A store whose Delta tables another tool has changed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

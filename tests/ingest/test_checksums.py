@@ -1,7 +1,5 @@
 """MCAP's CRC-32: the same whoever computes it, with `isal` and without."""
 
-from __future__ import annotations
-
 import sys
 import zlib
 

@@ -1,7 +1,5 @@
 """Scans to clearance while they are read: each message by itself, whatever comes with it."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

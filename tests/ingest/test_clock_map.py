@@ -1,7 +1,5 @@
 """Log time to stamped time: exact at its knots, monotone between them, at one pace beyond."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

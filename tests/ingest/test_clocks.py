@@ -1,7 +1,5 @@
 """Clocks compared: offset, jumps, backsteps, repeated and zero stamps, by hand and as shown."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

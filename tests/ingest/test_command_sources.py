@@ -1,7 +1,5 @@
 """Who drove, by whose command was in force: a multiplexer's inputs, a joystick's button."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -165,10 +163,7 @@ max_age_s = 0.4
 
 
 def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
-    """Return the same drive with the multiplexer's output smoothed to 20 Hz, as /cmd_vel.
-
-    `limit` is what a collision monitor leaves of it between 9 and 10 s.
-    """
+    """Return the drive, its output smoothed to 20 Hz and times `limit` from 9 to 10 s."""
     topics = taken_over()
     chosen = topics.pop(OUT)[1]
     reported = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)

@@ -1,7 +1,5 @@
 """Several recordings are committed at once: none is lost, and one that fails costs itself alone."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A store goes on after its files were compacted, and its summaries stay true."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import duckdb

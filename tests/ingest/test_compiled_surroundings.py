@@ -1,7 +1,5 @@
 """What robots see of their plans and of who comes near: compiled code and NumPy's, bit for bit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Probabilities of conditions, named parts of their rules, and the noise that a profile states."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -89,10 +87,7 @@ def test_the_version_of_labels_follows_what_can_change_them():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            FILE.replace("wheel_speed_mps - 0.5", "lead(wheel_speed_mps) OVER episode"),
-            "'over_mps",
-        ),
+        (FILE.replace("wheel_speed_mps - 0.5", "lead(wheel_speed_mps) OVER episode"), "'over_mps"),
         (FILE.replace("let smooth_mps", "let pose_x_m"), "'pose_x_m' is already used"),
         (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "1.5"), "in \\[0, 1\\]"),
         (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "'much'"), "not a number"),

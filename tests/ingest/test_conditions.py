@@ -1,7 +1,5 @@
 """Conditions: what they say of a step, and that `pre` ones never look at what comes after."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -11,13 +9,7 @@ from hypothesis import strategies as st
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task import conditions
-from restock.ingest.task.conditions import (
-    Condition,
-    label,
-    let_values,
-    primary,
-    shipped,
-)
+from restock.ingest.task.conditions import Condition, label, let_values, primary, shipped
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.task import STAND_IN_LIMITS, Noise
 

@@ -1,7 +1,5 @@
 """MCAP's own conformance suite: every record of every file, as its JSON lists them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

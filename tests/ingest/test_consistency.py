@@ -1,7 +1,5 @@
 """Recordings whose signals contradict each other: what is found, repaired, or kept and said."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,15 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import (
-    BEAMS,
-    FREE_M,
-    START_NS,
-    columns,
-    scans,
-    without,
-    write_topics,
-)
+from support.driven_robot import BEAMS, FREE_M, START_NS, columns, scans, without, write_topics
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
@@ -157,8 +147,7 @@ def test_a_robot_that_slips_or_not_does_not_contradict_itself(profile, tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("topic", "ahead_s"),
-    [("/cmd_vel", 0.4), ("/cmd_vel", -0.7), ("/scan", 0.8)],
+    ("topic", "ahead_s"), [("/cmd_vel", 0.4), ("/cmd_vel", -0.7), ("/scan", 0.8)]
 )
 def test_a_topic_of_another_clock_counts_from_its_reception(profile, tmp_path, topic, ahead_s):
     topics = shifted(winding(), topic, ahead_s)
@@ -245,12 +234,7 @@ WRONG = {
     "km/h": (lambda t: scaled(t, "/odom", 3.6, SPEED), "wheels", "/odom", "is 3.6 times"),
     "sign": (lambda t: scaled(t, "/odom", -1, SPEED), "wheels", "/odom", "another sign"),
     "rate": (lambda t: scaled(t, "/odom", -1, RATE), "wheels", "/odom", "its yaw rate is -1"),
-    "degrees": (
-        lambda t: scaled(t, "/imu", 57.3, GYRO),
-        "gyro",
-        "/imu",
-        "57 times",
-    ),
+    "degrees": (lambda t: scaled(t, "/imu", 57.3, GYRO), "gyro", "/imu", "57 times"),
     "no gyro": (lambda t: scaled(t, "/imu", 0, GYRO), "gyro", "/imu", "stays at 0"),
     "late odometry": (lambda t: shifted(t, "/odom", -0.6), "order", "/odom", "before the commands"),
 }

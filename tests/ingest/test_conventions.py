@@ -1,7 +1,5 @@
 """What messages say in place of a value that was not measured is no value: null, and counted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

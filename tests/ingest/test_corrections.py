@@ -1,7 +1,5 @@
 """Corrections of labels: laid over the rules' labels, kept through relabelling and re-ingest."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import shutil

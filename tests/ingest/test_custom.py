@@ -1,7 +1,5 @@
 """Custom signals: from any field to a column of the table, and into conditions and queries."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A file of Delta's log that is damaged is named with what to do: rows never just go missing."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Definitions as the files of packages have them: includes, comments, CRLF, blank lines."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

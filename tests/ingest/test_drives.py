@@ -1,7 +1,5 @@
 """Several drives of one kind of robot: which are of a kind, and one profile for all of them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from functools import partial

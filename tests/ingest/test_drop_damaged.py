@@ -1,7 +1,5 @@
 """A store whose files are damaged: what is lost is said, and Restock's commands lead out of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -213,10 +211,7 @@ def test_rows_that_are_lost_with_their_manifests_are_counted(tmp_path):
         damage(tmp_path / "s", next(f for f in active(tmp_path / "s", name) if "comp" in f), "cut")
     done = drop_damaged(writer)
     assert len(done.dropped) == 2
-    assert (done.lost, done.unnamed_transitions) == (
-        [],
-        sum(WHOLE[f"{n:016x}-a"] for n in (1, 3)),
-    )
+    assert (done.lost, done.unnamed_transitions) == ([], sum(WHOLE[f"{n:016x}-a"] for n in (1, 3)))
     assert shown(tmp_path / "s") == expected((2, "b", 7))
 
 

@@ -1,7 +1,5 @@
 """MCAP's other message encodings: JSON, protobuf and ROS 1 become columns as CDR does."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where an episode begins and ends, and that every tick is accounted for."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Exposures: situations beside the conditions, which take no row's condition from them."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -12,11 +10,7 @@ from support.driven_robot import Drive, write_bag
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
-from restock.ingest.profile.profile import (
-    load_profile,
-    profile_toml,
-    read_profile_toml,
-)
+from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
 from restock.ingest.store.manifest import label_scores
 from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
 from restock.ingest.task.schema import SIGNAL_COLUMNS

@@ -1,7 +1,5 @@
 """Poses by satellite fixes: metres east and north, no pose without a fix, and a causal heading."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -61,9 +59,7 @@ def recorded(folder: Path, *, heading: bool = False, seconds: float = 20.0) -> P
         "/cmd_vel": (
             TWIST,
             columns(
-                ticks,
-                {"linear.x": np.where(going, 1.0, 0.0), "angular.z": turning},
-                stamped=False,
+                ticks, {"linear.x": np.where(going, 1.0, 0.0), "angular.z": turning}, stamped=False
             ),
         ),
         "/gps/fix": (

@@ -1,18 +1,12 @@
 """A robot's outline from its description, or the command line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.paths import SHARED
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.propose.footprint import (
-    footprint_of,
-    of_urdf,
-    parse_footprint,
-)
+from restock.ingest.propose.footprint import footprint_of, of_urdf, parse_footprint
 
 URDF = """<robot name="cart">
   <link name="base_footprint"/>

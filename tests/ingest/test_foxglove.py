@@ -1,7 +1,5 @@
 """Robots that record Foxglove's message types, and ROS's, as JSON or protobuf: what is proposed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Poses through /tf and /tf_static: hand values, holds, changes of the tree, what is missing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -66,11 +64,7 @@ def at(*seconds: float) -> list[np.ndarray]:
 
 
 def test_a_chain_by_hand():
-    """Check a chain of frames worked out by hand.
-
-    The map's odom is at (10, 0) turned a quarter left, the robot at (2, 1) in odom, and the body .5
-    m ahead of it: 2 forward in odom is 2 up in the map, 1 left is 1 back.
-    """
+    """Odom is at (10, 0) turned left, the robot at (2, 1) in it, its body .5 m ahead."""
     tree = tree_of(
         Frames(base="body"),
         [(0.0, "map", "odom", 10, 0, 0, np.pi / 2), (0.0, "odom", "base_link", 2, 1, 0, 0.0)],

@@ -1,7 +1,5 @@
 """How a recording is cut into groups while it is read changes nothing of what comes out."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Definitions by hand, and robots that are steered."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

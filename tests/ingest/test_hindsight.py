@@ -1,7 +1,5 @@
 """Goals in hindsight: where a drive got to is the goal of what led there."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hostile files: a clear refusal or a counted loss; no crash, no hang, no memory without bound."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -418,10 +416,7 @@ def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path):
 
 @pytest.mark.long
 def test_definitions_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
-    """Check thirty definitions of 40 kB that differ, against a tenth of the limit.
-
-    The parser takes a second for a MB.
-    """
+    """Check thirty definitions of 40 kB that differ, against a tenth of the limit."""
     monkeypatch.setattr(recording, "MAX_DEFINED_BYTES", recording.MAX_DEFINED_BYTES // 10)
     path = tmp_path / "run.mcap"
     with path.open("wb") as file:

@@ -1,7 +1,5 @@
 """`restock info`: right counts for every recording, and one clear message for what is none."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

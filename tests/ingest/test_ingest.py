@@ -1,7 +1,5 @@
 """`restock ingest`: recordings in, a store out, and what it says and returns on the way."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`restock store label`: changed conditions over stored signals, in one commit."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

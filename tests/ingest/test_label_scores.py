@@ -1,7 +1,5 @@
 """The true conditions of a step, and labels scored against them."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A robot with several lidars, or one beside its middle: clearance as one in the middle sees it."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from dataclasses import dataclass

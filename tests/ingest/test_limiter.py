@@ -1,7 +1,5 @@
 """The limiter takes speed away and never adds any, the more the nearer something is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A policy on a running robot: what it sees is what an ingest stores, and it acts as in torch."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A running robot's clock: what `align` finds in the whole recording, without its future."""
 
-from __future__ import annotations
-
 import sqlite3
 
 import numpy as np

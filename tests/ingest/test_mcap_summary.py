@@ -1,7 +1,5 @@
 """The summary of an MCAP file repeats what its chunks say: where they differ, the chunks count."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Memory grows with what a profile keeps of a recording, not with the recording's bytes."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Speeds from poses, where a robot has no odometry."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A container that this test adds: one class, one row of `CONTAINERS`, and nothing else."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A robot without a lidar: its clearance is unknown, and so is every condition that needs it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The ROS 2 node on a stub of rclpy: it drives to its goal and stops for what is unreliable."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable
@@ -12,14 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.policy_files import changed_policy
-from support.ros_graph import (
-    VOLATILE,
-    Durability,
-    Graph,
-    QoS,
-    Returned,
-    message_class,
-)
+from support.ros_graph import VOLATILE, Durability, Graph, QoS, Returned, message_class
 from support.twin_robot import TwinRobot, follower_onnx
 
 from restock.cli import main, run_node

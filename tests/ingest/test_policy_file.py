@@ -1,7 +1,5 @@
 """Policy files from strangers: refused before the runtime reads what no policy needs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -151,9 +149,7 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
     "a cycle": (insert(node("Relu", ["values"], ["a"])), "reads 'values' before"),
     "twice": (insert(node("Relu", ["observation"], ["values"])), "has 'values' twice"),
     "an output of nothing": (
-        lambda m: m.graph.output.append(
-            onnx.helper.make_tensor_value_info("more", 1, ["N"]),
-        ),
+        lambda m: m.graph.output.append(onnx.helper.make_tensor_value_info("more", 1, ["N"])),
         "returns 'more'",
     ),
     "two inputs": (lambda m: m.graph.input.append(m.graph.input[0]), "takes 2 inputs"),

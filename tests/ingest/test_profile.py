@@ -1,7 +1,5 @@
 """Profiles: what ships, what a stranger's file may get wrong, and where each error points."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

@@ -1,7 +1,5 @@
 """docs/profile.md has every key of the tables that it is of, with its default."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 

@@ -1,7 +1,5 @@
 """docs/profile.md: what it shows on sample_logs/ is what comes out."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -21,11 +19,7 @@ FILES = {block.marks["file"]: block.text for block in BLOCKS if "file" in block.
 
 
 def assert_prints_as_shown(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
-    """Run the commands of a console block: each prints the lines below it, in that order.
-
-    `…` stands for lines, or for the end of one, that the page leaves out. The page leaves out the
-    rule under a table's header too.
-    """
+    """Run a console block: commands print the lines below; `…` stands for others."""
     for part in block.text.removeprefix("$ ").split("\n$ "):
         command, *shown = part.splitlines()
         capsys.readouterr()

@@ -1,7 +1,5 @@
 """What `restock profile new` makes of a recording: a row of `ROBOTS` each, and what it rests on."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -93,10 +91,7 @@ def usual(seconds: float = 6.0, **changes: Any) -> Topics:
 
 @dataclass
 class Commanded(Drive):
-    """Commands at these times (s), received while the robot's clock ran at `pace` of log time.
-
-    Its poses lie up to `off_m` ahead of where it is, or behind it, by turns.
-    """
+    """Commands at `times_s`, at `pace` of log time, poses up to `off_m` off."""
 
     times_s: Any = ()
     pace: float = 1.0
@@ -243,10 +238,7 @@ def flight(command: str = "/mavros/setpoint_velocity/cmd_vel", climbs: bool = Tr
     speeds = {"twist.linear.x": np.full(len(SECONDS), 0.3)}
     speeds["twist.linear.z"] = climbs * np.gradient(RISING, SECONDS)
     place = "geometry_msgs/msg/PoseStamped", columns(SECONDS, at)
-    return {
-        "/mavros/local_position/pose": place,
-        command: (STAMPED, columns(SECONDS, speeds)),
-    }
+    return {"/mavros/local_position/pose": place, command: (STAMPED, columns(SECONDS, speeds))}
 
 
 def servoed(**speeds: object) -> Topics:

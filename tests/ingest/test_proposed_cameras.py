@@ -1,7 +1,5 @@
 """A proposal has the cameras of its recording in comments, with the size and rate of frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from support.cameras import FRONT, REAR, camera_bag, compressed, file_of, picture, raw

@@ -1,29 +1,15 @@
 """What Restock's own node published: a proposal reads it as `node --write-profile` does."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import (
-    START_NS,
-    Drive,
-    columns,
-    typed_topics,
-    write_topics,
-)
+from support.driven_robot import START_NS, Drive, columns, typed_topics, write_topics
 
 from restock.cli import main
-from restock.ingest.live.node import (
-    ACTION,
-    LIMITER,
-    PROPOSAL,
-    SHADOW,
-    TAKEOVER,
-)
+from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.store.store import Store
 

@@ -1,7 +1,5 @@
 """Ingest on a Ray cluster, started on this machine: the same results and the same errors."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Chunks that are decompressed on other threads give what they give in their turn."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Readers: every container gives the same columns, and nothing goes missing unsaid."""
 
-from __future__ import annotations
-
 import errno
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Recordings are taken out of a store, all that are named or none; versions before keep them."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import os

@@ -1,7 +1,5 @@
 """An ingest says, or refuses, a recording whose rows are in the store under another id."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The robot of a description: what is taken from it, and what is said of the rest."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

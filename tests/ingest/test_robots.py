@@ -1,7 +1,5 @@
 """A real robot's drives through `benchmarks/robots.py`: rows, the twin, contacts against labels."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

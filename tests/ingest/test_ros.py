@@ -1,7 +1,5 @@
 """The ROS 2 node under a real rclpy, over DDS on loopback: run with `make test-ros`."""
 
-from __future__ import annotations
-
 import signal
 from collections import Counter
 from collections.abc import Iterator

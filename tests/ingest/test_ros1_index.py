@@ -1,7 +1,5 @@
 """ROS 1 bags whose index does not fit their chunks: the chunks are right, no message is lost."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -20,8 +20,6 @@ A range within the lidar's resolution of the end of what counts (`range_max_m`) 
 on one side alone: those entries, and no others, may differ by more, and they must be few.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where along its plan a robot is."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

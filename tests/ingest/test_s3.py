@@ -1,9 +1,4 @@
-"""A store on S3: all verbs take its address, and errors say what is wrong with the server.
-
-What it shares with a store in a folder is in `test_store`.
-"""
-
-from __future__ import annotations
+"""A store on S3: all verbs take its address, and errors say what is wrong with the server."""
 
 import json
 import socket

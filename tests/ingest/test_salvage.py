@@ -1,7 +1,5 @@
 """Damaged MCAP files: what can be proven to be there is read, what is lost is said in bytes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Lidar scans to clearance per sector."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

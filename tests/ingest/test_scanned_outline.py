@@ -1,7 +1,5 @@
 """The outline by what the lidar never saw inside, its own parts, and where transforms put it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Several robots in one recording: `restock profile new --robot` says whose profile it is."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files that are no files, or do not stay as they are: a message, never a crash or silence."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import subprocess

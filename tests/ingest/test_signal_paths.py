@@ -1,7 +1,5 @@
 """Signal paths: what they find in columns, and what they say where there is no such field."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

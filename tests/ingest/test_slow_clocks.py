@@ -1,7 +1,5 @@
 """A robot's clock that runs at another pace than log time: rows pair what belonged together."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from pathlib import Path
@@ -26,10 +24,7 @@ PACES = [0.5, 0.97, 1.0]
 
 
 def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None):
-    """Return the same messages, received while a simulation ran at `pace` of log time.
-
-    `pause`: at so many seconds of stamped time the simulation stands for so many of log time.
-    """
+    """Return messages received at `pace` of log time; `pause` is (stamped, log time) in s."""
 
     def received(times: np.ndarray) -> np.ndarray:
         since = times - START_NS

@@ -1,7 +1,5 @@
 """A bag of several files: which parts are missing, empty, copied or under another name."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Damaged `.db3` files are refused, and with `--salvage` every whole page is read."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections import Counter
 from collections.abc import Callable

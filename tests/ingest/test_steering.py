@@ -1,7 +1,5 @@
 """Robots that nothing describes: whether they steer as a car, by how they turned."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

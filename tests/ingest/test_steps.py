@@ -1,7 +1,5 @@
 """Topics to steps: what each tick sees, and why a tick cannot be used."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from msgspec.structs import replace

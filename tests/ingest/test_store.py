@@ -1,9 +1,4 @@
-"""The store's writer: whole or not at all, replaced in one commit, whoever else is writing.
-
-What `place` is given to holds in a folder and on S3.
-"""
-
-from __future__ import annotations
+"""The store's writer, in a folder and on S3: whole or not at all, whoever else is writing."""
 
 import multiprocessing
 import os

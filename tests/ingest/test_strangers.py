@@ -1,7 +1,5 @@
 """Other people's robots by the proposed profile, as `benchmarks/strangers.py` measures it."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Who came nearer between two scans, and what lies on the plan: a scan of points, seen by rays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -1,7 +1,5 @@
 """What recordings and their paths say of themselves, and how a profile reads it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sqlite3
@@ -18,10 +16,7 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.storage import (
-    MAX_ENTRIES,
-    custom_data,
-)
+from restock.ingest.containers.storage import MAX_ENTRIES, custom_data
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tag_rules import MAX_TAGS, TagRules, path_pattern, resolve_tags
 from restock.replay.store.store import Store

@@ -1,7 +1,5 @@
 """Tags: whose drive a recording is, by who says so, and what becomes of it in a store."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

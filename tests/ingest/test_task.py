@@ -1,7 +1,5 @@
 """The task: observation, action, reward, termination. By hand, and by what must always hold."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Transition rows: what is in each, against the contract and by hand."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pyarrow as pa
@@ -86,10 +84,7 @@ def test_progress_is_along_the_plan_when_acting():
     assert len(x) == len(y) == 1
     topics["/plan"] = columns(
         np.array([0.0, 2.0]),
-        {
-            "poses[].pose.position.x": ragged(detour_x),
-            "poses[].pose.position.y": ragged(detour_y),
-        },
+        {"poses[].pose.position.x": ragged(detour_x), "poses[].pose.position.y": ragged(detour_y)},
     )
     table = rows_of(topics)
     remaining = table["route_remaining_m"].to_numpy()

@@ -1,7 +1,5 @@
 """One topic with messages of two types: read together if their fields are the same."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Several workers: the same results, whoever of them dies, and no half-written store."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -205,10 +203,7 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_running(bags, tmp_path):
     children = descendants(process.pid)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
     _, err = process.communicate()
-    assert (process.returncode, err) == (
-        130,
-        "restock: interrupted; no partial files were left\n",
-    )
+    assert (process.returncode, err) == (130, "restock: interrupted; no partial files were left\n")
     while any(map(_alive, children)):
         time.sleep(0.01)
     rows(store)

@@ -1,7 +1,5 @@
 """Arguments of another kind than a function takes: refused by name, before anything is written."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

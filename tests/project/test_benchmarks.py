@@ -1,7 +1,5 @@
 """Benchmarks beside other libraries run where these are not installed."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Files are replaced whole, or made only where there is none."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

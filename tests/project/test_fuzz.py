@@ -1,7 +1,5 @@
 """What fuzzing found stays fixed, and the fuzz target itself works (see fuzz/readers.py)."""
 
-from __future__ import annotations
-
 import importlib.util
 import random
 import subprocess

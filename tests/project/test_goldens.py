@@ -1,7 +1,5 @@
 """The values that the sample logs become are those that were written down."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -6,8 +6,6 @@ door is exempt: `restock/__init__.py`, `__main__.py`, the rooms' `__init__.py` a
 by name, and only when a name is asked for; no module of Restock imports from them.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from graphlib import TopologicalSorter

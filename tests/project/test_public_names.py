@@ -1,7 +1,5 @@
 """Public names: cheap to import, never shadowed, and all that docs teach."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

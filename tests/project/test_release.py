@@ -1,7 +1,5 @@
 """Releases: one version everywhere, workflows and a container file whose commands exist."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import tomllib

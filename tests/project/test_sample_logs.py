@@ -1,7 +1,5 @@
 """The sample logs are what their manifest says, small, varied, readable, and can be made again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

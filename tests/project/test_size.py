@@ -1,7 +1,5 @@
 """The house does not grow: the counts of CONTRIBUTING.md's table are not exceeded."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import importlib

@@ -1,7 +1,5 @@
 """State declared by name: what is saved is what is restored, through JSON and without sharing."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Intervals against published and hand-made values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Typed TOML: values read back equal; a key or a value that does not fit is named."""
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib
@@ -19,9 +17,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.replay.mixture.mixture import Mixture
 from restock.toml import Checked, parse_toml, read_toml, toml_value, typed
-from restock.train.dqn.config import (
-    TrainConfig,
-)
+from restock.train.dqn.config import TrainConfig
 from restock.train.study.study import Study
 
 plain = st.recursive(

@@ -1,7 +1,5 @@
 """The wheel holds every file of every room and names the packages that it needs."""
 
-from __future__ import annotations
-
 import ast
 import platform
 import re

@@ -1,7 +1,4 @@
-"""Reads an export with the real d3rlpy and prints what it finds: `python read_with_d3rlpy.py FILE`.
-
-Run by tests/test_export.py, with a Python that has d3rlpy.
-"""
+"""Read an export with the real d3rlpy and print what it finds: run by test_export.py."""
 
 import json
 import sys

@@ -1,7 +1,4 @@
-"""Reads an export with the real lerobot and prints what it finds: `… DIR`.
-
-Run by tests/test_export.py, with a Python that has lerobot.
-"""
+"""Read an export with the real lerobot and print what it finds: run by test_export.py."""
 
 import importlib.machinery
 import json

@@ -1,7 +1,5 @@
 """Each audit finds the fault planted for it, and nothing in data without it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Quotas of the batch: logged rows as far as they bear it, fresh rows for the rest, or short."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

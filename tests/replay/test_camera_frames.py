@@ -1,7 +1,5 @@
 """Frames of cameras for rows of a store: in SQL, decoded in Python, and as LeRobot's images."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

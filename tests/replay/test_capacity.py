@@ -1,7 +1,5 @@
 """Capacity by task diversity: against a naive count over the newest rows."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 

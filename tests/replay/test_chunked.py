@@ -1,7 +1,5 @@
 """A panel larger than memory is drawn from in chunks: the same quotas, every row in its turn."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -109,9 +107,7 @@ def test_a_state_of_other_chunks_is_refused(thousand):
 
 
 @pytest.fixture(scope="module")
-def fifty_thousand(
-    tmp_path_factory,
-) -> np.memmap[Any, np.dtype[np.float32]]:
+def fifty_thousand(tmp_path_factory) -> np.memmap[Any, np.dtype[np.float32]]:
     return panel(tmp_path_factory.mktemp("panel") / "rows", 50_000)
 
 

@@ -1,7 +1,5 @@
 """The density ratio where it is known: outcomes stay as they are, states stay boosted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Drift: the tests hold their level on correlated logs, and a worn wheel is named."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Events: where a condition began and ended, and what came of it, against a plain loop."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,11 +125,7 @@ def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path):
 
 @dataclass(frozen=True)
 class Case:
-    """An episode, a letter a step, and its events.
-
-    `s` slips, `b` is blocked, `x` both, `.` nominal. An event is a condition, its first and last
-    step, its outcome, and when it was recovered from.
-    """
+    """Labels `s` slips, `b` blocked, `x` both; events: name, first, last, outcome, after."""
 
     labels: str
     events: list[tuple[str, int, int, str, float | None]]

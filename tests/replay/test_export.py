@@ -5,8 +5,6 @@ CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON name
 `.venv-neighbours` where there is one, else with this one.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re

@@ -1,7 +1,5 @@
 """Strata by the situation instead of its outcome: quotas, and the audit that tells them apart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

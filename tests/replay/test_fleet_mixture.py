@@ -1,7 +1,5 @@
 """Mixtures of a fleet: quotas by robot, and whole robots held out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

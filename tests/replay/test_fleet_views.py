@@ -1,7 +1,5 @@
 """A fleet's weeks and robots: counts that add up, and cells that were never seen."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

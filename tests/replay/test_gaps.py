@@ -1,7 +1,5 @@
 """`restock coverage gaps`: what is missing, what fills it, and how sure that is."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

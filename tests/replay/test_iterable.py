@@ -1,7 +1,5 @@
 """A panel through torch's DataLoader: the same batches whatever the workers, quotas exact."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

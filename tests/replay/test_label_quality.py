@@ -1,7 +1,5 @@
 """`restock store label --score`: labels against the truth, and their reliability."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

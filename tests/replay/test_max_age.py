@@ -1,7 +1,5 @@
 """`max_age_days` of a mixture counts to when the panel is mixed, not to the newest row."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """The messages that a trace names at a tick are those that ingest made the row of."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

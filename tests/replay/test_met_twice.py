@@ -1,7 +1,5 @@
 """Numbers that come more than once are all found, and few others."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

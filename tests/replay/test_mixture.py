@@ -1,7 +1,5 @@
 """Mixtures: what a file may say, how shares come about, and the weights against their boost."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Which rows a mixture takes, by safety, version, caps, labels and store; and its schema."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

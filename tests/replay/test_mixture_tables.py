@@ -1,7 +1,5 @@
 """`mixture(name)` and `mixture_rows(name)`: a plan in SQL, and `restock mix` packs just that."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Recordings whose action is the measured motion: said at ingest, audited, in no panel unasked."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

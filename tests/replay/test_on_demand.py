@@ -1,7 +1,5 @@
 """A store makes the views and macros that a query names, and what they are made of."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

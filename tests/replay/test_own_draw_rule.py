@@ -1,7 +1,5 @@
 """A draw rule of your own, one class and one row of RULES, draws everywhere that rows are drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.library_buffers import make_store

@@ -1,7 +1,5 @@
 """The file of packed rows: whatever order their parts come in, the same bytes and checksum."""
 
-from __future__ import annotations
-
 import errno
 import os
 

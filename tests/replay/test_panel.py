@@ -1,7 +1,5 @@
 """Panels: rows equal to the store's, n-step returns, pinned, checked, all or nothing."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

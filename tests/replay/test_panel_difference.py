@@ -1,7 +1,5 @@
 """`restock coverage diff` of panels: rows, mixture, shares and weights."""
 
-from __future__ import annotations
-
 import json
 
 import msgspec

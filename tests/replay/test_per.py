@@ -1,7 +1,5 @@
 """Draws are in proportion to priorities, and weights undo exactly that."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The same drive in two recordings is found by content, never trained on and held out at once."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

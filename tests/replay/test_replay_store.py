@@ -1,7 +1,5 @@
 """The store's views: what they count, what they hide, and that every column is documented."""
 
-from __future__ import annotations
-
 import gc
 import json
 import re

@@ -1,7 +1,5 @@
 """An archive of incidents stands for natural rates: those of the main store, or given ones."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Label review: doubtful events are listed with their moment, and verdicts are taken back."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -42,10 +40,7 @@ def monday(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def reviewed(tmp_path_factory) -> tuple[Path, list[DoubtfulEvent]]:
-    """Return two synthetic recordings, and all that is doubtful in them.
-
-    `recovery` has a probability, the other conditions have none.
-    """
+    """Return two recordings with probabilities of `recovery`, and what is doubtful."""
     path = tmp_path_factory.mktemp("small") / "store"
     for recording in (1, 2):
         StoreWriter(path).write(*one(recording))

@@ -1,7 +1,5 @@
 """Whether more success earns more: told of planted drivers, and not told where it cannot be."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from functools import cache

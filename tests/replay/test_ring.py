@@ -1,7 +1,5 @@
 """The fresh ring: n-step rows against a naive oracle, eviction, labels, resume."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Candidates put in order: the same table whatever batches their rows came in."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -18,10 +16,7 @@ BY = [("recording_id", "ascending"), *((key, "ascending") for key in KEYS)]
 
 
 def rows_of(recordings: int, episodes: int, steps: int) -> pa.Table:
-    """Return recordings whose ids do not lie in the order of their names.
-
-    One zone in three is null.
-    """
+    """Return recordings whose ids are not in the order of their names; some zones null."""
     rng = np.random.default_rng(recordings * 100 + steps)
     count = recordings * episodes * steps
     recording = np.repeat(np.arange(recordings), episodes * steps)

@@ -1,7 +1,5 @@
 """Pairs of recordings that hold one drive, against the definition in plain loops."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from itertools import combinations
 from statistics import median_low

@@ -1,7 +1,5 @@
 """However one draws from a panel, the mixture's rules hold, or it is refused with a remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any

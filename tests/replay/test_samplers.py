@@ -1,7 +1,5 @@
 """Every sampler meets exact quotas over time and draws the same after a restart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Shares sum to one, hold floors and caps, and ask of rows no more than they bear."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A store of one episode: every shipped mixture packs it, and says what is held out."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """`restock sql`: tables, JSON and CSV; stdin; runs and panels; errors; Ctrl-C."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """A mixture that stocks: nothing corrected below its natural share, and what is missing is told."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """`restock coverage diff` of stores and versions: what came, went and changed."""
 
-from __future__ import annotations
-
 import json
 from datetime import datetime
 

@@ -1,7 +1,5 @@
 """A sampled row leads back to its panel, store, recording and messages, or says what is missing."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Returns over three steps where a real recording's episodes are cut: they bootstrap there."""
 
-from __future__ import annotations
-
 import re
 from itertools import groupby
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Strata that want a share and have nearly no rows: each is named, with what gives it some."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Time travel: every verb that reads a store answers as it was at a version or a time."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

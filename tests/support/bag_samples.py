@@ -1,7 +1,5 @@
 """Small recordings for tests: the same messages written as a sqlite3 bag and as MCAP."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The driven robot with cameras: frames whose colour says which message they are."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A robot that drives straight ahead at .5 m/s, for tests worked out by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -160,10 +158,7 @@ def ragged(points: list[NDArray[Any]]) -> Ragged:
 
 
 def transforms(time_s: NDArray[Any], *edges: tuple[Any, ...]) -> tuple[str, TopicColumns]:
-    """Return messages that each hold every edge: parent, child, x, y, yaw and roll.
-
-    What an edge leaves out is 0; numbers may be one for each message.
-    """
+    """Return messages that each hold every edge: parent, child, x, y, yaw and roll."""
     count, full = len(time_s), [(*edge, *(0.0,) * (6 - len(edge))) for edge in edges]
     parent, child, x, y, yaw, roll = (
         np.stack([np.broadcast_to(one, count) for one in values], axis=1).reshape(-1)
@@ -230,10 +225,7 @@ def write_topics(
     *then: Mapping[str, TopicColumns],
     storage: str = "sqlite3",
 ) -> Path:
-    """Topics as (message type, columns), as a rosbag2 folder; other fields are zero or empty.
-
-    Messages lie in the order of their log time; after them those of each of `then`.
-    """
+    """Write (message type, columns) as a rosbag2 folder by log time, then those of `then`."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     types = _humble()
@@ -261,10 +253,7 @@ def write_topics(
 
 @cache
 def _humble() -> Any:
-    """Return the types of ROS 2 Humble, with those of ackermann_msgs and move_base_msgs.
-
-    They compile how each is serialised when it is first written.
-    """
+    """Return the types of ROS 2 Humble, with those of ackermann_msgs and move_base_msgs."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     from restock.ingest.decoding.definitions import ackermann_types

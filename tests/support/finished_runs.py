@@ -1,7 +1,5 @@
 """Finished runs with the tables that comparisons read, written without training."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any
@@ -89,11 +87,7 @@ def make_run(
         )
         run.append_columns(
             "progress",
-            {
-                **dict.fromkeys(run.table("progress").schema.names),
-                **clocks,
-                "phase": ["online"],
-            },
+            {**dict.fromkeys(run.table("progress").schema.names), **clocks, "phase": ["online"]},
         )
     for condition, bonus in (("nominal", 0.2), ("wheel_slip", 0.0)):
         won = rng.random(episodes) < success + bonus

@@ -1,9 +1,4 @@
-"""Synthetic fleets: robots that drive over weeks, as a connection with a store's views.
-
-Consecutive steps are correlated, as those of a robot are: speeds and errors wander (AR(1)).
-"""
-
-from __future__ import annotations
+"""Synthetic fleets over weeks; consecutive steps are correlated (AR(1)), as a robot's are."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -39,10 +34,7 @@ class SyntheticRobot:
 
 
 def fleet(robots: list[SyntheticRobot], **size: int) -> duckdb.DuckDBPyConnection:
-    """Return a connection with the rows of a store of this fleet.
-
-    Its size is as `drives` has it; `install_named` adds views.
-    """
+    """Return a connection with a fleet's rows as of a store; `install_named` adds views."""
     made = drives(robots, **size)
     connection = duckdb.connect()
     transitions = pa.concat_tables(rows for rows, _ in made)

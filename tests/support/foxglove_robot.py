@@ -1,7 +1,5 @@
 """A robot that drives in a circle and records Foxglove's message types as JSON or protobuf."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -83,10 +81,7 @@ def place(time_s: float) -> tuple[float, float, float]:
 
 
 def drive(duration_s: float = 20.0) -> list[Message]:
-    """Return time, topic, type and values of each message.
-
-    Command 10 Hz, pose and odometry 20 Hz, scan 10 Hz of a wall at one range all around.
-    """
+    """Return (time, topic, type, values): commands, scans at 10 Hz, poses, odometry at 20."""
     messages: list[Message] = []
     for time_s in np.arange(0, duration_s, 0.05).tolist():
         x, y, yaw = place(time_s)

@@ -8,8 +8,6 @@ differently by other processors and libraries: hashes, and all tables of the run
 the machine that `made_on` describes, and numbers of ingested and mixed rows everywhere.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

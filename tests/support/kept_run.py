@@ -1,7 +1,5 @@
 """A run that kept a policy, as `restock train` leaves it, without the training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

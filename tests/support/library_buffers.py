@@ -1,7 +1,5 @@
 """Other libraries' DQNs trained on a mixture, for the contract of their buffers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Parameters of which some run with every `make test`, and the others with `make test-long`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 
@@ -9,10 +7,7 @@ import pytest
 
 
 def one_in(every: int, values: Iterable[Any]) -> list[Any]:
-    """Return the first of each `every` values as it is, and the others marked `long`.
-
-    A tuple is of several parameters.
-    """
+    """Return the first of each `every` values as it is, and the others marked `long`."""
     return [
         value
         if number % every == 0

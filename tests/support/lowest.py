@@ -1,7 +1,5 @@
 """The oldest releases that pyproject.toml allows, as constraints for pip: `make test-lowest`."""
 
-from __future__ import annotations
-
 import sys
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Exports read back by libraries that cannot live in this environment."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -11,8 +11,6 @@ and into a notebook beside the other things that are built:
     python -m support.notebook docs/tutorial.md build   (in tests/; `make notebook` does it)
 """
 
-from __future__ import annotations
-
 import base64
 import os
 import re

@@ -1,7 +1,5 @@
 """A page: its text, that it fetches nothing and runs its own scripts alone, and its charts."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib
@@ -37,10 +35,7 @@ class _Scripts(HTMLParser):
 
 
 def charts_of(html: str) -> dict[str, Any]:
-    """Return config, rows and charts of a page, as its script reads them.
-
-    Asserts that its scripts are those that draw charts, and that its policy lets only them run.
-    """
+    """Return a page's config, rows and charts; its policy lets only these scripts run."""
     page = _Scripts()
     page.feed(html)
     data, runtime, drawing = page.found

@@ -11,8 +11,6 @@ A block is fenced and names its language. A comment on the line before it may sa
 `<!-- new folder -->` on a line of its own: the blocks after it run in a folder of their own.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

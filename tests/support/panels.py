@@ -1,7 +1,5 @@
 """Panels and plans for tests, from a table of transitions or a store."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path

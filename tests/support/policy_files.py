@@ -1,7 +1,5 @@
 """Policy files that nobody should drive by: an exported one changed, with a digest that fits."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from pathlib import Path

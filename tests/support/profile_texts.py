@@ -1,7 +1,5 @@
 """Texts of profiles, for tests that change a word of one."""
 
-from __future__ import annotations
-
 from support.paths import ROOT
 
 WAREHOUSE = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text("utf-8")

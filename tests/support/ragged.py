@@ -1,7 +1,5 @@
 """Ragged columns from lists."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from restock.ingest.decoding.columns import Ragged, offsets_of

@@ -11,8 +11,6 @@ as printed.
     python -m support.reader FOLDER    serves at FOLDER/socket
 """
 
-from __future__ import annotations
-
 import dataclasses
 import gc
 import json
@@ -55,7 +53,7 @@ SHORT = {
 
 
 @contextmanager
-def reader(folder: Path) -> Iterator[Reader]:
+def reader(folder: Path) -> Iterator["Reader"]:
     """Yield a server for as long as the context lasts; its socket and client lie in `folder`."""
     environment = {
         **os.environ,

@@ -1,7 +1,5 @@
 """The stub's graph on a real one: what is sent crosses DDS on loopback, and what comes back."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

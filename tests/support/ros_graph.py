@@ -6,8 +6,6 @@ enabled, which requests of QoS match which offers, timers by the node's clock or
 `test_ros.py` compares it with rclpy: the same commands for the same messages.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -30,7 +28,7 @@ class QoS:
     reliability: Reliability = Reliability.RELIABLE
     durability: Durability = Durability.VOLATILE
 
-    def offers(self, requested: QoS) -> bool:
+    def offers(self, requested: "QoS") -> bool:
         """Whether a subscription that asks for this gets anything of a publisher with mine."""
         reliable = self.reliability is Reliability.RELIABLE
         latched = self.durability is Durability.TRANSIENT_LOCAL

@@ -1,9 +1,4 @@
-"""An S3 server on loopback, in a process of its own: Delta's library asks with the GIL held.
-
-`python s3_server.py` prints its port, and serves until its stdin is closed.
-"""
-
-from __future__ import annotations
+"""An S3 server on loopback, in a process of its own: Delta's library asks with the GIL held."""
 
 import logging
 import re
@@ -20,7 +15,7 @@ if TYPE_CHECKING:
 BUCKET = "warehouse"
 
 
-def address(request: pytest.FixtureRequest) -> str:
+def address(request: "pytest.FixtureRequest") -> str:
     """Where a store of this test alone may lie, with a space in it."""
     return f"s3://{BUCKET}/site 7/" + re.sub(r"\W+", "_", request.node.nodeid)
 

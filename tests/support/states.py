@@ -1,7 +1,5 @@
 """Saved states as a checkpoint keeps them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any

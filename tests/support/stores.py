@@ -1,7 +1,5 @@
 """A small synthetic store of transitions, for tests that need one without a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -180,10 +178,7 @@ def write_store(
     task: Task = TASK,
     tags: Sequence[Mapping[str, str]] = (),
 ) -> Path:
-    """Write a store of these recordings and their tags, one commit each, the manifest row first.
-
-    As another tool writes it: manifests have no summaries.
-    """
+    """Write recordings and tags, a commit each, as another tool does: without summaries."""
     for transitions, reported in zip_longest(recordings, tags):
         row = manifest(transitions, task=task, tags=reported)
         write_deltalake(str(path / "recordings"), row, mode="append", description=FORMAT)

@@ -1,7 +1,5 @@
 """Training runs on the corridor of `support.toy_twin`: short, equal where nothing differs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

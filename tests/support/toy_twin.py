@@ -5,8 +5,6 @@ of `wheel_slip` a forward step fails half the time, and the wheels turn all the 
 is fully determined by its spec, as in the real one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

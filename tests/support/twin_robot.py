@@ -1,7 +1,5 @@
 """The twin as a robot on a graph: it publishes what it senses, and drives by /cmd_vel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How old the logs of a run are: when it began, not beside the newest of their store."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rows are diagnosed before training: consistent mistakes are named, sound rows are left alone."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -213,10 +211,7 @@ def test_only_a_sure_opposite_sign_is_called_mirrored(high: float, named: str) -
     ],
 )
 def test_a_fault_of_one_robot_is_named_with_its_recording(kind, tagged, part, logs, twin):
-    """Check that a fault in a third of the rows is named with its recording.
-
-    A robot that logs a recording a mission is known by its tag; without it, by when it drove.
-    """
+    """Check that a fault in a third of the rows is named by tag or by when it drove."""
     owner = logs.episode % 3
     third = np.array([f"r{one}" for one in owner])
     fleet = replace(logs, recording=third, logged_ns=1_000 * owner + logs.episode)

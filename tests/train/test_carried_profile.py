@@ -1,7 +1,5 @@
 """A profile of one's own goes with its rows: store, panel and run carry its text."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -14,11 +12,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, PanelError
-from restock.ingest.profile.profile import (
-    load_profile,
-    profile_toml,
-    read_profile_toml,
-)
+from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
 from restock.ingest.profile.tables import CustomSignal
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store

@@ -1,7 +1,5 @@
 """Checkpoints: exact, atomic, and nothing in them that executes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

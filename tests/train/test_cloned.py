@@ -1,7 +1,5 @@
 """The way the logs were driven, as a policy: how good a clone it is, and what it is refused for."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

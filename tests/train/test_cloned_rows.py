@@ -1,7 +1,5 @@
 """Which logged rows are cloned: those of named drivers, and others' successful episodes."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,19 +1,11 @@
 """The gate: what was fed alike passes, what was planted is found, and noise is called noise."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 import pytest
 
-from restock.train.judge.comparability import (
-    Check,
-    ComparabilityLimits,
-    Feed,
-    check_feeds,
-    worst,
-)
+from restock.train.judge.comparability import Check, ComparabilityLimits, Feed, check_feeds, worst
 
 CELLS = ["logs/nominal", "logs/wheel_slip", "logs/rare", "fresh/nominal", "fresh/wheel_slip"]
 LIMITS = ComparabilityLimits(resamples=300)

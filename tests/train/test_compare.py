@@ -1,7 +1,5 @@
 """`restock compare`: what may be compared, what is refused and why, and who did better."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The configuration of a run: unknown, renamed and out-of-range values are refused by their key."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Contrasts of a study: measures of runs, paired by seed; and what so many seeds can see."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

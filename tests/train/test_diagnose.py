@@ -1,7 +1,5 @@
 """`restock diagnose`: planted symptoms are named for what they are, and never forced."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -108,11 +106,7 @@ def action_rows(
     logged: int,
     supplied: float,
 ) -> list[dict[str, Any]]:
-    """Return rows of two actions in a condition.
-
-    `turn` is wanted in some of the fresh rows, and taken in some of the logs' and of the fresh
-    ones.
-    """
+    """Return rows of two actions; `turn` is (wanted in fresh rows, share of it in the logs)."""
     wanted, share = turn or (0.4, 0.4)
     fresh = 0.4 if turn is None else supplied
     rows = []
@@ -315,7 +309,7 @@ def test_of_two_faults_the_experiment_answers_for_the_target(
         def __init__(self, out: Path, *_: Any) -> None:
             make_run(out, **after)
 
-        def open(self) -> Trained:
+        def open(self) -> "Trained":
             return self
 
         def close(self) -> None: ...

@@ -1,7 +1,5 @@
 """`restock eval`: what is asked of it is checked, by name, before anything is driven."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -13,11 +11,7 @@ from support.kept_run import kept_run
 from restock.cli import main
 from restock.files import write_table
 from restock.train.evaluation.eval_run import plan_evaluation
-from restock.train.run.kept_evaluations import (
-    add_evaluation,
-    read_evaluations,
-    shown_evaluation,
-)
+from restock.train.run.kept_evaluations import add_evaluation, read_evaluations, shown_evaluation
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.missions import KINDS
 

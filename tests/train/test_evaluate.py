@@ -1,7 +1,5 @@
 """Evaluation: the same episodes for everyone, in the order asked, whatever the number of envs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

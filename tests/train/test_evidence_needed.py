@@ -1,7 +1,5 @@
 """What is missing before the twin and a policy can be judged is told in hours of driving."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A run is judged, reported and evaluated with the panel that it was fed, or not at all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

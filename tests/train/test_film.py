@@ -1,7 +1,5 @@
 """Films of an evaluation: an episode driven again is the recorded one, or it is not shown."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,10 +12,7 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.report.run.floor import films_section
-from restock.train.evaluation.eval_run import (
-    drive_evaluation,
-    plan_evaluation,
-)
+from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
 from restock.train.evaluation.film import RESCUE, WORST, differing_fields, drive_again, scenes
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 

@@ -1,7 +1,5 @@
 """A fresh row's condition, known once its episode has ended, is in every table that has one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import duckdb

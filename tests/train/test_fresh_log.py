@@ -1,7 +1,5 @@
 """What the twin gave goes into a store like a robot's log: once, whole, with its labels."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Labels from infos alone are those of the signals; metadata beside a buffer is a ring's."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

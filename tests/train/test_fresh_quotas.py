@@ -1,7 +1,5 @@
 """Runs whose quotas are filled with fresh rows: which they are, what is recorded, what is said."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

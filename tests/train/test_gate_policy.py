@@ -1,7 +1,5 @@
 """`restock gate`: passes what is shown not to be worse, names where it is, refuses the rest."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

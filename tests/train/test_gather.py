@@ -1,7 +1,5 @@
 """`gather_rows` gives the rows, whether compiled, by PyTorch's prefetching kernel, or without."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

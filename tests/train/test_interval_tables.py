@@ -1,7 +1,5 @@
 """The sums of an interval's rows, beside the same counted row by row."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which policy of a run drives: the best that it evaluated, or the latest of an interrupted one."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

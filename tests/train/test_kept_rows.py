@@ -1,7 +1,5 @@
 """Rows of batches as the record keeps them: compiled code and NumPy's write the same columns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stable-Baselines3's DQN and PPO as arms of a study: runs that are evaluated as any other."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

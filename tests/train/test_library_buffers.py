@@ -1,7 +1,5 @@
 """The contract of every library's buffer: logs by quota and fresh rows, with a record of which."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

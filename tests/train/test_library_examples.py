@@ -1,7 +1,5 @@
 """Other libraries train in the twin unchanged: each example in docs/examples runs, shortened."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from typing import Any

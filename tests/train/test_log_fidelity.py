@@ -1,7 +1,5 @@
 """Logged rows with wrong labels, or that do not belong together, are told from good ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

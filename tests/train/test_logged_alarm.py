@@ -1,7 +1,5 @@
 """An alarm from a panel: where logged failures began, and what `restock export` makes of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Missions from the places robots really went: the goals that rows tell, and the floor's room."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`env.twin = false`: a policy from the logs alone, where no twin is worth trusting."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

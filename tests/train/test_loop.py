@@ -1,7 +1,5 @@
 """The training loop on a corridor: it learns, repeats itself, and resumes bit for bit."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from concurrent.futures import Executor, Future

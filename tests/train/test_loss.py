@@ -1,16 +1,9 @@
 """The loss against hand arithmetic."""
 
-from __future__ import annotations
-
 import pytest
 from torch import Tensor, int64, stack, tensor, zeros
 
-from restock.train.dqn.algorithm import (
-    conservative_penalty,
-    dqn_loss,
-    margin_penalty,
-    td_target,
-)
+from restock.train.dqn.algorithm import conservative_penalty, dqn_loss, margin_penalty, td_target
 
 
 def test_td_target_by_hand() -> None:

@@ -1,7 +1,5 @@
 """The compiled update agrees with autograd in double precision, with and without AVX-512."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from typing import Any

@@ -1,7 +1,5 @@
 """The Q network: shapes, LayerNorm, seeded initialisation."""
 
-from __future__ import annotations
-
 import torch
 
 from restock.train.dqn.network import QNetwork, clone

@@ -1,7 +1,5 @@
 """A run that meets numbers that are not finite stops, names the rows, and leaves what was whole."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

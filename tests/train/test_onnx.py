@@ -1,7 +1,5 @@
 """Policies as ONNX: the values of PyTorch, usable without it, refused where they do not fit."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Off-policy evaluation of runs: on episodes they did not learn from, or refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

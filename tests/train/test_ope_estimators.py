@@ -1,7 +1,5 @@
 """Off-policy evaluation against a finite MDP whose value is known: solved as a linear system."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -28,10 +26,7 @@ STATES, ACTIONS, STEPS, DISCOUNT = 5, 2, 30, 0.9
 
 
 class Chain:
-    """States 0 … 4 in a row, the last one absorbing.
-
-    Action 1 goes on with chance 0.8, action 0 stays; each step costs 0.1, and arriving pays 1.
-    """
+    """States 0 to 4, the last absorbing: action 1 goes on with chance .8, a step costs .1."""
 
     def __init__(self) -> None:
         self.move = np.zeros((STATES, ACTIONS, STATES))  # P(s' | s, a)
@@ -44,10 +39,7 @@ class Chain:
         self.move[STATES - 1, :, STATES - 1] = 1.0
 
     def q(self, policy: np.ndarray) -> np.ndarray:
-        """Return Q of a policy (S, A), exact by (I - gamma P) Q = R.
-
-        For STEPS steps at most it is that of the infinite horizon, but for 0.9^30 of it.
-        """
+        """Return Q of a policy (S, A), exact by (I - gamma P) Q = R but for 0.9^30 of it."""
         reward = (self.move * self.reward).sum(axis=2).reshape(-1)
         onward = np.einsum("sat,tb->satb", self.move, policy).reshape(STATES * ACTIONS, -1)
         solved = np.linalg.solve(np.eye(STATES * ACTIONS) - DISCOUNT * onward, reward)
@@ -80,12 +72,7 @@ def logged(episodes: int, seed: int, q: np.ndarray, policy: np.ndarray = TARGET)
     value = (policy * q).sum(axis=1)
     value[-1] = 0.0
     ratio = np.where(alive, policy[state, action] / BEHAVIOUR[state, action], 1.0)
-    return OpeEpisodes(
-        ratio,
-        np.where(alive, reward, 0.0),
-        value[state[:, 0]],
-        DISCOUNT,
-    )
+    return OpeEpisodes(ratio, np.where(alive, reward, 0.0), value[state[:, 0]], DISCOUNT)
 
 
 NO_MODEL = np.zeros((STATES, ACTIONS))

@@ -1,7 +1,5 @@
 """An algorithm of your own, written against the seam alone, learns in a run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

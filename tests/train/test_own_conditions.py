@@ -1,7 +1,5 @@
 """Training with conditions of one's own: those over custom signals label logs, not the twin."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Practice by arm: the rule's shares, what moves them, their record, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A policy against another on the same episodes: paired, refused where the episodes differ."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -122,12 +120,7 @@ def test_few_episodes_say_nothing_of_better_or_worse(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"first_seed": 10_001},
-        {"episodes": 40},
-        {"perturbations": ("none",)},
-        {"friction": 0.7},
-    ],
+    [{"first_seed": 10_001}, {"episodes": 40}, {"perturbations": ("none",)}, {"friction": 0.7}],
     ids=str,
 )
 def test_other_episodes_are_refused(baseline: Path, tmp_path: Path, changes: dict) -> None:

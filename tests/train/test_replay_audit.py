@@ -1,7 +1,5 @@
 """The replay audit record: of a run, in one line of Python, and the same in SQL."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

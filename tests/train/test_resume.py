@@ -1,7 +1,5 @@
 """A run that was cut goes on bit for bit, whatever its checkpoint holds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -78,11 +76,7 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
         None,
         Walker,
     ),
-    "practice": (
-        {"practice": {"rule": "success"}},
-        None,
-        lambda: None,
-    ),
+    "practice": ({"practice": {"rule": "success"}}, None, lambda: None),
     "shares of logged rows": (
         {"replay": {"logs_share": None}},
         logs_by(SCHEDULED, CONDITIONS),

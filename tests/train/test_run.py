@@ -1,7 +1,5 @@
 """The run directory: readable at any moment, never half-written, continued where it was."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`restock coverage diff` of runs: settings, feed and evaluation side by side."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

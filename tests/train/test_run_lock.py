@@ -1,7 +1,5 @@
 """A run has one writer, whoever reads it, and a killed writer does not lock it for good."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Stable-Baselines3's buffer alone: its n-step rows, its continuous actions, what it refuses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A saved model of Stable-Baselines3 is loaded to act, and to train on in its run or another."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

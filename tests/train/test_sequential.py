@@ -1,7 +1,5 @@
 """Bounds of a mean difference that hold after every pair: errors counted in simulations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The shares of a run: its own draws, schedules, and the cap a row that holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +70,7 @@ def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
     "logs", ["0.5", "{schedule='linear', start=0.9, end=0.1, to_env_steps=1000}"]
 )
 def test_rows_that_bear_too_few_draws_bear_them_all(logs: str) -> None:
-    """Check that missing draws are not asked for again at each new share.
-
-    That once left later batches with .69 of the draws.
-    """
+    """Check that missing draws are not asked for again at each new share."""
     text = f"max_replays_per_row=50\n[sources]\nlogs={logs}\n{HALVES}"
     plan = controller(text, [100, 100], PlannedDraws(0, 128_000, 0, 1000))
     owed = 0.0

@@ -1,7 +1,5 @@
 """`restock train`: every arm with every seed, once; what is there is not done again."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from signal import SIGINT, pthread_kill

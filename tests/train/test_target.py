@@ -1,7 +1,5 @@
 """Target updates, and the two clocks example: online and target estimate over four updates."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -21,12 +19,7 @@ class One(nn.Module):
 
 
 def test_the_two_clocks() -> None:
-    """One state with a self-loop: reward 1, discount 0.5, learning rate 0.5, hard sync at three.
-
-    The online estimate moves half-way to `1 + 0.5 * target` at every update. The target stands at
-    0 for the first three updates, so the online estimate closes on 1, not on the true value 2;
-    only after the sync does it learn from what it learnt.
-    """
+    """One state with a self-loop (reward 1, discount .5) closes on 1 before the sync."""
     online, target = One(0.0), One(0.0)
     clock = TargetUpdate(Hard(every=3), online.parameters(), target.parameters())
     history = []

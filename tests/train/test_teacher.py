@@ -1,7 +1,5 @@
 """A teacher's filter: plausible actions, what Q chooses among them, who is asked, what is kept."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -35,11 +33,7 @@ from restock.train.dqn.behaviour import (
 )
 from restock.train.dqn.config import TeacherConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.feed.teacher import (
-    Imitation,
-    TeacherFailed,
-    open_teacher,
-)
+from restock.train.feed.teacher import Imitation, TeacherFailed, open_teacher
 from restock.train.loop import train
 from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.run import checkpoint
@@ -191,12 +185,7 @@ def test_half_of_the_rows_are_mirrored_with_their_action(tmp_path: Path) -> None
     ring.appended = 4
     mirror = Mirror.of(task)
     imitation = Imitation(
-        TeacherConfig(source="operator"),
-        None,
-        ring,
-        batch_size=400,
-        seed=0,
-        mirror=mirror,
+        TeacherConfig(source="operator"), None, ring, batch_size=400, seed=0, mirror=mirror
     )
     drawn = imitation.draw_online()
     both = (

@@ -1,7 +1,5 @@
 """Tianshou's buffer alone: its targets, its sub-buffers, what it refuses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The curves of a run in W&B and MLflow, read back from their own files; a tracker that fails."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`restock train` and `restock eval` in the real twin: small runs, and every refusal."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

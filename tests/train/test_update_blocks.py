@@ -1,7 +1,5 @@
 """Updates in blocks: as one by one on the CPU, and on a GPU as a graph that is replayed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A moment as an MCAP file: read back with a reader of ROS, value by value."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two action spaces of one task: an index into the table, or any command within its reach."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

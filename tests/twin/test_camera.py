@@ -1,7 +1,5 @@
 """Frames by a camera over EGL; skipped by name where there is none."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """How near the robot comes to people and forklifts: true, and measured where it is asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

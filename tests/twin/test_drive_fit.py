@@ -1,7 +1,5 @@
 """`restock twin fit` and `gap` of a robot of one's own: driven in the twin, recorded, ingested."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -1,7 +1,5 @@
 """What the twin says of exposures: where their causes are, and that the rules find them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

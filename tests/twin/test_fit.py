@@ -1,7 +1,5 @@
 """`restock twin fit`: segments of a log, their replay, and parameters recovered from recordings."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -42,11 +40,7 @@ from restock.train.twin.calibration.open_loop import (
     replay_segments,
     split_at,
 )
-from restock.train.twin.physics.perturbation import (
-    Perturbation,
-    load_perturbation,
-    load_schedule,
-)
+from restock.train.twin.physics.perturbation import Perturbation, load_perturbation, load_schedule
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 
 BAGS = SHARED
@@ -103,10 +97,7 @@ def test_every_step_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> No
 
 
 def test_a_late_pose_or_tick_moves_segments_on(known: Path) -> None:
-    """Keep segments if poses come in bursts, as a Neato's do.
-
-    Only 2 of the 12 stretches of its drive began on a fresh pose.
-    """
+    """Keep segments if poses come in bursts, as a Neato's do."""
     with Store(known) as store:
         steps = logged_steps(store)
     usual = log_segments(steps, 2.0)

@@ -1,7 +1,5 @@
 """Generated floors, floors from TOML and from occupancy maps, and several of them in one twin."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

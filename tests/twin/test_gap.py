@@ -1,7 +1,5 @@
 """The gap between twin and logs: what it is under a known perturbation, and what is said of it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +17,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.report import write_gap_page
-from restock.stats import (
-    NOT_KNOWN,
-    ConfidenceInterval,
-)
+from restock.stats import NOT_KNOWN, ConfidenceInterval
 from restock.train.judge.before_training import twin_evidence
 from restock.train.twin.calibration.gap import (
     AFTER,

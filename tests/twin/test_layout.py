@@ -1,7 +1,5 @@
 """The warehouse: its geometry, and that the profile's zones are its aisles and cross-aisles."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from restock.ingest.profile.profile import load_profile

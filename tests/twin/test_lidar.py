@@ -1,7 +1,5 @@
 """The twin's lidar: compiled ranges are MuJoCo's own, whatever stands and moves on the floor."""
 
-from __future__ import annotations
-
 import json
 import math
 

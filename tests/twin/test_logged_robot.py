@@ -1,7 +1,5 @@
 """The robot of a store's logs is that of its profile, even after only [robot] changed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from support.paths import ROOT

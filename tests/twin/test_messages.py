@@ -1,7 +1,5 @@
 """Packed columns are the bytes rosbags would have written, and the sinks keep every message."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +50,7 @@ def test_any_shape_packs_as_rosbags_serialises_it(frame, names, ranges):
         ),
         (
             build(
-                "tf2_msgs/msg/TFMessage",
-                transforms=[{"child_frame_id": name} for name in names],
+                "tf2_msgs/msg/TFMessage", transforms=[{"child_frame_id": name} for name in names]
             ),
             {f"transforms[{i}].transform.rotation.w": np.ones(1) for i in range(len(names))},
         ),

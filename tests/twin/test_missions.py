@@ -1,7 +1,5 @@
 """A kind of mission is one file: a new one is staged, driven, scored, measured and drawn."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

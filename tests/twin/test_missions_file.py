@@ -1,7 +1,5 @@
 """A missions file in the twin: which missions it makes, and which it refuses by name."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

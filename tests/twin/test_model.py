@@ -1,7 +1,5 @@
 """The twin's physics against hand physics, within 15 %, and against itself at a finer timestep."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import mujoco

@@ -1,7 +1,5 @@
 """One reader of logged steps and one driver of logged commands, for the fit and for the gap."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A robot's own MuJoCo model in the built one's place: it drives, or what it lacks is said."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

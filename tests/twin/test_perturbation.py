@@ -1,7 +1,5 @@
 """Perturbations: what they say, what the sensors make of them, and that rows say which held."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 from pathlib import Path

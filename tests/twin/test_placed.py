@@ -1,7 +1,5 @@
 """A drive is told to be on a floor by where it went and by the walls that its lidar saw."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +9,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floors import open_floors
-from restock.train.twin.floors.placed import (
-    Drive,
-    drive_of,
-    on_free_ground,
-    placed_on,
-)
+from restock.train.twin.floors.placed import Drive, drive_of, on_free_ground, placed_on
 
 TASK = load_profile("warehouse_amr").task
 (FLOOR,) = open_floors("default")

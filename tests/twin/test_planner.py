@@ -1,7 +1,5 @@
 """Plans on the known map, and blocks found from the lidar alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

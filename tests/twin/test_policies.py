@@ -1,7 +1,5 @@
 """The scripted drivers do what their names promise, and say who drove and how likely."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest
@@ -128,10 +126,7 @@ def test_a_lattice_guides_an_operator_that_was_stuck() -> None:
 
 
 def test_a_slow_robot_that_drives_is_not_taken_for_stuck() -> None:
-    """Drive at .28 m/s, less than .1 m in the steps after which a robot counts as stuck.
-
-    The operator used to back off in most states, and agents learned that from it.
-    """
+    """Drive at .28 m/s, less than .1 m in the steps after which a robot counts as stuck."""
     task = load_profile("warehouse_amr").task
     slow = tuple((0.28 * v, w) for v, w in task.actions)
     task = msgspec.structs.replace(task, actions=slow)

@@ -1,7 +1,5 @@
 """What a robot would have logged of a drive: rates, three times a message, the policy's view."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The recorder: the same seed gives the same bytes, any policy drives, nothing is half-done."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A profile's robot in the twin: it drives what it is commanded; the stand-in is as it was."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 
@@ -101,11 +99,7 @@ def test_it_drives_what_it_is_commanded(name: str) -> None:
 
 
 def test_a_skid_steer_robot_slides_where_one_axle_rolls() -> None:
-    """Compare skid steer, whose wheels scrub in every turn, with one axle.
-
-    By their contact points alone, scrubbing wheels turn a robot too far. On slippery floor a skid
-    steer's turn while driving changes; that of one axle does not.
-    """
+    """Compare skid steer, whose wheels scrub in every turn, with one axle."""
     sim, _ = driven(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
     assert sim.robot.turn_track_m / sim.robot.track_m == pytest.approx(1.96, abs=0.2)
     one_axle = msgspec.structs.replace(HUSKY, drive="differential", wheelbase_m=None)

@@ -1,7 +1,5 @@
 """Robots that steer, and with mecanum wheels: what they drive, what they cannot, and how."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The scene of a mission as a viewer gets it: markers, parameters, frames, map, and their QoS."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The noise of the twin's sensors."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.signal import lfilter
 

@@ -1,7 +1,5 @@
 """The state lattice: which gaps the body fits through, and how it must stand to do so."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

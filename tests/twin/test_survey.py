@@ -1,7 +1,5 @@
 """The floor that a recording shows: its map, the way driven, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import re
 from itertools import pairwise
@@ -30,13 +28,7 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_files import read_floor
 from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame
 from restock.train.twin.physics.episode import EpisodeSpec, describe_floor
-from restock.train.twin.survey.picture import (
-    LONG_SIDE,
-    MARGIN,
-    PLACE,
-    WAY,
-    write_picture,
-)
+from restock.train.twin.survey.picture import LONG_SIDE, MARGIN, PLACE, WAY, write_picture
 from restock.train.twin.survey.survey import survey
 
 CELL_M = 0.05

@@ -1,7 +1,5 @@
 """Surveys of robots that record Foxglove's message types: scans whose pose is in the message."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

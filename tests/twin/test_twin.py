@@ -1,7 +1,5 @@
 """The twin's environments: Gymnasium's rules, determinism, state, and the contract."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,11 +19,7 @@ from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.physics.perturbation import (
-    PERTURBATIONS,
-    Perturbation,
-    load_schedule,
-)
+from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation, load_schedule
 
 
 def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:

@@ -1,7 +1,5 @@
 """The twin of a robot without a lidar: the same drive, seen without it, by the logs' contract."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest
