@@ -89,9 +89,7 @@ def test_what_runs_beside_a_stage_fails_it(tmp_path: Path) -> None:
     assert failing.exit_code == 2
 
 
-def test_an_unexpected_exit_code_stops_the_demo(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unexpected_exit_code_stops_the_demo(tmp_path, monkeypatch):
     ran: list[str] = []
 
     def dispatch(command: list[str]) -> int:

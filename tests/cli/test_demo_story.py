@@ -33,9 +33,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return to
 
 
-def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(
-    reported: Settings, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported, capsys, monkeypatch):
     """The plan of the panel was printed, as if it had been drawn."""
     monkeypatch.setattr(demo, "before_and_after", lambda to: [])
     demo.tell(reported, stdout())

@@ -1,7 +1,5 @@
 """`restock start` takes a stranger's bag stage by stage, and stops where a person must decide."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
@@ -45,11 +43,7 @@ def way(out: Path, verbs: Verbs, bag: Path, number: int = 1) -> list[str]:
     stages = [
         Stage("ingest", "", ["ingest", str(store)], reads=(bag,), writes=(store,)),
         Stage("mix", "", ["mix", str(out / f"panel{number}")]),
-        Stage(
-            *("train", "", ["train", str(run)]),
-            writes=(run,),
-            resume=("train-on", str(run)),
-        ),
+        Stage(*("train", "", ["train", str(run)]), writes=(run,), resume=("train-on", str(run))),
     ]
     return [work.do(stage).status for stage in stages]
 

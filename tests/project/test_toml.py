@@ -169,14 +169,6 @@ def test_each_setting_with_names_to_choose_from_lists_them(kind: type) -> None:
         assert set(re.findall(r'"(.+?)"', listed)) == names, refused.value.what
 
 
-def test_a_missing_key_is_named() -> None:
-    class Needs(Checked, frozen=True):
-        name: str
-
-    with pytest.raises(ConfigError, match="missing key `name`"):
-        typed({}, Needs, where="config.toml")
-
-
 def test_a_renamed_key_is_refused_with_its_new_name() -> None:
     renamed = {"portion": "use share", "inner.portion": "use inner.share"}
     for values, old, new in (

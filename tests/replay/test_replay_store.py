@@ -78,16 +78,6 @@ def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path):
         ]
 
 
-def test_an_older_version_can_be_opened(store_path, transitions):
-    with Store(store_path, version=0) as store:
-        assert store.sql("SELECT count(DISTINCT recording_id) FROM transitions").fetchall() == [
-            (1,)
-        ]
-        assert store.sql("SELECT count(*) FROM recordings").fetchall() == [(1,)]
-    with pytest.raises(StoreError, match="version 9"):
-        Store(store_path, version=9)
-
-
 @pytest.mark.parametrize(
     ("found", "command"),
     [(None, "sql"), ("restock-store/1", "audit"), ("restock-store/99", "store compact")],
@@ -368,20 +358,6 @@ def test_a_pivot_takes_its_columns_from_the_data(store):
             "SELECT count(*) FROM transitions WHERE primary_condition = 'nominal'"
         ).fetchall()
     )
-
-
-@pytest.mark.parametrize(
-    ("query", "message"),
-    [
-        ("FROM coverag", "Did you mean"),
-        ("SELECT nope FROM episodes", "nope"),
-        ("SELEC 1", "syntax error"),
-        ("", "empty"),
-    ],
-)
-def test_wrong_sql_says_what_duckdb_says(store, query, message):
-    with pytest.raises(QueryError, match=message):
-        store.sql(query)
 
 
 def test_what_is_no_store_is_refused_by_what_it_is(tmp_path):

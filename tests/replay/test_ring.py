@@ -106,27 +106,6 @@ def test_rows_are_those_of_a_naive_n_step_oracle(num_envs, n_step, steps, seed):
     assert not expected
 
 
-def test_known_values_of_termination_truncation_and_bootstrap():
-    ring = FreshRing(10, 2, 1, discount=0.5, n_step=3)
-    for index in range(2):  # environment 0 terminates after two steps, environment 1 is cut
-        ring.append(
-            observation=np.array([[index], [10 + index]]),
-            action=np.array([1, 2]),
-            reward=np.array([1.0, 2.0]),
-            terminated=np.array([index == 1, False]),
-            truncated=np.array([False, index == 1]),
-            next_observation=np.array([[index + 1], [11 + index]]),
-            env_step=index,
-            gradient_step=0,
-        )
-    part = {name: ring.rows[:4, place].ravel().tolist() for name, place in ring.columns.items()}
-    assert part["observation"] == [0.0, 10.0, 1.0, 11.0]
-    assert part["next_observation"] == [2.0, 12.0, 2.0, 12.0]
-    assert part["reward"] == [1.5, 3.0, 1.0, 2.0]
-    assert part["discount"] == [0.0, 0.25, 0.0, 0.5]  # truncation bootstraps, shortened
-    assert ring.meta["horizon"][:4].tolist() == [2, 2, 1, 1]
-
-
 def filled(
     capacity: int = 40, steps: int = 60, seed: int = 0, n_step: int = 3
 ) -> tuple[FreshRing, Drive]:

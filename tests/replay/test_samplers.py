@@ -14,7 +14,7 @@ from support.states import through_json
 from restock.errors import MixtureError
 from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.rules import EPSILON, Prioritised
-from restock.replay.sampling.sampler import Quotas, QuotaSampler, uniform_sampler
+from restock.replay.sampling.sampler import Quotas, QuotaSampler
 from restock.train.run import checkpoint
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
@@ -166,12 +166,6 @@ def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
     expected = go_on(first, 250, seed=2)  # into blocks drawn later
     assert go_on(second, 250, seed=2) == expected
     assert go_on(third, 250, seed=2) == expected
-
-
-def test_a_state_of_other_strata_is_refused():
-    state = uniform_sampler(10, 4, np.random.default_rng(0)).state_dict()
-    with pytest.raises(MixtureError, match="other strata"):
-        uniform_sampler(11, 4, np.random.default_rng(0)).load_state_dict(state)
 
 
 def test_a_state_of_another_rule_is_refused():

@@ -78,18 +78,6 @@ def test_csv_has_a_header_even_without_rows(store_path, capsys):
     assert out_of(capsys, str(store_path), query, "--csv") == "condition,rows_held\n"
 
 
-def test_a_table_is_for_people(store_path, capsys):
-    text = out_of(capsys, str(store_path), "FROM coverage_by_condition")
-    assert "behaviour_policies" in text
-    assert "operator, planner" in text
-
-
-def test_rows_too_wide_for_a_table_are_printed_in_turn(store_path, capsys):
-    text = out_of(capsys, str(store_path), "FROM recordings ORDER BY recording_id LIMIT 2")
-    assert "row 2" in text
-    assert "conditions_json" in text
-
-
 def test_a_query_comes_from_stdin(store_path, capsys, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("SELECT 1 AS one;\nSELECT 2 AS two"))
     assert json.loads(out_of(capsys, str(store_path), "-", "--json")) == [{"two": 2}]

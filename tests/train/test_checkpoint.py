@@ -69,12 +69,6 @@ def test_a_damaged_or_foreign_file_gives_one_clear_error(tmp_path: Path, content
         checkpoint.load(path)
 
 
-def test_a_missing_checkpoint_says_so(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="there is no checkpoint") as raised:
-        checkpoint.load(tmp_path / "none")
-    assert "remove it, and train again" in str(raised.value)
-
-
 def test_checkpoint_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "latest.safetensors"
     save_file({}, path, metadata={"format": "restock-checkpoint/1", "state": "{}"})

@@ -7,7 +7,7 @@ from support.stores import TASK
 
 from restock.replay.store.store import Store
 from restock.train.evaluation.ope import EssGate
-from restock.train.judge.before_training import Evidence, policy_evidence
+from restock.train.judge.before_training import policy_evidence
 
 PERIOD_S = TASK.control_period_s
 
@@ -24,7 +24,3 @@ def test_hours_follow_from_the_episodes(store_path: Path) -> None:
     assert f"at least {9 * driven_h:.2g} h more" in str(policy)
     assert enough.more_h == 0
     assert str(enough).endswith(": enough")
-
-
-def test_no_drive_of_that_length_is_said() -> None:
-    assert str(Evidence("x", "y", "0 in 0", None)).endswith("no drive is long enough")

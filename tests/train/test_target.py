@@ -48,16 +48,6 @@ def test_polyak_by_hand() -> None:
     assert clock.last_sync == 3
 
 
-def test_tau_of_one_is_a_hard_sync_of_every_update() -> None:
-    torch.manual_seed(0)
-    online = nn.Linear(4, 3)
-    slow, hard = nn.Linear(4, 3), nn.Linear(4, 3)
-    TargetUpdate(Polyak(tau=1.0), online.parameters(), slow.parameters()).after(1)
-    TargetUpdate(Hard(every=1), online.parameters(), hard.parameters()).after(1)
-    for a, b in zip(slow.parameters(), hard.parameters(), strict=True):
-        assert torch.equal(a, b)
-
-
 def test_distance_is_relative_to_the_online_parameters() -> None:
     online, target = One(4.0), One(3.0)
     clock = TargetUpdate(Hard(every=2), online.parameters(), target.parameters())

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from restock.errors import RecordingError
 from restock.train.twin.recording.bag_writer import (
     Format,
     Message,
@@ -125,13 +124,3 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, file_format: Fo
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_there_is_never_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "log.mcap").write_text("precious")
-    with (
-        pytest.raises(RecordingError, match=r"log\.mcap: it already exists"),
-        recording_sink(tmp_path / "log.mcap", "mcap", TOPICS),
-    ):
-        pass
-    assert (tmp_path / "log.mcap").read_text() == "precious"
