@@ -97,16 +97,6 @@ def test_what_a_mixture_may_not_say_is_refused(text, message):
         parse_mixture(text)
 
 
-def test_an_unknown_key_is_named_with_its_path(tmp_path):
-    (tmp_path / "m.toml").write_text("[[strata]]\nname = 'nominal'\nshair = 0.3\n")
-    with pytest.raises(ConfigError, match=r"m\.toml: unknown key `strata\[0\]\.shair`"):
-        load_mixture(tmp_path / "m.toml")
-    with pytest.raises(ConfigError, match=r"`held_out`\n.*now called `evaluation_split`"):
-        parse_mixture("[held_out]\nby = 'none'\n" + EVERY)
-    with pytest.raises(ConfigError, match="coverage, uniform"):
-        load_mixture("coverag")
-
-
 SLIPS_ALONE = "[[strata]]\nname = 'nominal'\n[[strata]]\nname = 'wheel_slip'\n"
 LATER_HALF = "share = { schedule = 'linear', start = 0.5, end = 0.3, to_env_steps = 1000 }\n"
 

@@ -381,13 +381,6 @@ def test_what_is_no_store_is_refused_by_what_it_is(tmp_path):
         assert str(refused.value.where) == str(tmp_path / place).removesuffix("@3")
 
 
-def test_a_missing_file_of_rows_is_named_with_a_remedy(tmp_path):
-    StoreWriter(tmp_path / "s").write(*one(1))
-    next((tmp_path / "s" / "transitions").glob("*/*.parquet")).unlink()
-    with pytest.raises(StoreError, match="--force"):
-        Store(tmp_path / "s").sql("FROM transitions")
-
-
 @pytest.mark.parametrize("limit", ["lots", "5", "0 kib", "0%", "-1", "none"])
 def test_a_memory_limit_that_is_none_is_refused(store_path, limit):
     with pytest.raises(StoreError, match="4GB"):
