@@ -37,7 +37,7 @@ from harness import markdown, once, run_restock
 from restock.cli.output import plain
 from restock.errors import RestockError
 from restock.files import write_text
-from restock.report import write_study_page
+from restock.report import study_page, write_page
 from restock.stats import paired_t
 from restock.train.study.contrasts import RunCurve
 from restock.train.study.study import DONE, Study, StudyPlan, load_study
@@ -106,7 +106,8 @@ def _answer(options: argparse.Namespace) -> int:
     plan = StudyPlan(study, mixtures, out / options.question)
     comparisons = run_study(plan, workers=options.workers, say=_say)
     found = findings(plan, comparisons)
-    write_study_page(plain(found), plan.out / "study.html", options.question)
+    content = study_page(plain(found), options.question)
+    write_page(content, plan.out / "study.html", markdown=True)
     page = f"{(plan.out / 'study.md').read_text(encoding='utf-8')}\n{curves(plan)}"
     write_text(plan.out / "study.md", page)
     write_text(plan.out / "study.json", json.dumps(plain(found), indent=1) + "\n")

@@ -13,8 +13,7 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.replay.store.store import Store
-from restock.report import write_study_page
-from restock.report.fleet.coverage import coverage_facts, coverage_page
+from restock.report import coverage_page, study_page, write_page
 from restock.report.look import charts
 from restock.report.look.write import Charts
 
@@ -75,7 +74,7 @@ def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
         "cost": [],
         "comparisons": [comparison],
     }
-    found = read(write_study_page(study, tmp_path / "study.html"))
+    found = read(write_page(study_page(study), tmp_path / "study.html"))
     assert "gate refused 1 of 1 comparisons" in found.text
     assert "too few episodes or seeds to show that they were fed the same (mix)" in found.text
     assert HOSTILE in found.text  # shown, as text
@@ -121,7 +120,7 @@ def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[
 
 def coverage_of(store: Store, gaps: dict[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the cards by label, and the sections by id."""
-    page = coverage_page(coverage_facts(store), gaps, "nothing to compare")
+    page = coverage_page(store, gaps, "nothing to compare")
     cards = {card["label"]: card["value"] for card in page["cards"]}
     return cards, {section.id: section for section in page["sections"]}
 

@@ -87,7 +87,7 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
-    "report": "look run fleet replay/fleet replay/store train/twin/calibration",
+    "report": "look run fleet",
     "report/look": "train/twin/missions",
     "report/run": (
         "look replay/panel replay/plan replay/sampling replay/store train/evaluation train/judge"
@@ -118,7 +118,7 @@ MAY_IMPORT = {
         " train/twin/floors train/twin/missions"
     ),
     "cli/twin": (
-        "cli report report/run ingest/profile ingest/propose"
+        "cli report ingest/profile ingest/propose"
         " ingest/task replay/fleet replay/store train/evaluation"
         " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
         " train/twin/physics train/twin/recording train/twin/survey"

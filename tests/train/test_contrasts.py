@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.finished_runs import document, make_run
 
-from restock.report import write_study_page
+from restock.report import study_page, write_page
 from restock.train.judge.compare import compare
 from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
@@ -145,7 +145,7 @@ def test_the_page_has_contrasts_then_success_and_safety(tmp_path: Path) -> None:
     assert rows["uniform"]["bumps_per_km"][0] == pytest.approx(80.0)  # 16 in 200 m
     assert rows["quotas"]["time_lost_s"][0] == pytest.approx(2.0)
     assert rows["planner"]["success wheel_slip"] == [0.5, None, None]  # one policy: no seeds
-    html = write_study_page(found, tmp_path / "study.html").read_text(encoding="utf-8")
+    html = write_page(study_page(found), tmp_path / "study.html", markdown=True).read_text("utf-8")
     page = (tmp_path / "study.md").read_text(encoding="utf-8")
     heads = ("## Contrasts", "## Success and safety", "## quotas against uniform")
     places = [page.index(head) for head in heads]

@@ -16,7 +16,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.report import write_gap_page
+from restock.report import gap_page, write_page
 from restock.stats import NOT_KNOWN, ConfidenceInterval
 from restock.train.judge.before_training import twin_evidence
 from restock.train.twin.calibration.gap import (
@@ -203,7 +203,7 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Pat
     assert again.verdicts == gap.verdicts
     assert again.about == json.loads(json.dumps(gap.about))
     assert again.paths == gap.paths
-    page = write_gap_page(tmp_path / "gap").read_text()
+    page = write_page(gap_page(again), tmp_path / "gap" / "index.html").read_text()
     assert "Do not trust the twin in: recovery, wheel slip" in page
     assert charts_of(page)["charts"]
     write_gap(gap, tmp_path / "gap")  # a gap measured before is replaced

@@ -126,6 +126,3 @@ def _at(error: Exception) -> str:
         if str(frame.f_globals.get("__name__", "")).startswith("restock.")
     ]
     return lines[-1] if lines else ""
-
-
-__all__ = ["GL", "NO_GL", "as_restock_error"]

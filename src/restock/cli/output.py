@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from functools import cache
@@ -72,6 +72,11 @@ def stderr() -> Console:
 def say(message: str) -> None:
     """Print one line of progress to stderr, without markup: it may hold a path or a command."""
     stderr().print(visible(message, keep="\n"), markup=False, emoji=False, soft_wrap=True)
+
+
+def print_text(text: str = "") -> None:
+    """Print lines of data to stdout as they are: a terminal wraps them."""
+    sys.stdout.write(visible(text, keep="\n") + "\n")
 
 
 def say_unverified(store: Store) -> None:
@@ -183,6 +188,16 @@ def print_parted(
         if place:
             sys.stdout.write("\n")
         print_table(rows, group, title=None if place else title)
+
+
+def print_sections(sections: Iterable[Any]) -> None:
+    """Print the tables of a page's sections (None: it has none), but for those that it folds."""
+    for section in filter(None, sections):
+        title: str | None = section.title
+        for table in section.tables:
+            if table.rows and not table.folded:
+                print_table(table.rows, table.columns, title=table.title or title)
+                title = None
 
 
 def _grouped(

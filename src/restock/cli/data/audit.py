@@ -220,12 +220,12 @@ class AuditCommand:
             output.print_json({"store": str(self.store), "capacity": asdict(capacity)})
             return int(ExitCode.OK)
         output.print_table(capacity.curve, title="what the newest rows cover")
-        output.stdout().print(
+        output.print_text(
             f"{capacity.recommended:,} rows: {capacity.reason}. A smaller buffer forgets cells "
             "that no sampling can bring back"
         )
         if not capacity.saturated:
-            output.stdout().print(
+            output.print_text(
                 f"the newest half keeps {capacity.half_share:.0%}: the logs still add new cells, "
                 "and more recordings will add more"
             )
@@ -270,16 +270,16 @@ def _print(findings: list[Finding]) -> None:
             ]
         )
     for finding in reported:
-        output.stdout().print()
+        output.print_text()
         more = finding.rows - min(SHOWN, len(finding.sample))
         title = f"{finding.status}: {finding.audit.name}" + (f" ({more} more)" if more else "")
         output.print_table(finding.sample[:SHOWN], finding.columns, title=title)
-        output.stdout().print(f"  {finding.audit.advice}", markup=False)
+        output.print_text(f"  {finding.audit.advice}")
     for status in ("pass", "skipped"):
         names = [finding.audit.name for finding in findings if finding.status == status]
         if names:
             output.print_wrapped(f"{status}: {', '.join(names)}")
-    output.stdout().print(f"\n{_summary(findings)}")
+    output.print_text(f"\n{_summary(findings)}")
 
 
 def _print_reward(reward: RewardAudit) -> None:
@@ -305,7 +305,7 @@ def _print_reward(reward: RewardAudit) -> None:
         if row["outcome"] == "all"
     ]
     output.print_table(shown, title="return by driver")
-    output.stdout().print()
+    output.print_text()
     pairs = [
         {
             "condition": row["condition"],
@@ -325,10 +325,10 @@ def _print_reward(reward: RewardAudit) -> None:
     reported = Counter(row["verdict"] for row in reward.order)
     for finding in reward.findings:
         if finding.rows:
-            output.stdout().print(f"{finding.status}: {finding.audit.doc}", markup=False)
-            output.stdout().print(f"  {finding.audit.advice}", markup=False)
+            output.print_text(f"{finding.status}: {finding.audit.doc}")
+            output.print_text(f"  {finding.audit.advice}")
     counts = ", ".join(f"{reported[name]} {name}" for name in VERDICTS if reported[name])
-    output.stdout().print(f"\n{counts or 'nothing to compare: undetermined'}")
+    output.print_text(f"\n{counts or 'nothing to compare: undetermined'}")
 
 
 VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # for a pair of drivers

@@ -68,14 +68,13 @@ class ExportCommand:
             if self.json:
                 output.print_json(made)
             else:
-                output.stdout().print(
+                output.print_text(
                     f"policy {made['version']} ({made['trained']}) of task {made['task_hash']}"
                     f" -> {made['path']}"
-                    f" ({made['bytes']:,} bytes)",
-                    markup=False,
+                    f" ({made['bytes']:,} bytes)"
                 )
                 if "alarm" in made:
-                    output.stdout().print(_alarm_line(json.loads(made["alarm"])), markup=False)
+                    output.print_text(_alarm_line(json.loads(made["alarm"])))
             return
         refuse(self, ["alarm"], "applies only to --to onnx", remedy="leave it out")
         from restock.replay.export.dataset import export_dataset
@@ -95,7 +94,7 @@ class ExportCommand:
             output.print_json(document)
             return
         for line in _summary(document):
-            output.stdout().print(line, markup=False)
+            output.print_text(line)
 
     def _cameras(self) -> list[str] | None:
         """Return cameras as `export_dataset` takes them."""

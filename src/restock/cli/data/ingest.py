@@ -190,12 +190,9 @@ def show(outcome: IngestResult) -> None:
     from restock.ingest.store.manifest import UNUSED
 
     row = outcome.manifest
-    console = output.stdout()
-    console.print(
+    output.print_text(
         f"{visible(outcome.path)}  {row['format']}  {row['duration_s']:.1f} s  "
-        f"recording {row['recording_id']}",
-        markup=False,
-        soft_wrap=True,
+        f"recording {row['recording_id']}"
     )
     episodes = (
         f"{counted(row['transitions'], 'transition')} in {counted(row['episodes'], 'episode')}"
@@ -203,19 +200,17 @@ def show(outcome: IngestResult) -> None:
     tags = in_words(row["tags"] or {})
     if outcome.status in ("unchanged", "tagged"):
         how = f"now with tags {tags or 'none'}, " if outcome.status == "tagged" else ""
-        console.print(
+        output.print_text(
             f"{outcome.status}: {how}{episodes} are in the store already"
-            " (--force ingests them again)",
-            markup=False,
-            soft_wrap=True,
+            " (--force ingests them again)"
         )
         notes = "\n".join([*map(visible, outcome.notes), ""])
-        console.print(notes, markup=False, soft_wrap=True)
+        output.print_text(notes)
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
-    console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
+    output.print_text(into + (f", store version {outcome.version}" if outcome.version else ""))
     if tags:
-        console.print(f"tags: {tags}", markup=False, soft_wrap=True)
+        output.print_text(f"tags: {tags}")
     used = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
     used = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in used]
@@ -225,7 +220,7 @@ def show(outcome: IngestResult) -> None:
     if len(used) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
         topics = counted(len(rest), "further topic")
-        console.print(f"{topics} ({sum(rest):,} messages): not used by the profile")
+        output.print_text(f"{topics} ({sum(rest):,} messages): not used by the profile")
     if row["signals"]:
         output.print_table(
             [
@@ -285,8 +280,8 @@ def show(outcome: IngestResult) -> None:
         ]
         output.print_table(labels, output.reported(labels))
     for line in _unknown(row):
-        console.print(line, markup=False, soft_wrap=True)
-    console.print(
+        output.print_text(line)
+    output.print_text(
         f"{counted(row['ticks'], 'tick')} = {counted(row['transitions'], 'transition')}"
         f" + {counted(row['episode_ends'], 'episode end')}"
         f" + {sum(drop['count'] for drop in row['drops']):,} dropped"
@@ -294,16 +289,16 @@ def show(outcome: IngestResult) -> None:
     if row["drops"]:
         output.print_table([{"dropped": d["reason"], "ticks": d["count"]} for d in row["drops"]])
     endings = ", ".join(f"{reason} {count}" for reason, count in outcome.endings.items())
-    console.print(f"episodes ended by: {endings}", markup=False)
+    output.print_text(f"episodes ended by: {endings}")
     for item in row["stand_ins"]:
-        console.print(f"no {item['input']}: {item['instead']}", markup=False)
+        output.print_text(f"no {item['input']}: {item['instead']}")
     for note in outcome.notes:
-        console.print(visible(note), markup=False, soft_wrap=True)
+        output.print_text(note)
     for loss in outcome.lost_messages:
-        console.print(visible(f"lost: {loss}"), markup=False, soft_wrap=True)
+        output.print_text(f"lost: {loss}")
     for contradiction in outcome.contradictions:
-        console.print(visible(contradiction), markup=False, soft_wrap=True)
-    console.print()
+        output.print_text(contradiction)
+    output.print_text()
 
 
 def _unknown(row: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -91,7 +90,7 @@ class MixCommand:
             title=self.mixture,
         )
         for line in _summary(document):
-            output.stdout().print(line, markup=False, soft_wrap=not sys.stdout.isatty())
+            output.print_text(line)
 
 
 def describe(plan: PanelPlan) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ExitCode, figure, visible
+from restock.errors import ExitCode, figure
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
@@ -66,10 +65,10 @@ class CoverageCommand:
             output.print_json(rows)
         else:
             output.print_table([_line(row) for row in rows], title="rows that hold each condition")
-            output.stdout().print(by_priority(order), markup=False, soft_wrap=True)
+            output.print_text(by_priority(order))
             if guessed := {r["condition"]: n for r in rows if (n := r["uncertain_recordings"])}:
                 said = uncertain_labels(guessed, max(guessed.values()))
-                output.stdout().print(said, markup=False, soft_wrap=True)
+                output.print_text(said)
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import RestockError
@@ -78,7 +77,7 @@ class CoverageCommand:
         from restock.replay.fleet.shopping_list import document, shopping_list
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
-        from restock.report import write_coverage_page
+        from restock.report import coverage_page, write_page
         from restock.train.twin.missions import KINDS
 
         advance(0, "what is missing")
@@ -103,7 +102,7 @@ class CoverageCommand:
         except RestockError as error:  # the logs do not show it
             drift = str(error)
         advance(1, "charts")
-        return write_coverage_page(store, missing, drift, out)
+        return write_page(coverage_page(store, missing, drift), out)
 
 
 def _line(row: dict[str, Any]) -> dict[str, Any]:
@@ -221,7 +220,7 @@ def _print_gaps(answer: dict[str, Any]) -> None:
     unit = answer["unit"]
     name = f"{answer['store']} version {answer['store_version']}"
     if answer["closed"]:
-        output.stdout().print(f"{name}: no gaps; it has all that {answer['mixture']} asks for")
+        output.print_text(f"{name}: no gaps; it has all that {answer['mixture']} asks for")
         return
     known, unknown, orders = readable(answer)
     if known:
@@ -232,7 +231,7 @@ def _print_gaps(answer: dict[str, Any]) -> None:
     plan = answer["plan"]
     if orders:
         _table("what to log next", orders)
-        output.stdout().print(
+        output.print_text(
             f"{figure(plan['total'])} {unit} in all (95 %: {figure(plan['total_low'])} to"
             f" {figure(plan['total_high'])})"
             + (f", {figure(plan['hours'])} hours" if unit == "missions" else "")
@@ -240,7 +239,7 @@ def _print_gaps(answer: dict[str, Any]) -> None:
             " not with that of 50% as by the table above"
         )
     if "missions_file" in answer:
-        output.stdout().print(f"-> {answer['missions_file']}", markup=False)
+        output.print_text(f"-> {answer['missions_file']}")
 
 
 def _table(title: str, rows: list[dict[str, Any]], note: str = "") -> None:
@@ -249,7 +248,7 @@ def _table(title: str, rows: list[dict[str, Any]], note: str = "") -> None:
 
     section(title, rows)
     if note:
-        output.stdout().print(note, markup=False, soft_wrap=not sys.stdout.isatty())
+        output.print_text(note)
 
 
 @dataclass
@@ -298,7 +297,6 @@ class DriftCommand:
 def _print_drift(drift: Drift) -> None:
     from restock.cli import output
 
-    out = output.stdout()
     verdicts: dict[tuple[str, str], Counter[str]] = {}
     for row in drift.tests:
         verdicts.setdefault((row["robot"], row["against"]), Counter())[row["verdict"]] += 1
@@ -312,9 +310,9 @@ def _print_drift(drift: Drift) -> None:
         title=f"comparisons by {drift.every}",
     )
     for note in drift.notes:
-        out.print(visible(f"- {note}"), markup=False, soft_wrap=True)
-    out.print()
+        output.print_text(f"- {note}")
+    output.print_text()
     for row in drift.findings:
-        out.print(visible(row["finding"]), markup=False, soft_wrap=True)
+        output.print_text(row["finding"])
     if not drift.findings:
-        out.print(drift.without_findings(), markup=False, soft_wrap=True)
+        output.print_text(drift.without_findings())

@@ -133,12 +133,12 @@ def _print_stores(document: dict[str, Any]) -> None:
         ]
     )
     if not document["different"]:
-        output.stdout().print("no difference in recordings, episodes, labels or definitions")
+        output.print_text("no difference in recordings, episodes, labels or definitions")
         return
     section("definitions that differ", _lines(document["definitions"], _same("what", "a", "b")))
     section("recordings", _lines(document["recordings"], _RECORDINGS))
     episodes = document["episodes"]
-    output.stdout().print(
+    output.print_text(
         f"episodes: {episodes['in']:,} added, {episodes['out']:,} removed, "
         f"{episodes['changed']:,} with changed rows, {episodes['same']:,} the same"
     )
@@ -160,7 +160,7 @@ def _print_stores(document: dict[str, Any]) -> None:
         if moved:
             section(title, _lines(moved, _SIGNALS))
         else:
-            output.stdout().print(f"\nno signal shifted: {signals['compared']}")
+            output.print_text(f"\nno signal shifted: {signals['compared']}")
 
 
 def _print_panels(document: dict[str, Any]) -> None:
@@ -168,12 +168,12 @@ def _print_panels(document: dict[str, Any]) -> None:
 
     _sides(document, ("id", "store", "store_version", "rows", "effective_rows", "logs_share"))
     if not document["different"]:
-        output.stdout().print("the same panel: mixture, rows and weights")
+        output.print_text("the same panel: mixture, rows and weights")
         return
     _keys("header", document["header"])
     _keys("mixture", document["mixture"])
     rows, weights = document["rows"], document["weights"]
-    output.stdout().print(
+    output.print_text(
         f"rows: {rows['in']:,} in, {rows['out']:,} out, {rows['both']:,} in both;"
         f" {weights['rows_changed']:,} of those with another weight, largest"
         f" {weights['largest_a']:.3g} and {weights['largest_b']:.3g}"
@@ -191,24 +191,23 @@ def _print_runs(document: dict[str, Any]) -> None:
     section("settings that differ", _lines(settings, _same("setting", "kind", "a", "b")))
     if (panels := document["panels"]) is not None:
         if "note" in panels:
-            output.stdout().print(f"panels: {panels['note']}", markup=False)
+            output.print_text(f"panels: {panels['note']}")
         else:
-            output.stdout().print("\nTheir panels:")
+            output.print_text("\nTheir panels:")
             _print_panels(panels)
     section("what the critics were fed, % of all rows drawn", _lines(document["fed"], _FED))
     ages = _lines(document["ages"], _same("source", "unit", "p50", "p90"))
     section("ages of the rows drawn, last interval", ages)
     if document["evaluation_note"]:
-        output.stdout().print(f"evaluation: {document['evaluation_note']}", markup=False)
+        output.print_text(f"evaluation: {document['evaluation_note']}")
     section(
         f"evaluation ({document['evaluated_by']}): paired differences b - a, 95 % over episodes",
         _lines(document["evaluation"], _EVALUATION),
     )
     verdict = document["comparable"]
-    output.stdout().print(
+    output.print_text(
         f"\n`restock compare` says: {verdict['algorithm']} as methods, {verdict['mixture']} as"
-        " mixtures (--treatment mixture)",
-        markup=False,
+        " mixtures (--treatment mixture)"
     )
 
 
@@ -281,7 +280,7 @@ def _print_labels(labels: dict[str, Any]) -> None:
     line += " their condition"
     if labels["rows_with_other_changes"]:
         line += f", and {labels['rows_with_other_changes']:,} more changed another condition"
-    output.stdout().print(line)
+    output.print_text(line)
 
 
 def section(title: str, rows: list[dict[str, Any]]) -> None:
@@ -291,7 +290,7 @@ def section(title: str, rows: list[dict[str, Any]]) -> None:
     if not rows:
         return
     shown = rows[:SHOWN] if sys.stdout.isatty() else rows
-    output.stdout().print()
+    output.print_text()
     output.print_table(shown, title=title)
     if len(shown) < len(rows):
-        output.stdout().print(f"… {len(rows) - len(shown):,} more: --json has all")
+        output.print_text(f"… {len(rows) - len(shown):,} more: --json has all")

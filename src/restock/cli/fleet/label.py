@@ -107,7 +107,7 @@ class LabelCommand:
                 ]
             )
         if version is not None:
-            output.stdout().print(f"store version {version}")
+            output.print_text(f"store version {version}")
         return ExitCode.OK
 
     def _check_options(self) -> None:
@@ -181,14 +181,14 @@ def print_scores(path: Path, *, json: bool) -> int:
         output.print_json({"scores": rows, "reliability": bins})
         return ExitCode.OK
     if not found:
-        output.stdout().print(
+        output.print_text(
             "no recording in the store contains the true conditions: nothing to score"
         )
         return ExitCode.OK
     output.print_table(score_rows(found))
     reported = [row for row in bins if row["known"]]
     if reported:
-        output.stdout().print(
+        output.print_text(
             "\nA probability is reliable if, among steps with probability p, a share p is true:"
         )
         output.print_table(reliability_rows(reported))
@@ -276,7 +276,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
             output.say(nothing)
         return ExitCode.OK
     if not rows:
-        output.stdout().print(nothing, markup=False, soft_wrap=True)
+        output.print_text(nothing)
         return ExitCode.OK
     output.print_parted(
         [_review_line(row) for row in rows],
@@ -336,9 +336,8 @@ def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: b
         output.print_json(document)
         return ExitCode.OK
     if not outcomes:
-        output.stdout().print(
-            "there are no corrections to remove" if file == NONE else f"{file} contains no verdict",
-            markup=False,
+        output.print_text(
+            "there are no corrections to remove" if file == NONE else f"{file} contains no verdict"
         )
         return ExitCode.OK
     output.print_table(
@@ -350,7 +349,7 @@ def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: b
     else:
         lines.append("unchanged" if version is None else f"store version {version}")
     for line in lines:
-        output.stdout().print(line, markup=False)
+        output.print_text(line)
     return ExitCode.OK
 
 

@@ -79,7 +79,7 @@ def _write(
 ) -> Path:
     """Write the page, with the curves and costs that the comparison itself does not need."""
     from restock.cli.output import plain
-    from restock.report import write_comparison_page
+    from restock.report import comparison_page, write_page
     from restock.train.study.contrasts import learning_curves, training_cost
 
     names = _names(first, second)
@@ -92,7 +92,7 @@ def _write(
         "cost": training_cost(arms),
         "runs": {name: [str(path) for path in paths] for name, paths in arms.items()},
     }
-    return write_comparison_page(plain(found), out)
+    return write_page(comparison_page(plain(found)), out)
 
 
 def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:

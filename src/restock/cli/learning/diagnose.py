@@ -125,7 +125,7 @@ class DiagnoseCommand:
 
 
 def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
-    from restock.cli.output import print_parted, stdout
+    from restock.cli.output import print_parted, print_text
 
     several = len(paths) > 1  # a verdict of one is said below
     print_parted(
@@ -148,16 +148,15 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
         title="supply: share of replay / of what driving meets; agreement: logged rows that look"
         " like it; unexplained: of their next observations; G: |TD| held out / in replay",
     )
-    out = stdout()
-    out.print(f"{diagnosis.cause}")
+    print_text(f"{diagnosis.cause}")
     for line in diagnosis.evidence:
-        out.print(f"  {line}", markup=False, soft_wrap=True)
+        print_text(f"  {line}")
     to = "to decide" if diagnosis.cause == "UNDETERMINED" else "to confirm"
-    out.print(f"{to}: {diagnosis.experiment}", markup=False, soft_wrap=True)
+    print_text(f"{to}: {diagnosis.experiment}")
 
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
-    from restock.cli.output import print_parted, stdout
+    from restock.cli.output import print_parted, print_text
     from restock.train.judge.before_training import GAP_CHECK
 
     named = {check for one in diagnosis.findings for check in one.evidence}
@@ -187,27 +186,27 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
             key=("check",),
             title="findings beyond their limit, with 95 % intervals over episodes",
         )
-    out, about = stdout(), diagnosis.about
+    about = diagnosis.about
     compared = f"{about['rows']:,} rows of {about['episodes']:,} episodes"
     against = (
         f" against {about['twin_rows']:,} fresh rows of the twin" if about["twin_rows"] else ""
     )
     made = sum(row.status != "not run" for row in diagnosis.comparisons)
-    out.print(f"{diagnosis.verdict}: {compared}{against}, {made} comparisons")
+    print_text(f"{diagnosis.verdict}: {compared}{against}, {made} comparisons")
     for one in diagnosis.findings:
-        out.print(f"  {one.cause}: {one.text}", markup=False, soft_wrap=True)
-        out.print(f"    {one.remedy}", markup=False, soft_wrap=True)
+        print_text(f"  {one.cause}: {one.text}")
+        print_text(f"    {one.remedy}")
     if diagnosis.untrusted:
-        out.print(
-            f"  `restock twin gap` found the twin far from these logs: "
-            f"{', '.join(diagnosis.untrusted)}. Where the two differ, either may be wrong",
-            markup=False, soft_wrap=True,
-        )  # fmt: skip
+        names = ", ".join(diagnosis.untrusted)
+        print_text(
+            f"  `restock twin gap` found the twin far from these logs: {names}."
+            " Where the two differ, either may be wrong"
+        )
     by_reason: dict[str, list[str]] = {}
     for row in diagnosis.not_run:
         by_reason.setdefault(row.note, []).append(row.check)
     for reason, checks in by_reason.items():
-        out.print(f"  not run: {', '.join(checks)}: {reason}", markup=False, soft_wrap=True)
+        print_text(f"  not run: {', '.join(checks)}: {reason}")
 
 
 def _range(least: float | None, most: float | None) -> str:
@@ -217,13 +216,11 @@ def _range(least: float | None, most: float | None) -> str:
 
 
 def _show_confirmation(confirmation: dict[str, Any]) -> None:
-    from restock.cli.output import stdout
+    from restock.cli.output import print_text
 
     answer = {True: "CONFIRMED", False: "REFUTED", None: "NOT DECIDED"}[confirmation["confirmed"]]
     changed = ", ".join(confirmation["changed"])
-    stdout().print(
-        f"{answer}: with {changed} it is {confirmation['cause']} ({confirmation['run']})"
-    )
+    print_text(f"{answer}: with {changed} it is {confirmation['cause']} ({confirmation['run']})")
 
 
 def _document(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:

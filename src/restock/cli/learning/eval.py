@@ -288,6 +288,3 @@ def _value(row: dict[str, Any]) -> str:
     if row["value"] is None:
         return "refused"
     return interval_text(row["value"], row["low"], row["high"])
-
-
-__all__ = ["show_measures", "show_off_policy"]

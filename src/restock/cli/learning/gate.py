@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -49,10 +50,10 @@ class GateCommand:
     """Print the document as JSON: claim, evidence and limits."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json, progress, say
+        from restock.cli.output import print_json, print_sections, progress, say
         from restock.errors import ExitCode
         from restock.files import write_text
-        from restock.report import write_gate_page
+        from restock.report import gate_page, write_page
         from restock.train.judge.gate import FOLDER, drive_gate, junit, plan_gate
         from restock.train.judge.sequential import NOT_WORSE
 
@@ -69,41 +70,17 @@ class GateCommand:
         )
         with progress("driving", None) as advance:
             document = drive_gate(plan, lambda text: advance(note=text))
-        page = write_gate_page(document, self.run_path / FOLDER / "gate.html")
+        content = gate_page(document)
+        page = write_page(content, self.run_path / FOLDER / "gate.html")
         write_text(self.run_path / FOLDER / "junit.xml", junit(document))
         if self.json:
             print_json(document)
         else:
-            _show(document)
+            sys.stdout.write(f"{document['claim']}\n")
+            print_sections(content["sections"])
             say(f"wrote {page}")
         passed = document["verdict"] == NOT_WORSE
         return int(ExitCode.OK if passed else ExitCode.FAILED)
-
-
-def _show(document: dict[str, Any]) -> None:
-    """Print the claim, a line a cell, and the limits."""
-    import sys
-
-    from restock.cli.output import print_table, reported
-    from restock.stats import interval_text
-
-    rows = [
-        {
-            "condition": cell["condition"],
-            "perturbation": cell["perturbation"].replace("none", ""),
-            "floors": cell["layouts"] if len({c["layouts"] for c in document["cells"]}) > 1 else "",
-            "measure": cell["measure"],
-            "pairs": cell["pairs"],
-            "better by [bounds]": ""
-            if cell["difference"] is None
-            else interval_text(cell["difference"], cell["low"], cell["high"], "+.3f"),
-            "margin": cell["margin"],
-            "verdict": cell["verdict"],
-        }
-        for cell in document["cells"]
-    ]
-    print_table(rows, reported(rows), title=document["claim"])
-    sys.stdout.writelines(f"{line}\n" for line in ("", *document["limits"]))
 
 
 def _margins(text: str) -> dict[str, float]:

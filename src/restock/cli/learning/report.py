@@ -48,8 +48,8 @@ class ReportCommand:
         from restock.files import expect_file_place
         from restock.ingest.store.location import Location
         from restock.replay.store.store import is_store
-        from restock.report import build_report, write_card, write_gap_page
-        from restock.train.twin.calibration.twin_gap import FOLDER
+        from restock.report import build_report, gap_page, write_card, write_page
+        from restock.train.twin.calibration.twin_gap import FOLDER, read_gap
 
         if self.card:
             for flag, path in (("--out", self.out), ("--figures", self.figures)):
@@ -69,7 +69,9 @@ class ReportCommand:
             expect_file_place(self.figures / "figure.svg", "--figures", run=self.run_directory)
         with progress("report", None):
             if is_store(Location.of(self.run_directory)):
-                path = write_gap_page(self.run_directory / FOLDER, self.out, self.figures)
+                folder = self.run_directory / FOLDER
+                content = gap_page(read_gap(folder))
+                path = write_page(content, self.out or folder / "index.html", self.figures)
             else:
                 path = build_report(self.run_directory, self.out, self.figures)
         if self.json:

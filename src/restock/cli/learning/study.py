@@ -65,7 +65,7 @@ class StudyCommand:
         from restock.cli.output import plain, print_json, say
         from restock.errors import ConfigError
         from restock.files import expect_place, write_text
-        from restock.report import write_study_page
+        from restock.report import study_page, write_page
         from restock.train.study.study import StudyPlan, load_study
         from restock.train.study.study_run import findings, run_study
 
@@ -79,7 +79,8 @@ class StudyCommand:
             comparisons = run_study(plan, workers=self.workers, say=say)
         found = plain(findings(plan, comparisons))
         write_text(self.out / "study.json", dumps(found, indent=1) + "\n")
-        page = write_study_page(found, self.out / "study.html", self.study.stem)
+        content = study_page(found, self.study.stem)
+        page = write_page(content, self.out / "study.html", markdown=True)
         say(f"wrote {page}")
         if self.json:
             print_json(found)

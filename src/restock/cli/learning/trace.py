@@ -140,7 +140,7 @@ def _print(trace: tracing.Trace, with_messages: bool) -> None:
     if trace.origin is not None:
         _print_origin(trace.origin, with_messages)
     for note in trace.notes + (trace.origin.notes if trace.origin else []):
-        output.stdout().print(f"note: {note}", markup=False)
+        output.print_text(f"note: {note}")
 
 
 def _print_origin(origin: Origin, with_messages: bool) -> None:
@@ -168,7 +168,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
             ],
             title=f"the frames of its cameras, in {', '.join(files)}",
         )
-        output.stdout().print()
+        output.print_text()
     if origin.messages:
         output.print_parted(
             [
@@ -200,10 +200,10 @@ def _print_view(written: dict[str, Any]) -> None:
     from restock.cli import output
 
     rows = [{"topic": topic, "messages": count} for topic, count in written["topics"].items()]
-    output.stdout().print()
+    output.print_text()
     output.print_table(rows, title=f"{written['path']}, {written['seconds']:g} s")
     for note in written["notes"]:
-        output.stdout().print(f"note: {note}", markup=False)
+        output.print_text(f"note: {note}")
     output.say(f"open it in Foxglove and import the layout {written['layout']}")
 
 
@@ -215,7 +215,7 @@ def _section(title: str, values: dict[str, Any] | None) -> None:
     if known:
         rows = [{"": name, "value": _short(value)} for name, value in known.items()]
         output.print_table(rows, title=title)
-        output.stdout().print()
+        output.print_text()
 
 
 def _short(value: Any) -> str:

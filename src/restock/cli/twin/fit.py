@@ -144,10 +144,10 @@ def _show(fit: FittedTwin) -> None:
             title="median distance from the logged position",
         )
     for line in fit.warnings:
-        output.stdout().print(f"warning: {line}")
+        output.print_text(f"warning: {line}")
     if fit.left_out:
         left = ", ".join(_count(reason, count) for reason, count in fit.left_out.items())
-        output.stdout().print(f"left out: {left}")
+        output.print_text(f"left out: {left}")
 
 
 def _count(reason: str, count: int) -> str:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
-
-if TYPE_CHECKING:
-    from restock.train.twin.calibration.twin_gap import TwinGap
 
 
 @dataclass
@@ -56,7 +53,7 @@ class GapCommand:
         from restock.cli import output
         from restock.errors import ExitCode
         from restock.replay.store.store import Store
-        from restock.report import write_gap_page
+        from restock.report import gap_page, write_page
         from restock.train.twin.calibration.gap import measure_gap
         from restock.train.twin.calibration.twin_gap import (
             GapConfig,
@@ -88,55 +85,11 @@ class GapCommand:
             )
         if self.out is not None:
             write_gap(gap, self.out)
-            output.say(f"wrote {write_gap_page(self.out)}")
+            output.say(f"wrote {write_page(gap_page(gap), self.out / 'index.html')}")
         if self.json:
             output.print_json(gap.document())
         else:
-            _show(gap)
+            page = gap_page(gap)
+            output.print_sections(page["sections"])
+            output.print_text(page["headline"])
         return int(ExitCode.FAILED if self.check and gap.untrusted else ExitCode.OK)
-
-
-def _show(gap: TwinGap) -> None:
-    from restock.cli.output import print_table, stdout
-    from restock.report.run.twin_gap import headline, source_name
-
-    positions: dict[tuple[str, float], dict[str, Any]] = {}
-    for row in gap.paths:
-        if row["quantity"] == "position":
-            key = (row["condition"], row["horizon_s"])
-            line = positions.setdefault(
-                key,
-                {"condition": key[0], "after s": key[1], "segments": row["segments"]},
-            )
-            line[source_name(row["source"])] = row["median"]
-            line[f"{source_name(row['source'])} p90"] = row["p90"]
-    print_table(
-        list(positions.values()),
-        title="metres from the logged position: median and 90th percentile",
-    )
-    rewards = [
-        {
-            "condition": row["condition"],
-            "source": source_name(row["source"]),
-            "steps": row["steps"],
-            "reward off by": row["mean_gap"],
-            "bias": row["bias"],
-            "reward's spread": row["logged_spread"],
-        }
-        for row in gap.rewards
-        if row["term"] == "reward"
-    ]
-    print_table(rewards, title="reward after one step from the logged state")
-    print_table(
-        [
-            {
-                "condition": item.condition,
-                "verdict": item.verdict,
-                "why": "; ".join(item.reasons),
-            }
-            for item in gap.verdicts
-        ]
-    )
-    for note in gap.not_done:
-        stdout().print(f"- {note}", markup=False, soft_wrap=True)
-    stdout().print(headline(gap), markup=False)

@@ -181,4 +181,4 @@ def _show(name: str, facts: dict[str, Any]) -> None:
     texts = {key: value if isinstance(value, str) else cell(value) for key, value in rows.items()}
     output.print_table([{"": key, name: text} for key, text in texts.items()])  # to the left
     for note in notes:
-        output.stdout().print(f"- {note}", markup=False, soft_wrap=True)
+        output.print_text(f"- {note}")

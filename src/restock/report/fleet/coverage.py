@@ -49,16 +49,14 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     return found
 
 
-def coverage_page(
-    found: dict[str, Rows], gaps: dict[str, Any], drift: Drift | str
-) -> dict[str, Any]:
+def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dict[str, Any]:
     """Return everything that the page's template needs.
 
     Args:
-        found: of `coverage_facts`.
         gaps: as `restock coverage gaps --json` prints them.
         drift: what was measured, or why nothing was.
     """
+    found = coverage_facts(store)
     (totals,) = found["totals"]
     named = (row["condition"] for rows in ("shelves", "weeks", "rare") for row in found[rows])
     colours = charts.palette(set(named))
@@ -384,6 +382,3 @@ def _in_word(name: str, value: Any) -> str:
     if isinstance(value, str):
         return value if name == "asked by" else words(value)
     return f"{value:,}"
-
-
-__all__ = ["coverage_facts", "coverage_page", "headline", "shopping_section", "to_log"]

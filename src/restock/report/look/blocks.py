@@ -225,6 +225,3 @@ def rows_of(cursor: duckdb.DuckDBPyConnection) -> Rows:
 def ask(connection: Any, sql: str, **parameters: Any) -> Rows:
     """Run a query with its `$name` parameters."""
     return rows_of(connection.execute(sql, parameters or None))
-
-
-__all__ = ["ask", "rows_of", "statements"]

@@ -508,6 +508,3 @@ def _by_condition(rows: Rows) -> Rows:
     """Return rows in the order of their conditions on every page."""
     order = ordered(rows, "condition", WORDS_COLOURS)
     return sorted(rows, key=lambda row: order.index(row["condition"]))
-
-
-__all__ = ["colours", "curves", "differences", "improvements", "intervals"]

@@ -35,8 +35,16 @@ from restock.report.look.charts import CONFIG
 PNG_SCALE = 2.0  # pixels a CSS pixel
 
 
-def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | None = None) -> Path:
+def write_page(
+    content: dict[str, Any],
+    out: Path | str,
+    figures: Path | str | None = None,
+    *,
+    markdown: bool = False,
+) -> Path:
     """Write a page, and its figures into the folder `figures`; returns the page's path.
+
+    With `markdown` the same words and tables are written beside it, as FILE.md.
 
     Args:
         content: what the template asks for: kicker, title, headline, lead, cards, sections,
@@ -66,6 +74,8 @@ def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | N
     write_text(out, template.render({"verdict": None, **content, **own}))
     if figures is not None:
         write_figures(sections, Path(figures))
+    if markdown:
+        write_text(out.with_suffix(".md"), as_markdown(content))
     return out
 
 
@@ -374,15 +384,3 @@ def _script() -> str:
 def _hash(script: str) -> str:
     digest = hashlib.sha256(script.encode()).digest()
     return f"'sha256-{base64.b64encode(digest).decode()}'"
-
-
-__all__ = [
-    "DARK",
-    "Charts",
-    "as_markdown",
-    "dark_rules",
-    "live",
-    "policy",
-    "write_figures",
-    "write_page",
-]

@@ -8,18 +8,34 @@ to make the evaluation look better than deployment.
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from restock.files import write_text
 from restock.replay.sampling.rules import RULES
 from restock.report.look import write
 from restock.report.look.blocks import Rows, Section, Table, count, estimate, percent, shown
-from restock.report.run.facts import Facts, evaluation_bias
+from restock.report.run.facts import Facts, evaluation_bias, gather
 from restock.report.run.fed import by_arm
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"
+
+
+def write_card(run: Path) -> tuple[dict[str, Any], str]:
+    """Write the replay card into a run directory; return it as JSON values and as Markdown.
+
+    Raises:
+        RunError: no run there, or one with nothing to report on yet.
+    """
+    card = replay_card(gather(run))
+    markdown = as_markdown(card)
+    write_text(run / "replay_card.json", json.dumps(card, indent=1, default=str) + "\n")
+    write_text(run / "replay_card.md", markdown)
+    return card, markdown
 
 
 def replay_card(facts: Facts) -> dict[str, Any]:
@@ -297,6 +313,3 @@ def _words(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "none"
     return "none" if value is None else str(value)
-
-
-__all__ = ["as_markdown", "replay_card"]

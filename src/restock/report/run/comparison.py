@@ -471,16 +471,3 @@ def _value_and_ends(value: list[float | None]) -> dict[str, float | None]:
 def _text(value: list[float | None], form: str) -> str:
     mean, low, high = value
     return "" if mean is None else interval_text(mean, low, high, form)
-
-
-__all__ = [
-    "comparison_page",
-    "cost_cards",
-    "curves_section",
-    "gate_section",
-    "headline",
-    "outcome_sections",
-    "study_page",
-    "verdict",
-    "why_refused",
-]

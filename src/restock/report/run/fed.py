@@ -480,6 +480,3 @@ def _cells_kept(capacity: dict[str, Any]) -> Drawing:
         marked="recommended",
         log=True,
     )
-
-
-__all__ = ["actions_section", "by_arm", "capacity_section", "practice_section"]

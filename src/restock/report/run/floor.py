@@ -198,6 +198,3 @@ def _box(plan: FloorMap, pose: list[float], size_m: tuple[float, float], colour:
         f' height="{breadth:.1f}" rx="4" fill="{colour}" stroke="#ffffff" stroke-width="2"'
         f' transform="translate({x:.1f} {y:.1f}) rotate({-math.degrees(pose[2]):.1f})"/>'
     )
-
-
-__all__ = ["films_section"]

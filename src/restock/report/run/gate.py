@@ -110,6 +110,3 @@ def _curves(cells: list[dict[str, Any]], *, several_floors: bool) -> Drawing:
 def _limits(document: dict[str, Any]) -> Section:
     rows = [{"limit": line} for line in document["limits"]]
     return Section("limits", "What this does not say", tables=[Table(rows)])
-
-
-__all__ = ["gate_page"]

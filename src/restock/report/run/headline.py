@@ -293,16 +293,3 @@ def off_policy_table(rows: Rows) -> Table:
         "episodes. Fitted Q evaluation rests only on a model of the values, and has no "
         "interval.",
     )
-
-
-__all__ = [
-    "BASELINES",
-    "NOTHING_DROVE",
-    "baseline",
-    "compared",
-    "headline",
-    "judged_section",
-    "lead",
-    "losses",
-    "off_policy_table",
-]

@@ -412,6 +412,3 @@ def ways_section(facts: Facts) -> Section | None:
             )
         ],
     )
-
-
-__all__ = ["ways_section"]

@@ -300,6 +300,3 @@ def _interval(interval: ConfidenceInterval, unit: str) -> str:
     text = f"{interval.value:{form}} {unit}".strip()
     ends = f" [{interval.low:{form}}, {interval.high:{form}}]"
     return text if math.isnan(interval.low) else text + ends
-
-
-__all__ = ["find_gap", "gap_page", "gap_section", "headline", "run_section", "source_name"]
