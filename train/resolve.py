@@ -245,9 +245,3 @@ def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     schedule = msgspec.structs.replace(config.schedule, env_steps=0)
     practice = msgspec.structs.replace(config.practice, rule="natural")
     return msgspec.structs.replace(config, teacher=teacher, schedule=schedule, practice=practice)
-
-
-__all__ = [
-    "check_new_run",
-    "resolve_ring_capacity",
-]

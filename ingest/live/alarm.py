@@ -144,6 +144,3 @@ def _discriminant(unsafe: F64, safe: F64) -> F64:
     apart = unsafe.mean(axis=0) - safe.mean(axis=0)
     weights[varies] = np.linalg.solve(within, apart) / spread[varies]
     return weights
-
-
-__all__ = ["Alarm", "alarm_of", "count_alarms", "fit_alarm"]

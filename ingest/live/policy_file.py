@@ -375,16 +375,3 @@ ONNX_OPERATORS: dict[str, Rule] = {  # all that a policy may have
 
 def _text(shape: Shape) -> str:
     return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
-
-
-__all__ = [
-    "FORMAT",
-    "MAX_BYTES",
-    "MAX_PARTS",
-    "MAX_WIDTH",
-    "ONNX_OPERATORS",
-    "OnnxFile",
-    "PolicyFile",
-    "graph_shapes",
-    "with_digest",
-]

@@ -369,9 +369,6 @@ def _left_out(others: Sequence[tuple[Path, RobotTraits]]) -> list[Advice]:
     return [Advice("name", f"{text}: {names}; {propose}")]
 
 
-__all__ = ["Drives", "drives_by_kind", "names_of", "pooled", "propose_for_drives"]
-
-
 SCANS = 40  # of a recording that are looked at
 BEAMS = 0.1  # of the beams, by which scans of one lidar may differ: some turn at their own pace
 RANGE = 0.01

@@ -493,19 +493,3 @@ def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> Non
                 stamp = np.concatenate([[start], now.stamp_ns]).astype(np.int64)
                 topics[name] = Samples(stamp, np.concatenate([before.row[-1:], now.row]))
         segments[index] = ClockSegment(topics, segments[index].clock_map)
-
-
-__all__ = [
-    "BY_LOG_TIME",
-    "CLOCK_FIELD",
-    "CLOCK_TOPIC",
-    "NS",
-    "ClockReport",
-    "ClockSegment",
-    "LatestMessages",
-    "Samples",
-    "align",
-    "clock_drifts",
-    "refuse_still_log_time",
-    "ticks_of",
-]

@@ -342,6 +342,3 @@ def _correlation(requested: F64, did: F64, joined: Bools, lag: int) -> float:
     if len(requested) < MIN_FOLLOWED or requested.std() < 1e-3 or did.std() < 1e-3:
         return -1.0
     return float(np.corrcoef(requested, did)[0, 1])
-
-
-__all__ = ["Finding", "clock_findings", "findings_of"]

@@ -439,6 +439,3 @@ def _flags(columns: TopicColumns, rule: Convention) -> Bools:
     if set(rule.fields) <= columns.fields.keys():  # whole, as no recording's reader gives them
         return rule.flags(columns.fields)
     return np.zeros(len(columns), np.bool_)
-
-
-__all__ = ["FixedPoses", "Fixes", "MAX_STD_M", "TRACK_M", "fixes_of", "local_plane_m", "track_yaw"]

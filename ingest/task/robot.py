@@ -396,6 +396,3 @@ def _cosc(angle: F64) -> F64:
     small = np.abs(angle) < 1e-6
     safe = np.where(small, 1.0, angle)
     return np.asarray(np.where(small, angle / 2, (1 - np.cos(safe)) / safe), np.float64)
-
-
-__all__ = ["Limited", "Limiter", "Limits", "RULES", "free_way", "limit"]

@@ -128,14 +128,3 @@ def as_toml(missions: MissionsFile) -> str:
             if value is not None and value != ():
                 lines.append(f"{name} = {toml_value(value)}")
     return "\n".join(lines) + "\n"
-
-
-__all__ = [
-    "MissionOrder",
-    "MissionsFile",
-    "as_toml",
-    "of_list",
-    "read_missions",
-    "refuse_existing",
-    "write_missions",
-]

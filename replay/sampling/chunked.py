@@ -219,6 +219,3 @@ def _share_out(sizes: Ints, rows: int) -> Ints:
         room[stratum] = min(int(sizes[stratum]), left // (len(sizes) - done))
         left -= int(room[stratum])
     return room
-
-
-__all__ = ["CHUNK_ROWS", "MEMORY_BYTES", "ChunkedSampler"]

@@ -249,19 +249,3 @@ RULES: dict[str, Rule] = {
 def follow_td(names: Iterable[str]) -> bool:
     """Return whether draws by any of these rules follow TD errors."""
     return any(RULES[name].follows_td for name in names)
-
-
-__all__ = [
-    "CHUNK",
-    "InTurns",
-    "Per",
-    "Prioritised",
-    "RULES",
-    "Rule",
-    "StratumDraws",
-    "StratumRows",
-    "Uniform",
-    "find_places",
-    "follow_td",
-    "uniform_places",
-]

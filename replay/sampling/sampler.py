@@ -445,6 +445,3 @@ def _by_stratum(quota: Ints) -> Ints:
 def uniform_sampler(rows: int, batch_size: int, rng: np.random.Generator) -> QuotaSampler:
     """Return a sampler that draws every row with the same probability: one stratum of all rows."""
     return QuotaSampler([np.arange(rows)], [1.0], batch_size, rng)
-
-
-__all__ = ["BLOCK", "BlockSampler", "QuotaSampler", "Quotas", "Sampler", "uniform_sampler"]

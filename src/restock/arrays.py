@@ -15,5 +15,3 @@ F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Codes = NDArray[np.signedinteger[Any]]  # indices of texts in a dictionary; -1: no text
 Bools = NDArray[np.bool_]
-
-__all__ = ["F32", "F64", "Bools", "Codes", "Ints"]

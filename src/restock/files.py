@@ -253,20 +253,3 @@ def is_running(process: int) -> bool:
     except PermissionError:
         pass
     return True
-
-
-__all__ = [
-    "building",
-    "expect_file_place",
-    "expect_place",
-    "first_line",
-    "is_undecoded",
-    "is_running",
-    "read_json",
-    "read_table",
-    "remove_leftovers",
-    "temporary_name",
-    "write_bytes",
-    "write_table",
-    "write_text",
-]

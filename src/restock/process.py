@@ -246,19 +246,3 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-__all__ = [
-    "cores",
-    "ended_with_us",
-    "hidden",
-    "import_extra",
-    "install_command",
-    "installed",
-    "interrupt_running",
-    "interrupts_raised",
-    "kill_as_interrupt",
-    "was_interrupted",
-    "went_on_after_interrupt",
-    "when_imported",
-]

@@ -50,6 +50,3 @@ def imported(face: str) -> dict[str, list[str]]:
             if names:
                 names_by_module.setdefault(node.module or "", []).extend(names)
     return names_by_module
-
-
-__all__ = ["FACES", "imported", "lazy"]

@@ -145,6 +145,3 @@ def _alike(one: Any, other: Any) -> bool:
 
 def _key(name: str) -> str:
     return name.removeprefix("_")
-
-
-__all__ = ["Stateful", "first_mismatch", "restored", "saved"]

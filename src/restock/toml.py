@@ -429,15 +429,3 @@ def _without_null(value: dict[str, Any]) -> dict[str, Any]:
         return value
     rest = {key: item for key, item in value.items() if key != "anyOf" and item is not None}
     return {**choices[0], **rest} if len(choices) == 1 else {"anyOf": choices, **rest}
-
-
-__all__ = [
-    "json_schema",
-    "Checked",
-    "by_path",
-    "changed",
-    "parse_toml",
-    "read_toml",
-    "toml_value",
-    "typed",
-]

@@ -256,18 +256,3 @@ def margin_penalty(q: Tensor, action: Tensor, expert: Tensor, margin: float) -> 
     others = torch.full_like(q, margin).scatter_(1, action.unsqueeze(1), 0.0)
     chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
     return (((q + others).amax(dim=1) - chosen) * expert).mean()
-
-
-__all__ = [
-    "ALGORITHMS",
-    "DQN",
-    "Algorithm",
-    "Loss",
-    "TrainingBatch",
-    "conservative_penalty",
-    "dqn_loss",
-    "make_algorithm",
-    "make_network",
-    "margin_penalty",
-    "td_target",
-]

@@ -175,15 +175,3 @@ class Behaviour(Stateful):
     def plausible(self, observation: Tensor) -> Tensor:
         """Return which actions (B, A) bool are plausible in observations (B, D)."""
         return plausible_actions(self._logits(observation), self.ratio)
-
-
-__all__ = [
-    "UNKNOWN",
-    "Behaviour",
-    "FilteredNetwork",
-    "Labelled",
-    "PolicyNetwork",
-    "imitation_loss",
-    "make_policy",
-    "plausible_actions",
-]

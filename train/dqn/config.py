@@ -337,15 +337,3 @@ def _apply(document: dict[str, Any], override: str) -> None:
         if not isinstance(document, dict):
             raise ConfigError(f"{key!r} is a key below a single value", where="--set")
     document[last] = value
-
-
-__all__ = [
-    "PracticeConfig",
-    "TeacherConfig",
-    "TrainConfig",
-    "apply_overrides",
-    "as_overrides",
-    "load_config",
-    "parse_config",
-    "refuse_untaught",
-]

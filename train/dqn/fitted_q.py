@@ -164,14 +164,3 @@ def _descend(optimizer: Any, loss: Tensor) -> None:
     optimizer.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]
     optimizer.step()
-
-
-__all__ = [
-    "FittedQConfig",
-    "Transitions",
-    "cloned_probabilities",
-    "cloned_behaviour",
-    "fitted_q",
-    "soft_greedy",
-    "values",
-]

@@ -537,6 +537,3 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
         for result in episodes
     ]
     return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
-
-
-__all__ = ["FIRST_SEED", "REFERENCES", "reference", "wrong_seed"]

@@ -357,6 +357,3 @@ def _explained_share(td: Tensor, target: Tensor) -> float | None:
     """Return the explained share of the targets' variance (n,); None without variance."""
     spread = float(target.var(unbiased=False))
     return 1.0 - float(td.var(unbiased=False)) / spread if spread > 0 else None
-
-
-__all__ = ["EvaluationBuffer"]

@@ -326,14 +326,3 @@ def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
         out, "WEBP", save_all=True, append_images=images[1:], duration=durations, loop=0, quality=70
     )
     return out.getvalue()
-
-
-__all__ = [
-    "Scene",
-    "drive_again",
-    "drive_row",
-    "scene_state",
-    "film_evaluation",
-    "scenes",
-    "differing_fields",
-]

@@ -259,14 +259,3 @@ def ways_to_evaluate(
     fitting = [kind for kind in kinds if kind in specs]
     most = min(max(len(specs[kind]) for kind in fitting), chosen.episodes)
     return [specs[kind][at] for at in range(most) for kind in fitting if at < len(specs[kind])]
-
-
-__all__ = [
-    "EVERY",
-    "HELD_OUT",
-    "LoggedMissions",
-    "LoggedWays",
-    "goal_of",
-    "logged_missions",
-    "logged_ways",
-]

@@ -257,6 +257,3 @@ def logged_episodes(panel: Panel) -> list[tuple[str | None, F32]]:
     with panel_store(panel) as store, passed_in(store.connection, wanted=wanted):
         rows = store.connection.execute(query, settings).fetchall()
     return [(failure, np.array(observations, np.float32)) for failure, observations in rows]
-
-
-__all__ = ["OnnxPolicy", "export_onnx", "to_onnx"]

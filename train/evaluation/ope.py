@@ -476,20 +476,3 @@ def behaviour_probability(
         cloned = cloned_probabilities(clone, steps.rows.observation[unknown])
         probability[unknown] = cloned[np.arange(len(cloned)), steps.rows.action[unknown]]
     return probability, int(unknown.sum()) / max(len(steps.rows), 1)
-
-
-__all__ = [
-    "EssGate",
-    "OpeConfig",
-    "OpeEpisodes",
-    "OpeEstimate",
-    "OpeResult",
-    "estimate",
-    "evaluate_off_policy",
-    "evaluate_run_off_policy",
-    "fitted",
-    "measures_of",
-    "notes_of",
-    "padded_episodes",
-    "per_decision",
-]

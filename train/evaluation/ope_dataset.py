@@ -308,14 +308,3 @@ def _halves(store: Store, ids: Ints) -> tuple[Ints, Ints]:
         ).fetchnumpy()
     rows, evaluation = np.asarray(columns["transition_id"], np.int64), columns["evaluation"]
     return rows[evaluation], rows[~evaluation]
-
-
-__all__ = [
-    "Measure",
-    "OpeDataset",
-    "OpeSteps",
-    "held_out_of",
-    "held_out_rows",
-    "load_ope_dataset",
-    "panel_store",
-]

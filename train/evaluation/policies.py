@@ -382,19 +382,3 @@ def _clone(observation: F32, action: Ints, actions: int, updates: int) -> QNetwo
 def _empty_network(observation_size: int, actions: int) -> QNetwork:
     none = np.zeros((1, observation_size), np.float32), np.zeros(1, np.int64)
     return _clone(*none, actions, 0)
-
-
-__all__ = [
-    "CLONED",
-    "ClonedPolicy",
-    "GreedyPolicy",
-    "clone_of",
-    "cloned_panel",
-    "is_cloned",
-    "kept_one",
-    "load_agent",
-    "load_cloned",
-    "load_kept",
-    "load_policy",
-    "save_agent",
-]

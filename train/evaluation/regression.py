@@ -169,10 +169,3 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
         key = int(row["episode_seed"]), str(sorted(row["perturbation_values"] or ()))
         cells.setdefault(cell, {})[key] = result
     return cells
-
-
-__all__ = [
-    "Evaluated",
-    "read_run_evaluation",
-    "regression",
-]

@@ -516,17 +516,3 @@ def _name(row: dict[str, Any]) -> str:
     if row["source"] == "logs":
         return f"panel row {row['panel_row']} (transition {row['transition_id']})"
     return f"step {row['episode_step']} of the twin's episode {row['episode']}"
-
-
-__all__ = [
-    "FeedRecord",
-    "LEAVE_OUT",
-    "NotFinite",
-    "STOPPED",
-    "TRAIN_SLOWER",
-    "UNLABELLED",
-    "check_fed",
-    "check_kept",
-    "refuse",
-    "row_ids",
-]

@@ -419,12 +419,3 @@ class NoTwin:
 
     def load_state_dict(self, state: dict[str, Any], /) -> None:
         pass
-
-
-__all__ = [
-    "NoTwin",
-    "Practice",
-    "check_missions",
-    "make_twin",
-    "mission_orders",
-]

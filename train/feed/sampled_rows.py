@@ -576,28 +576,3 @@ def policies(source: SourceRows) -> Columns:
         "behaviour_policy": np.array(source.policies, object)[observed],
         "rows": counts[observed],
     }
-
-
-__all__ = [
-    "BatchValues",
-    "FRESH",
-    "GREEDY",
-    "GreedyRows",
-    "HeldInterval",
-    "LOGGED",
-    "SampledRows",
-    "SourceRows",
-    "actions",
-    "add_names",
-    "ages",
-    "conditions",
-    "episode_sums",
-    "fed",
-    "first_places",
-    "fresh_audit",
-    "keep_rows",
-    "logged_audit",
-    "policies",
-    "sampled_episodes",
-    "strata",
-]

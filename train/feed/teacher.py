@@ -492,15 +492,3 @@ class _Drawn:
     def sample(self, count: int, rng: np.random.Generator) -> Ints:
         place = np.searchsorted(self.cumulative, rng.random(count), side="right")
         return self.rows[np.minimum(place, len(self.rows) - 1)]
-
-
-__all__ = [
-    "AskedTeacher",
-    "Imitation",
-    "Label",
-    "OperatorTeacher",
-    "Teacher",
-    "TeacherFailed",
-    "open_teacher",
-    "refuse_nothing_to_learn",
-]

@@ -370,13 +370,3 @@ class CapturedUpdates:
             for tensor, value in zip(moved, before, strict=True):
                 tensor.copy_(value)
         return graph
-
-
-__all__ = [
-    "CapturedUpdates",
-    "DeviceTable",
-    "Launched",
-    "Outcome",
-    "UpdateBlock",
-    "UpdateBlocks",
-]

@@ -369,6 +369,3 @@ def swapped(run: Run, cause: Cause) -> list[str]:
         natural,
         *(f"env.conditions.{name}={share:.6g}" for name in names),
     ]
-
-
-__all__ = ["check_place", "confirm", "swapped"]

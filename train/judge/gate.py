@@ -572,12 +572,3 @@ def junit(document: Document) -> str:
             ElementTree.SubElement(case, "failure", message=cell["verdict"])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-__all__ = [
-    "MEASURES",
-    "drive_gate",
-    "junit",
-    "passed_gate",
-    "plan_gate",
-]

@@ -121,6 +121,3 @@ def pairs_needed(bound: float, limit: float, *, variance: float, error: float = 
     while sequence.above_at is None:
         sequence.add(0.0)
     return sequence.above_at
-
-
-__all__ = ["NOT_SHOWN", "NOT_WORSE", "WORSE", "ConfidenceSequence", "bets", "pairs_needed"]

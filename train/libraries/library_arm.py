@@ -226,7 +226,5 @@ def main(words: list[str]) -> int:
     return 0
 
 
-__all__ = ["TRAINED", "Library", "LibraryArm", "check_installed", "train_library"]
-
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

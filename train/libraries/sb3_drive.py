@@ -262,6 +262,3 @@ class _OnPolicyFeed(BaseCallback):
                 for name, key, steps in rows
             ],
         )
-
-
-__all__ = ["dqn", "ppo"]

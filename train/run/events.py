@@ -290,13 +290,3 @@ class MlflowSink:
 
     def describe(self) -> dict[str, Any]:
         return {"run_id": self._id, "uri": self._uri}
-
-
-__all__ = [
-    "Events",
-    "Sink",
-    "TensorBoard",
-    "require_trackers",
-    "tracked",
-    "tracker_sinks",
-]

@@ -314,23 +314,3 @@ def _mean(name: str, values: Iterable[float]) -> dict[str, float | None]:
 def _interval(name: str, of: ConfidenceInterval) -> dict[str, float | None]:
     values = {name: of.value, f"{name}_low": of.low, f"{name}_high": of.high}
     return {key: None if np.isnan(value) else value for key, value in values.items()}
-
-
-__all__ = [
-    "CloneQuality",
-    "FILE",
-    "LIMITED",
-    "Mission",
-    "WAYS",
-    "add_evaluation",
-    "cell_name",
-    "keep_clone",
-    "measures",
-    "mission_of",
-    "planner_times",
-    "read_clones",
-    "read_evaluations",
-    "shown_evaluation",
-    "summary_rows",
-    "trained_step",
-]

@@ -460,14 +460,3 @@ def _values(path: Path) -> dict[str, Any]:
     except (SafetensorError, OSError, ValueError, LookupError):
         return {}
     return values if isinstance(values, dict) else {}
-
-
-__all__ = [
-    "LOCK",
-    "PolicyOrigin",
-    "RunLock",
-    "env_steps_of",
-    "kept_policy",
-    "latest_drives",
-    "run_clocks",
-]

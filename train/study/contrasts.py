@@ -294,17 +294,3 @@ def _mean(values: Any) -> float:
 
 def _known(value: float) -> float | None:
     return None if np.isnan(value) else value
-
-
-__all__ = [
-    "CELLS",
-    "RARE",
-    "Contrast",
-    "RunCurve",
-    "area",
-    "contrast",
-    "learning_curves",
-    "training_cost",
-    "unknown_measure",
-    "with_holm",
-]

@@ -323,16 +323,3 @@ def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
         if key != "settings" and other.get(key) != value
     ]
     return ", ".join(reported) or "the default"
-
-
-__all__ = [
-    "ArmConfig",
-    "Pair",
-    "Primary",
-    "Study",
-    "StudyEvaluation",
-    "StudyJob",
-    "StudyPlan",
-    "check_jobs",
-    "load_study",
-]

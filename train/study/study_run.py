@@ -488,15 +488,3 @@ def _range(name: str) -> tuple[float, float]:
 def _mean(values: Sequence[float | None]) -> float:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else float("nan")
-
-
-__all__ = [
-    "Say",
-    "arms",
-    "check_mixtures",
-    "contrasts",
-    "findings",
-    "run_job",
-    "run_study",
-    "train_words",
-]
