@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64, Bools, Ints
-from restock.errors import LabelError, QueryError, StoreError
+from restock.errors import LabelError, StoreError
 from restock.files import first_line
 from restock.ingest.relabel import RecordingCorrections
 from restock.ingest.store.manifest import Correction, LabelScore, label_scores, pooled
@@ -423,7 +423,6 @@ def _number(text: str) -> float | None:
 
 
 RESAMPLES = 1000
-ALL = "all"
 LABELS, TRUTHS = ("conditions", "exposures"), ("true_condition", "true_exposure")
 
 
@@ -435,7 +434,6 @@ class LabelQuality:
     are Wilson's.
     """
 
-    group: str  # the value of the column asked for, or "all"
     score: LabelScore
     uncertain: float | None  # share of uncertain steps
     precision: ConfidenceInterval  # of steps
@@ -444,38 +442,16 @@ class LabelQuality:
     event_recall: ConfidenceInterval
 
 
-def label_quality(store: Store, by: str | None = None) -> list[LabelQuality]:
-    """Return every condition that was labelled or true, over recordings whose truth is known.
-
-    `by` is a column of `recordings` (`source_file`, `robot`, `map`, …): one score for each value.
-
-    Raises:
-        QueryError: `recordings` has no such column.
-    """
-    columns = [name for name, *_ in store.sql("DESCRIBE recordings").fetchall()]
-    if by is not None and by not in columns:
-        raise QueryError(
-            f"`recordings` has no column {by!r}",
-            where=str(store.path),
-            remedy=f"by one of {', '.join(columns)}",
-        )
-    group = f'CAST("{by}" AS VARCHAR)' if by else f"'{ALL}'"
-    parts: dict[str, list[_Recording]] = {}
-    recordings = store.sql(
-        f"SELECT ingest_id, task_hash, coalesce({group}, '') FROM recordings ORDER BY 3, 1"
-    ).fetchall()
+def label_quality(store: Store) -> list[LabelQuality]:
+    """Return every condition that was labelled or true, over recordings whose truth is known."""
+    recordings = store.sql("SELECT ingest_id, task_hash FROM recordings ORDER BY 1").fetchall()
     names = [name for (name,) in store.sql("SELECT condition FROM conditions").fetchall()]
-    for ingest_id, task_hash, value in recordings:
-        if (
-            one := _read(store, ingest_id, names, store.task(task_hash).control_period_s)
-        ) is not None:
-            parts.setdefault(value, []).append(one)
+    periods = {task: store.task(task).control_period_s for task in {task for _, task in recordings}}
+    read = [_read(store, ingest_id, names, periods[task]) for ingest_id, task in recordings]
+    known = [one for one in read if one is not None]
     rng = np.random.Generator(np.random.PCG64(0))
-    return [
-        _quality(value, score, several, rng)
-        for value, several in parts.items()
-        for score in pooled(score for one in several for score in one.scores)
-    ]
+    scores = pooled(score for one in known for score in one.scores)
+    return [_quality(score, known, rng) for score in scores]
 
 
 @dataclass(frozen=True)
@@ -530,7 +506,7 @@ def _has(name: str, sets: Sequence[frozenset[str]]) -> Bools:
 
 
 def _quality(
-    value: str, score: LabelScore, recordings: Sequence[_Recording], rng: np.random.Generator
+    score: LabelScore, recordings: Sequence[_Recording], rng: np.random.Generator
 ) -> LabelQuality:
     counted = [
         one.episodes[score.condition] for one in recordings if score.condition in one.episodes
@@ -539,7 +515,6 @@ def _quality(
     reported = any(one.reported for one in recordings)
     draws = cluster_counts(len(episodes), RESAMPLES, rng) @ episodes  # (R, 4)
     return LabelQuality(
-        value,
         score,
         float(episodes[:, 3].sum() / score.known) if reported else None,
         _of_steps(score.precision, draws[:, 2], draws[:, 0]),

@@ -70,16 +70,8 @@ class Drift:
 
     def document(self) -> dict[str, Any]:
         """Return the plain values that `restock coverage drift --json` prints."""
-        return {
-            "store": self.store,
-            "version": self.version,
-            "every": self.every,
-            "reference": self.reference,
-            "tested": self.tested,
-            "findings": self.findings,
-            "notes": self.notes,
-            "tests": self.tests,
-        }
+        names = ("store", "version", "every", "reference", "tested", "findings", "notes", "tests")
+        return {name: getattr(self, name) for name in names}
 
 
 @interrupts_raised

@@ -160,7 +160,6 @@ def find_gaps(
     kinds: Sequence[str] = (),
     thresholds: Thresholds | None = None,
     min_rows: int = 0,
-    by: Sequence[str] = CELL,
 ) -> tuple[Yields, list[Gap]]:
     """Return the store's episodes, and what is missing, the most first.
 
@@ -168,20 +167,12 @@ def find_gaps(
         name: of the mixture, for the reports; `folder`: where its other stores are looked up.
         kinds: of missions that can be driven: names of conditions, the store's or shipped ones.
         thresholds: of audits, by audit; those of AUDITS are asked. None: the mixture alone.
-        min_rows: that each cell should have, of all combinations that `by` spans; 0: not asked.
-        by: the columns that make a cell.
+        min_rows: that each cell of CELL should have; 0: not asked.
 
     Raises:
-        ConfigError, MixtureError, StoreError: as `plan_panel` does; columns that make none, and
-            kinds, audits and thresholds that there are not, or thresholds of another kind.
+        ConfigError, MixtureError, StoreError: as `plan_panel` does; kinds, audits and thresholds
+            that there are not, or thresholds of another kind.
     """
-    unknown = sorted(set(by) - set(CELL))
-    if isinstance(by, str) or unknown or len(set(by)) != len(by) or not by:
-        raise ConfigError(
-            f"{', '.join(unknown) or list(by)!r} cannot define a cell",
-            where="by",
-            remedy=f"name one or more of {', '.join(CELL)}, each once",
-        )
     expect("store", store, Store, 'open it as Store("store")')
     expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
     _refuse_unknown(kinds, [NOMINAL, *(one.name for one in store.conditions()), *shipped()])
@@ -195,7 +186,7 @@ def find_gaps(
     if thresholds is not None:
         gaps += _of_audits(store.connection, yields, thresholds)
     if min_rows:
-        gaps += _of_cells(yields, store.conditions(), min_rows, by)
+        gaps += _of_cells(yields, store.conditions(), min_rows)
     gaps.sort(key=lambda gap: (gap.counted, -gap.missing, str(gap.cell)))
     named = dict(
         store.sql(
@@ -306,19 +297,16 @@ def _of_audits(
     return gaps
 
 
-def _of_cells(
-    yields: Yields, conditions: Sequence[Condition], min_rows: int, by: Sequence[str]
-) -> list[Gap]:
+def _of_cells(yields: Yields, conditions: Sequence[Condition], min_rows: int) -> list[Gap]:
     """Find cells with fewer rows, empty ones included.
 
     A cell of a robot counts that robot's rows, and is forecast by what any robot meets.
     """
     gaps = []
-    values: dict[str, list[str | int]] = {name: yields.values(name) for name in by}
-    if "condition" in values:
-        known = {NOMINAL, *(condition.name for condition in conditions), *values["condition"]}
-        values["condition"] = sorted(known, key=str)
-    if values.get("robot") == [""]:  # no recording says which robot
+    values: dict[str, list[str | int]] = {name: yields.values(name) for name in CELL}
+    known = {NOMINAL, *(condition.name for condition in conditions), *values["condition"]}
+    values["condition"] = sorted(known, key=str)
+    if values["robot"] == [""]:  # no recording says which robot
         del values["robot"]
     for chosen in product(*values.values()):
         cell: dict[str, Any] = dict(zip(values, chosen, strict=True))

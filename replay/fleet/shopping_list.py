@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
-from restock.errors import ConfigError, figure, plural
+from restock.errors import figure, plural
 from restock.replay.fleet.gaps import Gap, Unit, Yields, find_gaps
 from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.plan.source_plan import (
@@ -30,26 +30,15 @@ from restock.replay.store.store import Store
 
 # Of `FROM gaps(name)`, with their types.
 COLUMNS = {
-    "asked_by": "VARCHAR",
-    "stratum": "VARCHAR",
-    "condition": "VARCHAR",
-    "zone": "VARCHAR",
+    **dict.fromkeys(("asked_by", "stratum", "condition", "zone"), "VARCHAR"),
     "action": "BIGINT",
-    "action_name": "VARCHAR",
-    "robot": "VARCHAR",
-    "counted": "VARCHAR",
-    "needed": "BIGINT",
-    "there": "BIGINT",
-    "missing": "BIGINT",
-    "unit": "VARCHAR",
-    "best": "VARCHAR",
-    "rate": "DOUBLE",
-    "rate_low": "DOUBLE",
-    "rate_high": "DOUBLE",
-    "amount": "DOUBLE",
-    "amount_low": "DOUBLE",
-    "amount_high": "DOUBLE",
+    **dict.fromkeys(("action_name", "robot", "counted"), "VARCHAR"),
+    **dict.fromkeys(("needed", "there", "missing"), "BIGINT"),
+    **dict.fromkeys(("unit", "best"), "VARCHAR"),
+    **dict.fromkeys(("rate", "rate_low", "rate_high"), "DOUBLE"),
+    **dict.fromkeys(("amount", "amount_low", "amount_high"), "DOUBLE"),
 }
+CONFIDENCE = 0.8  # with which the planned amount is to close each gap by itself
 HOUR_STEPS = 60  # of an hour that is planned
 _PART = 0.1  # of a gap that an order fills at least, to be named as for it
 
@@ -96,7 +85,6 @@ class ShoppingList:
     """What to log next."""
 
     unit: Unit
-    confidence: float
     gaps: list[FilledGap]
     orders: list[Order]
     total_low: float  # of all orders together: 95 % of replicates need more than this …
@@ -112,27 +100,16 @@ def shopping_list(
     gaps: Sequence[Gap],
     *,
     unit: Unit | None = None,
-    confidence: float = 0.8,
-    seed: int = 0,
 ) -> ShoppingList:
     """Return what fills the gaps, at the rates of the store's episodes.
 
     Args:
         unit: missions of a kind, or hours of logging; None: missions where the recordings knew the
             truth (a simulator drives what one orders), else hours.
-        confidence: with which the planned amount is to close each gap by itself.
-
-    Raises:
-        ConfigError: missions are asked for, and none could be told apart.
     """
     if unit is None:
         unit = "missions" if yields.simulated else "hours"
-    if unit not in get_args(Unit):
-        has = ", ".join(get_args(Unit))
-        raise ConfigError(f"no unit {unit!r}", where="shopping list", remedy=f"give {has}")
-    if not 0 < confidence < 1:
-        raise ConfigError(f"must be between 0 and 1, got {confidence:g}", where="confidence")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     kinds: list[str | None] = [None] if unit == "hours" else [*sorted(set(yields.kind))]
     supplies = list(dict.fromkeys(s for gap in gaps for s in _supplies(gap, kinds)))
     table: dict[tuple[int, Supply], Forecast] = {}
@@ -142,14 +119,14 @@ def shopping_list(
         for index, gap in enumerate(gaps):
             if _may_fill(supply, gap):
                 # The same draws for every gap: gaps that are alike come out alike.
-                draws = np.random.default_rng(seed)
+                draws = np.random.default_rng(0)
                 table[index, supply] = forecast(gap.found[at], amount, gap.missing, rng=draws)
     filled = [
-        _filled(gap, {s: table[index, s] for s in _supplies(gap, kinds)}, confidence)
+        _filled(gap, {s: table[index, s] for s in _supplies(gap, kinds)})
         for index, gap in enumerate(gaps)
     ]
     reachable = [index for index, one in enumerate(filled) if one.best is not None]
-    amounts = _least(gaps, reachable, table, confidence, unit)
+    amounts = _least(gaps, reachable, table, CONFIDENCE, unit)
     total_low, total_high = (
         sum(_least(gaps, reachable, table, share, unit).values()) for share in (0.025, 0.975)
     )
@@ -159,7 +136,7 @@ def shopping_list(
     orders.sort(key=lambda order: -order.amount)
     if unit == "missions":
         filled = [_with_probability(one, amounts, yields, rng) for one in filled]
-    return ShoppingList(unit, confidence, filled, orders, total_low, total_high)
+    return ShoppingList(unit, filled, orders, total_low, total_high)
 
 
 def _may_fill(supply: Supply, gap: Gap) -> bool:
@@ -177,10 +154,10 @@ def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:
     ]
 
 
-def _filled(gap: Gap, mine: dict[Supply, Forecast], confidence: float) -> FilledGap:
+def _filled(gap: Gap, mine: dict[Supply, Forecast]) -> FilledGap:
     known = {supply: one for supply, one in mine.items() if one.known}
     if known:
-        best = min(known, key=lambda supply: known[supply].quantile(confidence))
+        best = min(known, key=lambda supply: known[supply].quantile(CONFIDENCE))
         return FilledGap(gap, best, known[best], None)
     # The kind of mission that is called so, else the one that was driven least: it has shown least.
     named = [
@@ -289,7 +266,7 @@ def document(found: ShoppingList) -> dict[str, Any]:
     """Return plain values, as `restock coverage gaps --json` prints them."""
     return {
         "unit": found.unit,
-        "confidence": found.confidence,
+        "confidence": CONFIDENCE,
         "closed": not found.gaps,
         "gaps": [_gap(one) for one in found.gaps],
         "plan": {

@@ -370,7 +370,7 @@ def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_pa
     assert section is not None
     assert "4 of 84 episodes" in section.intro
     shown = {row["policy"]: row["success"] for row in section.tables[0].rows}
-    assert shown == {"agent": "100% [34%, 100%]", "planner": "0% [0%, 66%]"}
+    assert shown == {"agent": "1.00 [0.34, 1.00]", "planner": "0.00 [0.00, 0.66]"}
     assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
 
 

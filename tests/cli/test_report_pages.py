@@ -42,7 +42,7 @@ def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     assert main(["compare", *plain, "--against", *other, "--page", str(page)]) == 1
     found = read(page)
-    assert "they differ in config.replay.batch_size" in found.text
+    assert "the runs differ in config.replay.batch_size" in found.text
     assert "Probability that" not in found.text
 
 
@@ -53,6 +53,7 @@ def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
         "baseline": "uniform",
         "treatment": "mixture",
         "verdict": "inconclusive",
+        "why": "too few episodes to show that mix (whole run) are the same",
         "refused": [],
         "differences": [],
         "checks": [{"name": "mix", "verdict": "inconclusive"}],
@@ -76,7 +77,7 @@ def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
     }
     found = read(write_page(study_page(study), tmp_path / "study.html"))
     assert "gate refused 1 of 1 comparisons" in found.text
-    assert "too few episodes or seeds to show that they were fed the same (mix)" in found.text
+    assert "inconclusive: too few episodes to show that mix (whole run)" in found.text
     assert HOSTILE in found.text  # shown, as text
 
 

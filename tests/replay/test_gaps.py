@@ -97,7 +97,6 @@ def test_audits_and_cells_ask_too(store):
             kinds=KINDS,
             thresholds=limits,
             min_rows=1,
-            by=("condition", "zone"),
         )
         rare = dict(
             opened.sql(
@@ -123,7 +122,6 @@ def test_audits_and_cells_ask_too(store):
         ({"thresholds": {"rare_conditions": {"min_rows": 3}}}, "'rare_condition'"),
         ({"thresholds": {"rare_condition": {"min_row": 3}}}, "'min_rows'"),
         ({"thresholds": {"rare_condition": {"min_rows": "x"}}}, "rare_condition.min_rows"),
-        ({"min_rows": 3, "by": ["aisle"]}, "'?aisle'?"),
     ],
 )
 def test_unknown_names_are_refused_with_what_is_near(given, near, store):

@@ -9,7 +9,6 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
-from restock.errors import QueryError
 from restock.ingest.store.transitions import replaced
 from restock.replay.review import label_quality
 from restock.replay.store.store import Store
@@ -37,14 +36,6 @@ def test_the_scores_of_a_store_say_how_sure_they_are(store):
             assert one.precision.value == 1 == one.event_precision.value
             assert one.recall.low <= one.recall.value == one.score.recall <= one.recall.high <= 1
             assert one.event_recall.low < one.event_recall.value < one.event_recall.high
-        by_log = label_quality(opened, "source_file")
-        assert {one.group for one in by_log} == {"logs/1.mcap", "logs/5.mcap"}
-        blocked = [one for one in by_log if one.score.condition == "blocked_aisle"]
-        assert sum(one.score.support for one in blocked) == found["blocked_aisle"].score.support
-        better, worse = (one.recall.value for one in sorted(blocked, key=lambda one: one.group))
-        assert better > worse + 0.2
-        with pytest.raises(QueryError, match="no column 'colour'"):
-            label_quality(opened, "colour")
 
 
 def test_the_command_prints_scores_and_reliability(store, capsys):

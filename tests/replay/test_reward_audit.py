@@ -117,8 +117,8 @@ def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, capsys):
     place = str(store_of(tmp_path / "store", hasty_and_careful(earlier, 120)))
     assert cli.main(["audit", place, "--reward", "--discount", "0.97"]) == 1
     shown = " ".join(capsys.readouterr().out.split())  # a cell may be wrapped
-    assert "return at discount 0.97" in shown
-    assert all(text in shown for text in ("goal after a bump 30", "bump_terminates", "1 reversed"))
+    assert "discounted by 0.97" in shown
+    assert all(text in shown for text in ("goal after a bump", "bump_terminates", "1 reversed"))
     assert cli.main(["audit", place, "--reward", "--discount", "0.97", "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     (pair,) = document["order"]

@@ -32,7 +32,6 @@ from restock.train.judge.before_training import (
     drive_twin,
     gap_evidence,
     open_rows,
-    untrusted,
 )
 from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
@@ -303,7 +302,7 @@ def test_a_measured_gap_is_evidence_and_no_verdict(tmp_path: Path, gap: TwinGap)
         "twin gap: nominal": "ok", "twin gap: wheel_slip": "off", "twin gap: recovery": "not run",
     }  # fmt: skip
     assert "0.40 m" in rows["twin gap: wheel_slip"].note
-    assert untrusted(list(rows.values())) == ["wheel_slip"]
+    assert RowDiagnosis("HEALTHY", [], list(rows.values()), {}).untrusted == ["wheel_slip"]
     (tmp_path / "gap/gap.json").write_text("{")
     (damaged,) = gap_evidence([tmp_path])
     assert (damaged.status, "contains no readable gap" in damaged.note) == ("not run", True)

@@ -178,7 +178,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
         "method",
     )
     page = (out / "study.md").read_text()
-    assert 'they differ in config.network.layer_norm, which treatment = "algorithm"' in page
+    assert "differ in config.network.layer_norm, which treatment algorithm does not" in page
     assert "## again against dueling" in page
     assert "Not held: the algorithm (network.layer_norm, library.arguments)." in page
 

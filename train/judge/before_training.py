@@ -80,14 +80,6 @@ def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
         )  # fmt: skip
 
 
-def untrusted(rows: Sequence[Comparison]) -> list[str]:
-    """Return the conditions in which the twin strays from the logs beyond its limits."""
-    start = f"{GAP_CHECK}: "
-    return [
-        row.check.removeprefix(start) for row in rows if row.off and row.check.startswith(start)
-    ]
-
-
 MIN_ROWS = 500  # of the logs, for silence to mean health; and of each part that is compared
 MOST = 40  # parts, of the most rows
 RECORDINGS_CHECK = "recordings"
@@ -312,7 +304,9 @@ class RowDiagnosis:
     @property
     def untrusted(self) -> list[str]:
         """Return the conditions in which `restock twin gap` found the twin far from these logs."""
-        return untrusted(self.comparisons)
+        start = f"{GAP_CHECK}: "
+        off = (row.check for row in self.comparisons if row.off)
+        return [check.removeprefix(start) for check in off if check.startswith(start)]
 
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as JSON values."""
@@ -415,18 +409,6 @@ def open_rows(
     Raises:
         as `diagnose_before_training`.
     """
-    opened = _open(path, profile, task_hash)
-    own, of_rows = opened.profile, opened.rows.task.hash
-    if own.task.hash != of_rows:
-        raise ConfigError(
-            f"profile {own.name!r} defines task {own.task.hash}, the rows are of {of_rows}",
-            where=str(path),
-            remedy="give the profile with which they were ingested",
-        )
-    return opened
-
-
-def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedRows:
     if (path / HEADER).is_file():
         panel = Panel.open(path)
         rows, own = of_panel(panel), profile or profile_of_panel(panel)
@@ -437,14 +419,16 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
                 not_run("fed labels", "labels against the store's", reason),
                 not_run("labels", "labels by stored signals", reason),
             ]
-            return OpenedRows(rows, own, missing, [path])
+            return OpenedRows(rows, _checked(own, rows, path), missing, [path])
         with Store(store_path, version=version) as store:
+            own = _checked(own, rows, path)
             compared = [*fed_labels(store, rows), *_of_store(store, rows, own)]
             return OpenedRows(rows, own, compared, [store_path, path])
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
-            rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
+            rows = of_store(store, chosen)
+            own = _checked(profile or _profile_of_store(store, chosen), rows, path)
             return OpenedRows(rows, own, _of_store(store, rows, own), [path])
     raise RunError(
         "is not a run, a panel or a store" if path.exists() else "does not exist",
@@ -453,11 +437,24 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
     )
 
 
+def _checked(own: Profile, rows: FedRows, path: Path) -> Profile:
+    """Return the profile; raise ConfigError if its task is not that of the rows."""
+    if own.task.hash == rows.task.hash:
+        return own
+    raise ConfigError(
+        f"profile {own.name!r} defines task {own.task.hash}, the rows are of {rows.task.hash}",
+        where=str(path),
+        remedy="give the profile with which they were ingested",
+    )
+
+
 def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison]:
-    conditions = conditions_in_twin(profile.conditions, profile.signals, lidar=profile.task.lidar)[
-        0
-    ]
-    return list(stored(store, rows, profile, conditions))
+    return list(stored(store, rows, profile, _conditions(profile)))
+
+
+def _conditions(profile: Profile) -> list[Condition]:
+    """Return those of a profile's conditions that the twin's signals can say."""
+    return conditions_in_twin(profile.conditions, profile.signals, lidar=profile.task.lidar)[0]
 
 
 def _profile_of_store(store: Store, task_hash: str) -> Profile:
@@ -469,14 +466,9 @@ def _profile_of_store(store: Store, task_hash: str) -> Profile:
 def _drive(
     profile: Profile, perturbation: Perturbation | None, seed: int
 ) -> tuple[FedRows | None, str]:
-    conditions: list[Condition] = conditions_in_twin(
-        profile.conditions, profile.signals, lidar=profile.task.lidar
-    )[0]
+    task, robot, conditions = profile.task, profile.robot, _conditions(profile)
     try:
-        driven = drive_twin(
-            profile.task, conditions, robot=profile.robot, perturbation=perturbation, seed=seed
-        )
-        return driven, ""
+        return drive_twin(task, conditions, robot=robot, perturbation=perturbation, seed=seed), ""
     except RestockError as error:  # no such robot in the twin: the other checks still say much
         return None, f"the twin cannot be driven with this profile: {error.what}"
 

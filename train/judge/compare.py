@@ -52,6 +52,7 @@ from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
+_Key = tuple[int, str]  # of an episode: seed, and the values of the perturbation in force
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
 MIN_RUNS = 3  # seeds of each arm: with fewer there is no interval
 
@@ -75,6 +76,44 @@ class Comparison:
         """Return the checks that decide: those of the feed too, unless it is the treatment."""
         return [] if self.identical else _deciding(self.treatment, self.totals, self.checks)
 
+    @property
+    def why(self) -> str:
+        """Say why the comparison is refused; "" if it is not."""
+        if self.verdict == "comparable":
+            return ""
+        if self.refused:
+            names = ", ".join(difference.setting for difference in self.refused)
+            return f"the runs differ in {names}, which treatment {self.treatment} does not allow"
+        failed = [check for check in self.deciding_checks if check.verdict == self.verdict]
+        # Different numbers of updates make the feeds differ: name that one cause.
+        for check in failed:
+            if check.name == "updates" and None not in (check.first, check.second):
+                return (
+                    f"the first made {check.first:,.0f} updates and the second {check.second:,.0f},"
+                    " with those on the logs alone (schedule.updates_per_env_step); treatment"
+                    " method allows that"
+                )
+        names = ", ".join(dict.fromkeys(f"{check.name} ({check.part})" for check in failed[:4]))
+        names += f" and {len(failed) - 4} more" if len(failed) > 4 else ""
+        if self.verdict == "inconclusive":
+            return f"too few episodes to show that {names} are the same; add seeds to both sides"
+        return f"the critics were fed differently in {names}"
+
+    @property
+    def sentence(self) -> str:
+        """Say what the checks came to."""
+        if self.identical:
+            return "COMPARABLE: both sides are the same runs"
+        if self.verdict != "comparable":
+            undecided = ", inconclusive" if self.verdict == "inconclusive" else ""
+            return f"REFUSED{undecided}: {self.why}"
+        what = {
+            "mixture": "settings, steps",
+            "practice": "settings, steps and the logs' part of the feed",
+            "method": "environment, environment steps and evaluation",
+        }.get(self.treatment, "settings, steps and feed")
+        return f"COMPARABLE: {what} are the same within the limits, except the {self.treatment}"
+
     def as_json(self) -> dict[str, Any]:
         """Return the whole comparison as JSON values."""
         deciding = self.deciding_checks
@@ -82,6 +121,7 @@ class Comparison:
             "treatment": self.treatment,
             "verdict": self.verdict,
             "identical": self.identical,
+            "why": self.why,
             "refused": [difference.setting for difference in self.refused],
             "differences": [asdict(difference) for difference in self.differences],
             "checks": [
@@ -165,11 +205,8 @@ def _outcomes(first: Arm, second: Arm) -> tuple[str, list[dict[str, Any]]]:
     Raises:
         RunError: a run has no evaluation, or the arms share no episode.
     """
-    arms = [[agent_episodes(run) for run in arm.runs] for arm in (first, second)]
-    source = "restock eval" if all(e is not None for arm in arms for e in arm) else "training"
-    if source == "training":
-        arms = [[last_evaluation(run) for run in arm.runs] for arm in (first, second)]
-    scores = [_scores([e for e in arm if e is not None]) for arm in arms]
+    source, tables = _episodes([*first.runs, *second.runs])
+    scores = [_scores(of) for of in (tables[: len(first.runs)], tables[len(first.runs) :])]
     rows = []
     for cell in scores[0]:
         seeds = sorted(scores[0][cell].keys() & scores[1].get(cell, {}).keys())
@@ -231,25 +268,29 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
     return None
 
 
-def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
-    """Return success and return (runs, 2) by cell and seed, of episodes that every run drove."""
-    runs: list[dict[Cell, dict[int, tuple[float, float]]]] = []
-    for table in tables:
-        cells: dict[Cell, dict[int, tuple[float, float]]] = {}
-        for row in table.to_pylist():
-            block = f" ({row['block']})" if row["block"] in ("partial", "full") else ""
-            cell = (row.get("perturbation", "none"), row["condition"] + block)
-            success = float("nan") if row["success"] is None else float(row["success"])
-            result = success, float(row["return"])
-            cells.setdefault(cell, {})[int(row["episode_seed"])] = result
-        runs.append(cells)
-    shared: dict[Cell, dict[int, F64]] = {}
-    for cell, episodes in runs[0].items():
-        for seed in episodes:
-            if all(seed in run.get(cell, {}) for run in runs):
-                values = np.array([run[cell][seed] for run in runs], np.float64)
-                shared.setdefault(cell, {})[seed] = values
-    return shared
+def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[_Key, F64]]:
+    """Return success and return (runs, 2) by cell, of the episodes that every run drove."""
+    first, *others = runs = [_cells(table) for table in tables]
+    return {
+        cell: {
+            key: np.array([run[cell][key] for run in runs], np.float64)
+            for key in episodes
+            if all(key in run.get(cell, {}) for run in others)
+        }
+        for cell, episodes in first.items()
+    }
+
+
+def _episodes(runs: Sequence[Run]) -> tuple[str, list[pa.Table]]:
+    """Return the origin of the episodes that each run's policy drove, and these episodes.
+
+    Raises:
+        RunError: a run has no evaluation.
+    """
+    driven = [table for run in runs if (table := agent_episodes(run)) is not None]
+    if len(driven) == len(runs):
+        return "restock eval", driven
+    return "training", [last_evaluation(run) for run in runs]
 
 
 def last_evaluation(run: Run) -> pa.Table:
@@ -268,7 +309,6 @@ def last_evaluation(run: Run) -> pa.Table:
 
 
 Rows = list[dict[str, Any]]
-_Key = tuple[int, str]  # seed, and the values of the perturbation in force
 
 
 def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[str, Any]:
@@ -362,15 +402,11 @@ def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> Rows:
 
 def _evaluations(a: Run, b: Run, rng: np.random.Generator) -> tuple[str | None, Rows, str | None]:
     """Return the episodes' origin and a line per perturbation and condition, or why none."""
-    driven = [agent_episodes(run) for run in (a, b)]
-    source = "restock eval"
-    if any(table is None for table in driven):
-        source = "training"
-        try:
-            driven = [last_evaluation(run) for run in (a, b)]
-        except RunError as error:
-            return None, [], str(error)
-    cells = [_cells(table) for table in driven if table is not None]
+    try:
+        source, tables = _episodes([a, b])
+    except RunError as error:
+        return None, [], str(error)
+    cells = [_cells(table) for table in tables]
     rows = []
     for cell, of_a in cells[0].items():
         of_b = cells[1].get(cell, {})
@@ -409,8 +445,9 @@ def _evaluation(
     return line
 
 
-def _cells(table: pa.Table) -> dict[tuple[str, str], dict[_Key, tuple[float, float]]]:
-    cells: dict[tuple[str, str], dict[_Key, tuple[float, float]]] = {}
+def _cells(table: pa.Table) -> dict[Cell, dict[_Key, tuple[float, float]]]:
+    """Return success and return by cell and episode."""
+    cells: dict[Cell, dict[_Key, tuple[float, float]]] = {}
     for row in table.to_pylist():
         cell = str(row.get("perturbation", "none")), cell_name(row["condition"], row["block"])
         success = float("nan") if row["success"] is None else float(row["success"])

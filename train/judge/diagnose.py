@@ -268,6 +268,7 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
 
 
 _NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
+_NOT_CONFIRMED: frozenset[Cause] = _NOTHING | {"ACTION_COVERAGE"}
 
 
 def check_place(out: Path) -> None:
@@ -299,37 +300,23 @@ def confirm(
             is suspected.
     """
     check_place(out)
-    if rows_at_fault and diagnosis.cause in (*_NOTHING, "ACTION_COVERAGE"):
-        raise RunError(
-            f"is {diagnosis.cause} by its own figures, and only its rows are at fault: another run"
-            " cannot confirm that",
-            where=str(run.path),
-            remedy="correct the rows, mix again, and ask `restock diagnose PANEL`"
-            " whether they are right now",
-        )
-    if diagnosis.cause in _NOTHING:
-        raise RunError(
-            f"is {diagnosis.cause}: there is nothing to confirm",
-            where=str(run.path),
-            remedy=diagnosis.experiment,
-        )
-    if diagnosis.cause == "ACTION_COVERAGE":
-        raise RunError(
-            "is ACTION_COVERAGE: no setting can add the rows that the logs lack",
-            where=str(run.path),
-            remedy=diagnosis.experiment,
-        )
-    config, changed = run.document["config"], swapped(run, diagnosis.cause)
-    where = str(run.path)
-    if parse_config(apply_overrides(config, changed), where=where) == parse_config(
+    config, where = run.document["config"], str(run.path)
+    cause, remedy = diagnosis.cause, diagnosis.experiment
+    changed = [] if cause in _NOT_CONFIRMED else swapped(run, cause)
+    what = None
+    if rows_at_fault and cause in _NOT_CONFIRMED:
+        what = "by its own figures, and only its rows are at fault: another run cannot confirm that"
+        remedy = "correct the rows, mix again, and ask `restock diagnose PANEL` about them"
+    elif cause in _NOTHING:
+        what = "there is nothing to confirm"
+    elif cause == "ACTION_COVERAGE":
+        what = "no setting can add the rows that the logs lack"
+    elif parse_config(apply_overrides(config, changed), where=where) == parse_config(
         config, where=where
     ):
-        raise RunError(
-            f"is {diagnosis.cause}, and has the settings of the experiment already: "
-            + ", ".join(changed),
-            where=where,
-            remedy=diagnosis.experiment,
-        )
+        what = f"it has the settings of the experiment already: {', '.join(changed)}"
+    if what is not None:
+        raise RunError(f"is {cause}: {what}", where=where, remedy=remedy)
     panel = run.document["panel"]
     if config["teacher"]["source"] == "none":  # its other settings, resolved, have no effect
         config = config | {"teacher": {"source": "none"}}

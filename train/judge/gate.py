@@ -70,18 +70,23 @@ class Measure:
 
     name: str
     unit: str
-    meaning: str
     bound: float
     variance: float
     better: Callable[[EpisodeResult, EpisodeResult], float | None]
 
 
+def _less(name: str) -> Callable[[EpisodeResult, EpisodeResult], float | None]:
+    """Return by how much less a policy has of something than the baseline; None: one has none."""
+
+    def better(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
+        own, other = getattr(policy, name), getattr(baseline, name)
+        return None if own is None or other is None else float(other) - float(own)
+
+    return better
+
+
 def _success(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
     return float(bool(policy.success)) - float(bool(baseline.success))
-
-
-def _bumps(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
-    return float(baseline.bumps - policy.bumps)
 
 
 def _closest(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
@@ -90,16 +95,8 @@ def _closest(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
     return min(policy.closest_person_m, 2.0) - min(baseline.closest_person_m, 2.0)
 
 
-def _stopped(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
-    if policy.stopped_s is None or baseline.stopped_s is None:
-        return None
-    return baseline.stopped_s - policy.stopped_s
-
-
 def _time(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
-    if not (policy.success and baseline.success):
-        return None
-    return baseline.time_s - policy.time_s
+    return baseline.time_s - policy.time_s if policy.success and baseline.success else None
 
 
 SUCCESS = "success"
@@ -107,12 +104,12 @@ BUMPS = "bumps_per_km"
 STOPPED = "stopped_s"
 MEASURES = {
     one.name: one
-    for one in (
-        Measure(SUCCESS, "", "missions that reach their goal without a bump", 1, 0.25, _success),
-        Measure(BUMPS, "/km", "contacts a kilometre that the baseline drives", 10, 0.1, _bumps),
-        Measure("closest_person_m", "m", "closest approach to people, up to 2 m", 2, 0.1, _closest),
-        Measure(STOPPED, "s", "time an episode that the limiter stops the robot", 30, 9, _stopped),
-        Measure("time_lost_s", "s", "time to the goal, where both arrive", 30, 9, _time),
+    for one in (  # docs/eval.md says what each is
+        Measure(SUCCESS, "", 1, 0.25, _success),
+        Measure(BUMPS, "/km", 10, 0.1, _less("bumps")),
+        Measure("closest_person_m", "m", 2, 0.1, _closest),
+        Measure(STOPPED, "s", 30, 9, _less("stopped_s")),
+        Measure("time_lost_s", "s", 30, 9, _time),
     )
 }
 

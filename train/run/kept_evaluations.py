@@ -22,7 +22,14 @@ import pyarrow.compute as pc
 
 from restock.errors import RunError, counted, quoted
 from restock.files import read_table, write_table
-from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_ratio, mean_over_strata, wilson
+from restock.stats import (
+    NOT_KNOWN,
+    ConfidenceInterval,
+    clustered_ratio,
+    interval_text,
+    mean_over_strata,
+    wilson,
+)
 from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
 
 Mission = tuple[str | None, str, int, str]
@@ -276,6 +283,28 @@ def measures(episodes: Sequence[Row]) -> dict[str, Any]:
         **_limited(episodes),
         "time_lost_episodes": len(lost),
         **_mean("time_lost_s", lost),
+    }
+
+
+def measured_row(row: Row) -> dict[str, Any]:
+    """Return the measures of a cell as people read them: docs/eval.md explains each."""
+
+    def text(name: str, form: str) -> str:
+        ends = row.get(f"{name}_low"), row.get(f"{name}_high")
+        return "" if row[name] is None else interval_text(row[name], *ends, form)
+
+    nearest, held = row["closest_person_least_m"], row["limited_share"]
+    return {
+        "episodes": row["episodes"],
+        "success": text("success", ".2f") or "no goal",
+        "discounted return": text("discounted_return", ".2f"),
+        "bumps per km": text("bumps_per_km", ".1f"),
+        "people, least (mean) m": ""
+        if nearest is None
+        else f"{nearest:.2f} ({row['closest_person_m']:.2f})",
+        "time s": "" if row["time_s"] is None else f"{row['time_s']:.1f}",
+        "lost s": text("time_lost_s", "+.1f"),
+        "held back": "" if held is None else f"{held:.0%} ({row['stopped_share']:.0%} to a stop)",
     }
 
 

@@ -289,7 +289,6 @@ def _command(module: str, arguments: Sequence[str], log: Path) -> None:
 
 
 NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")
-MAX_NAMED = 4  # checks that refuse a comparison
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
@@ -317,40 +316,12 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
 
 def _compared(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
     """Return a comparison as JSON values, with why it has no outcomes, or ""."""
+    names = {"arm": pair.arm.name, "baseline": pair.baseline.name}
     if isinstance(comparison, RunError):
         why = f"{comparison.where}: {comparison.what}" if comparison.where else comparison.what
-        comparison = Comparison(pair.treatment, "inconclusive", [], [], [], [], None, [])
-    else:
-        why = _why_refused(pair, comparison)
-    return {
-        "arm": pair.arm.name,
-        "baseline": pair.baseline.name,
-        **comparison.as_json(),
-        "why": why,
-    }
-
-
-def _why_refused(pair: Pair, comparison: Comparison) -> str:
-    if comparison.verdict == "comparable":
-        return ""
-    if comparison.refused:
-        return (
-            f"they differ in {', '.join(one.setting for one in comparison.refused)}, which"
-            f' treatment = "{pair.treatment}" does not allow'
-        )
-    failed = [one for one in comparison.deciding_checks if one.verdict == comparison.verdict]
-    # Different numbers of updates make the feeds differ: name that one cause.
-    for check in failed:
-        if check.name == "updates" and check.first is not None and check.second is not None:
-            return (
-                f"{pair.arm.name} made {check.second:,.0f} updates and {pair.baseline.name}"
-                f" {check.first:,.0f}, with those on the logs alone;"
-                f' treatment = "{pair.treatment}" needs the same number'
-                ' (schedule.updates_per_env_step), treatment = "method" does not'
-            )
-    names = list(dict.fromkeys(check.name for check in failed))
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return f"{comparison.verdict} in {', '.join(names[:MAX_NAMED])}{more}"
+        none = Comparison(pair.treatment, "inconclusive", [], [], [], [], None, [])
+        return {**names, **none.as_json(), "why": why}
+    return {**names, **comparison.as_json()}
 
 
 def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:

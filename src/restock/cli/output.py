@@ -190,12 +190,12 @@ def print_parted(
         print_table(rows, group, title=None if place else title)
 
 
-def print_sections(sections: Iterable[Any]) -> None:
-    """Print the tables of a page's sections (None: it has none), but for those that it folds."""
+def print_sections(sections: Iterable[Any], *, folded: bool = False) -> None:
+    """Print the tables of a page's sections (None: it has none), and those that it folds."""
     for section in filter(None, sections):
         title: str | None = section.title
         for table in section.tables:
-            if table.rows and not table.folded:
+            if table.rows and (folded or not table.folded):
                 print_table(table.rows, table.columns, title=table.title or title)
                 title = None
 

@@ -12,6 +12,8 @@ from restock.report.fleet.coverage import coverage_page as coverage_page
 from restock.report.look.write import write_page as write_page
 from restock.report.run.card import write_card as write_card
 from restock.report.run.comparison import comparison_page as comparison_page
+from restock.report.run.comparison import gate_section as gate_section
+from restock.report.run.comparison import outcome_sections as outcome_sections
 from restock.report.run.comparison import study_page as study_page
 from restock.report.run.facts import gather
 from restock.report.run.gate import gate_page as gate_page

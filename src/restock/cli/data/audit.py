@@ -286,25 +286,9 @@ def _print_reward(reward: RewardAudit) -> None:
     """Print returns by driver, and whether more success earns a higher return."""
     from restock.cli import output
 
-    outcomes: dict[tuple[str, str], list[str]] = {}
-    for row in reward.returns:
-        if row["outcome"] != "all":
-            text = f"{row['outcome']} {row['episodes']} ({row['discounted_mean']:.2f})"
-            outcomes.setdefault((row["condition"], row["driver"]), []).append(text)
-    shown = [
-        {
-            "condition": row["condition"],
-            "driver": row["driver"],
-            "episodes": row["episodes"],
-            "success": row["success_share"],
-            f"return at discount {reward.discount:g}": row["discounted_mean"],
-            "undiscounted": row["return_mean"],
-            "by outcome (return)": ", ".join(outcomes[row["condition"], row["driver"]]),
-        }
-        for row in reward.returns
-        if row["outcome"] == "all"
-    ]
-    output.print_table(shown, title="return by driver")
+    names = ("condition", "driver", "outcome", "episodes", "success_share")
+    title = f"returns by driver, discounted by {reward.discount:g} a step"
+    output.print_table(reward.returns, [*names, "discounted_mean", "return_mean"], title=title)
     output.print_text()
     pairs = [
         {
@@ -356,7 +340,6 @@ def _summary(findings: list[Finding]) -> str:
     return ", ".join(counts)
 
 
-_MARKS = {"fail": "❌", "warn": "⚠️", "info": "ℹ️", "pass": "✅", "skipped": "–"}
 SHOWN = 5  # rows of a finding on a terminal
 
 
@@ -382,52 +365,28 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
         for row in changes
         if row["change"] == "out" and row.get("recording_id") not in with_recordings
     ]
-    labels = document["labels"]["changes"]
-    return [
-        _as_finding(
-            "recordings_lost",
-            "error",
-            f"Recordings that are in {old} but not in this store",
-            "ingest them again, or compare with a store without them",
-            gone,
-        ),
-        _as_finding(
-            "episodes_lost",
-            "error",
-            f"Episodes that are in {old} but not in this store, of recordings that are in both",
-            "find out what changed: the profile, the conditions, or a damaged recording",
-            lost,
-        ),
-        _as_finding(
-            "definitions_changed",
-            "warning",
-            "Conditions, labels or profiles with changed definitions",
-            "if this was not intended, restore the old ones and ingest again",
-            [row for row in document["definitions"] if row["what"] != "restock_version"],
-        ),
-        _as_finding(
-            "labels_changed",
-            "warning",
-            "Rows whose condition changed",
-            "`restock coverage diff` shows all of them; `restock store label STORE --review` lets "
-            "a person check labels",
-            labels,
-        ),
-        _as_finding(
-            "signals_shifted",
-            "warning",
-            "Signals whose mean over episodes shifted (false discovery rate 5 %)",
-            "`restock coverage drift` shows which robot, week and part",
-            shifted(document["signals"]["shifts"]),
-        ),
-        _as_finding(
-            "recordings_new",
-            "info",
-            "Recordings that were added, or written again",
-            "nothing to do: these recordings explain the differences",
-            [row for row in recordings if row["change"] != "out"],
-        ),
-    ]
+    definitions = [row for row in document["definitions"] if row["what"] != "restock_version"]
+    found: list[tuple[str, Severity, str, str, list[dict[str, Any]]]] = [
+        ("recordings_lost", "error", f"Recordings that are in {old} but not in this store",
+         "ingest them again, or compare with a store without them", gone),
+        ("episodes_lost", "error",
+         f"Episodes that are in {old} but not in this store, of recordings that are in both",
+         "find out what changed: the profile, the conditions, or a damaged recording", lost),
+        ("definitions_changed", "warning",
+         "Conditions, labels or profiles with changed definitions",
+         "if this was not intended, restore the old ones and ingest again", definitions),
+        ("labels_changed", "warning", "Rows whose condition changed",
+         "`restock coverage diff` shows all of them; `restock store label STORE --review` lets a"
+         " person check labels", document["labels"]["changes"]),
+        ("signals_shifted", "warning",
+         "Signals whose mean over episodes shifted (false discovery rate 5 %)",
+         "`restock coverage drift` shows which robot, week and part",
+         shifted(document["signals"]["shifts"])),
+        ("recordings_new", "info", "Recordings that were added, or written again",
+         "nothing to do: these recordings explain the differences",
+         [row for row in recordings if row["change"] != "out"]),
+    ]  # fmt: skip
+    return [_as_finding(*one) for one in found]
 
 
 def of_gate(document: Mapping[str, Any]) -> list[Finding]:

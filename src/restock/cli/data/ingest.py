@@ -141,13 +141,12 @@ class IngestCommand:
 
 # Of a manifest, as printed: definitions, and what is said in other words.
 _LEFT_OUT = (
-    "task_json",
-    "conditions_json",
-    "profile_toml",
-    "source_file",
-    "label_scores",
+    *("task_json", "conditions_json", "profile_toml", "source_file", "label_scores"),
     "label_counts",
 )
+
+
+_PRINTED = ("path", "status", "version", "messages", "conditions", "named", "exposures")
 
 
 def as_json(outcome: IngestResult) -> dict[str, Any]:
@@ -159,13 +158,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
 
     row = {key: value for key, value in outcome.manifest.items() if key not in _LEFT_OUT}
     return {
-        "path": outcome.path,
-        "status": outcome.status,
-        "version": outcome.version,
-        "messages": outcome.messages,
-        "conditions": outcome.conditions,
-        "named": outcome.named,
-        "exposures": outcome.exposures,
+        **{name: getattr(outcome, name) for name in _PRINTED},
         "label_scores": [
             {
                 **counts.get(score["condition"], {}),

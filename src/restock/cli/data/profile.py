@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile
     from restock.ingest.propose.drives import Drives, RobotTraits
 
+# of a proposal
+_PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands", "wheeled")
 OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
 
 
@@ -140,15 +142,9 @@ class ProfileCommand:
             output.print_json(
                 {
                     "toml": toml,
-                    "missing": proposal.missing,
-                    "signals": proposal.signals,
-                    "ticks": proposal.ticks,
-                    "transitions": proposal.transitions,
-                    "problems": proposal.problems,
+                    **{name: getattr(proposal, name) for name in _PRINTED},
                     "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
-                    "commands": proposal.commands,
                     "kinds": [asdict(kind) for kind in proposal.kinds],
-                    "wheeled": proposal.wheeled,
                     "read": [str(path) for path in chosen],
                     "unread": [str(path) for path in unread],
                     "unreadable": [str(path) for path in unreadable],

@@ -112,18 +112,21 @@ class LabelCommand:
 
     def _check_options(self) -> None:
         """Raise ConfigError if options cannot be combined."""
-        of_rules = {
+        given = {
+            "--score": self.score,
+            "--review": self.review is not None,
+            "--corrections": self.corrections is not None,
             "--profile": self.profile is not None,
+            "--out": self.out is not None,
         }
-        for verb, given, others in (
-            ("--score", self.score, {"--review": self.review is not None}),
-            ("--score", self.score, {"--corrections": self.corrections is not None}),
-            ("--review", self.review is not None, {"--corrections": self.corrections is not None}),
-            ("--corrections", self.corrections is not None, {"--out": self.out is not None}),
-        ):
-            clash = [name for name, there in (others | of_rules).items() if there]
-            if given and clash:
-                raise ConfigError(f"{verb} cannot be combined with {clash[0]}")
+        clashes = {
+            "--score": ("--review", "--corrections", "--profile"),
+            "--review": ("--corrections", "--profile"),
+            "--corrections": ("--out", "--profile"),
+        }
+        for option, others in clashes.items():
+            if clash := [name for name in others if given[option] and given[name]]:
+                raise ConfigError(f"{option} cannot be combined with {clash[0]}")
         if self.out is not None and self.review is None:
             raise ConfigError("--out needs --review N")
 
@@ -155,14 +158,9 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
     """Return an outcome as `--json` prints it."""
     from restock.ingest.store.manifest import score_rows
 
+    names = ("recording_id", "source_file", "before", "after", "changed", "named", "named_before")
     return {
-        "recording_id": outcome.recording_id,
-        "source_file": outcome.source_file,
-        "before": outcome.before,
-        "after": outcome.after,
-        "changed": outcome.changed,
-        "named": outcome.named,
-        "named_before": outcome.named_before,
+        **{name: getattr(outcome, name) for name in names},
         "label_scores": score_rows(outcome.scores),
     }
 
@@ -224,11 +222,8 @@ def reliability_rows(bins: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def quality_json(one: LabelQuality) -> dict[str, Any]:
     """Return counts, and shares with 95 % intervals, as `--json` prints them."""
-    from dataclasses import asdict
-
     shares = ("precision", "recall", "event_precision", "event_recall")
     return {
-        "group": one.group,
         **asdict(one.score),
         "uncertain": one.uncertain,
         **{name: asdict(getattr(one, name)) for name in shares},

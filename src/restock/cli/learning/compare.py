@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.judge.comparability import Check
     from restock.train.judge.compare import Comparison
 
 
@@ -70,7 +69,7 @@ class CompareCommand:
         if self.json:
             print_json(comparison.as_json())
         else:
-            _show(comparison)
+            _show(comparison, _names(first, second))
         return int(ExitCode.OK if comparison.verdict == "comparable" else ExitCode.FAILED)
 
 
@@ -87,7 +86,7 @@ def _write(
     found = {
         **comparison.as_json(),
         "names": names,
-        "sentence": _sentence(comparison),
+        "sentence": comparison.sentence,
         "curves": learning_curves(arms),
         "cost": training_cost(arms),
         "runs": {name: [str(path) for path in paths] for name, paths in arms.items()},
@@ -105,112 +104,19 @@ def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
     return (one, other) if one and other and one != other else ("first", "second")
 
 
-def _show(comparison: Comparison) -> None:
-    from restock.cli.output import print_table, say
+def _show(comparison: Comparison, names: tuple[str, str]) -> None:
+    """Print what differs, the checks that failed, the verdict and the outcomes."""
+    from restock.cli.output import plain, print_sections, say
+    from restock.report import gate_section, outcome_sections
 
-    refused = {difference.setting for difference in comparison.refused}
-    if comparison.differences:
-        rows = [
-            {
-                "setting": difference.setting,
-                "first": difference.first,
-                "second": difference.second,
-                "": "not allowed" if difference.setting in refused else difference.kind,
-            }
-            for difference in comparison.differences
-        ]
-        print_table(rows, title=f"what differs (treatment: {comparison.treatment})")
-    checks = comparison.totals + comparison.checks
-    deciding = comparison.deciding_checks
-    shown = [check for check in checks if check.verdict != "comparable"]
-    if shown and not comparison.identical:  # too few episodes show nothing of the same runs
-        treated = {
-            "mixture": " (the treatment: shown, not compared)",
-            "method": " (the treatment: shown, not compared)",
-            "data": " (the treatment: shown, not compared)",
-            "practice": " (of fresh rows it is the treatment: shown, not compared)",
-        }.get(comparison.treatment, "")
-        print_table(
-            [_check(check, decides=check in deciding) for check in shown],
-            title=f"what was fed{treated}",
-        )
-    say(_sentence(comparison))
+    found = plain(comparison.as_json())
+    # Too few episodes show nothing of the same runs.
+    checks = [] if comparison.identical else found["checks"]
+    failed = [check for check in checks if check["verdict"] != "comparable"]
+    print_sections([gate_section({**found, "checks": failed}, *names)], folded=True)
+    say(comparison.sentence)
     if comparison.rows:
-        of = (
-            "restock eval's episodes"
-            if comparison.source == "restock eval"
-            else "the last evaluation"
-        )
-        print_table(
-            [_outcome(row) for row in comparison.rows],
-            title=f"success on the same episodes, from {of}",
-        )
-        for reason in dict.fromkeys(row["no_interval"] for row in comparison.rows):
-            if reason is not None:
-                say(f"no interval: {reason}")
-
-
-def _check(check: Check, *, decides: bool) -> dict[str, Any]:
-    from restock.errors import verdict_said
-
-    return {
-        "check": check.name,
-        "of": check.part,
-        "first": check.first,
-        "second": check.second,
-        "value": check.value,
-        "interval": f"{check.low:.3g} to {check.high:.3g}",
-        "limit": check.limit,
-        "": verdict_said(check.verdict, decides=decides),
-    }
-
-
-def _outcome(row: dict[str, Any]) -> dict[str, Any]:
-    from restock.stats import interval_text
-
-    low, high = row["difference_low"], row["difference_high"]
-    return {
-        "perturbation": row["perturbation"],
-        "condition": row["condition"],
-        "episodes": row["episodes"],
-        "first": _success(row["success"][0]),
-        "second": _success(row["success"][1]),
-        "difference [95 %]": ("" if row["difference"] is None else f"{row['difference']:+.2f}")
-        + ("" if low is None else f" [{low:+.2f}, {high:+.2f}]"),
-        "P(second better) [95 %]": interval_text(
-            row["improvement"], row["improvement_low"], row["improvement_high"]
-        ),
-    }
-
-
-def _success(value: float | None) -> str:
-    return "no goal" if value is None else f"{value:.2f}"
-
-
-def _sentence(comparison: Comparison) -> str:
-    if comparison.identical:
-        return "COMPARABLE: both sides are the same runs"
-    if comparison.verdict == "comparable":
-        what = {
-            "mixture": "settings, steps",
-            "practice": "settings, steps and the logs' part of the feed",
-            "method": "environment, environment steps and evaluation",
-        }.get(comparison.treatment, "settings, steps and feed")
-        return (
-            f"COMPARABLE: {what} are the same within the limits, except the {comparison.treatment}"
-        )
-    if comparison.refused:
-        names = ", ".join(difference.setting for difference in comparison.refused)
-        return (
-            f"REFUSED: the runs differ in {names}, which is not what --treatment"
-            f" {comparison.treatment} compares"
-        )
-    failed = [check for check in comparison.deciding_checks if check.verdict == comparison.verdict]
-    names = ", ".join(dict.fromkeys(f"{check.name} ({check.part})" for check in failed[:4]))
-    more = f" and {len(failed) - 4} more" if len(failed) > 4 else ""
-    if comparison.verdict == "inconclusive":
-        return (
-            f"REFUSED, inconclusive: too few episodes to show that {names}{more} are the same;"
-            " add seeds to both sides (RUN RUN --against RUN RUN)"
-        )
-    return f"REFUSED: the critics were fed differently in {names}{more}"
+        print_sections(outcome_sections(found, *names))
+    for reason in dict.fromkeys(row["no_interval"] for row in comparison.rows):
+        if reason is not None:
+            say(f"no interval: {reason}")

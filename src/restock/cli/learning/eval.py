@@ -184,20 +184,22 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
 
     A table that is too wide is split, so that no measure is left out.
     """
-    from restock.cli.output import print_parted, say
+    from restock.cli.output import print_parted, reported, say
     from restock.errors import policy_words
+    from restock.train.run.kept_evaluations import measured_row
 
     names = policy_words(row["policy"] for row in rows)
     for perturbation in dict.fromkeys(row["perturbation"] for row in rows):
         own = [row for row in rows if row["perturbation"] == perturbation]
         cells = list(dict.fromkeys(row["condition"] for row in own))
         own.sort(key=lambda row: cells.index(row["condition"]))
-        shown = [_measures_row(row, names[row["policy"]]) for row in own]
-        if not any(row["held back"] for row in shown):
-            for row in shown:
-                del row["held back"]
+        shown = [
+            {"condition": row["condition"], "policy": names[row["policy"]], **measured_row(row)}
+            for row in own
+        ]
         print_parted(
             shown,
+            [name for name in shown[0] if name != "held back" or reported(shown, [name])],
             key=("condition", "policy"),
             title=f"perturbation {perturbation} [95 % over episodes]; time of the successful ones",
         )
@@ -205,33 +207,6 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
         row["time_lost_episodes"] for row in rows
     ):
         say("time lost is not known: add the planner to --policies once")
-
-
-def _measures_row(row: dict[str, Any], policy: str) -> dict[str, Any]:
-    nearest = row["closest_person_least_m"]
-    return {
-        "condition": row["condition"],
-        "policy": policy,
-        "episodes": row["episodes"],
-        "success": "no goal" if row["success"] is None else _with_interval(row, "success", ".2f"),
-        "discounted return": _with_interval(row, "discounted_return", ".2f"),
-        "bumps per km": _with_interval(row, "bumps_per_km", ".1f"),
-        "people, least (mean) m": ""
-        if nearest is None
-        else f"{nearest:.2f} ({row['closest_person_m']:.2f})",
-        "time s": "" if row["time_s"] is None else f"{row['time_s']:.1f}",
-        "lost s": _with_interval(row, "time_lost_s", "+.1f"),
-        "held back": ""
-        if row["limited_share"] is None
-        else f"{row['limited_share']:.0%} ({row['stopped_share']:.0%} to a stop)",
-    }
-
-
-def _with_interval(row: dict[str, Any], name: str, form: str) -> str:
-    from restock.stats import interval_text
-
-    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
-    return "" if value is None else interval_text(value, low, high, form)
 
 
 def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:

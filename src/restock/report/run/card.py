@@ -25,6 +25,45 @@ FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"
 
 
+_FED = {
+    "stratum": "stratum",
+    "natural_share": "natural",
+    "wanted_share": "wanted",
+    "drawn_share": "drawn",
+    "logs_share": "from logs",
+    "fresh_share": "fresh",
+    "short_share": "short",
+    "reason": "why short",
+}
+_CONDITIONS = {
+    "source": "source",
+    "condition": "condition",
+    "drawn_rows": "rows",
+    "drawn_share": "drawn",
+    "effective_share": "after weights",
+    "td_abs_mean": "mean absolute TD error at the end",
+}
+_AGES = {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")}
+_POLICIES = {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"}
+_PRACTICE = {
+    "arm": "missions",
+    "natural_share": "natural",
+    "first_share": "wanted at first",
+    "last_share": "wanted at last",
+    "given_share": "given",
+    "episodes": "ended",
+}
+_TEACHER = {
+    "source": "source",
+    "condition": "condition",
+    "asked_rows": "states",
+    "agreement": "behaviour network as the teacher",
+    "plausible_actions": "plausible actions",
+    "changed": "choice of Q changed",
+    "chosen_agreement": "choice as the teacher",
+}
+
+
 def write_card(run: Path) -> tuple[dict[str, Any], str]:
     """Write the replay card into a run directory; return it as JSON values and as Markdown.
 
@@ -65,18 +104,10 @@ def replay_card(facts: Facts) -> dict[str, Any]:
                 "fresh": settings.get("loss", {}).get("n_step"),
             },
         },
-        "fed": _columns(
-            facts.fed,
-            *("stratum", "natural_share", "wanted_share", "drawn_share", "logs_share"),
-            *("fresh_share", "short_share", "reason", "drawn_rows"),
-        ),
+        "fed": _columns(facts.fed, *_FED, "drawn_rows"),
         "ages": [_ages(facts.ages, *key) for key in _keys(facts.ages, "source", "unit")],
         "target": facts.config.get("target") or settings.get("target"),
-        "conditions": _columns(
-            facts.conditions,
-            *("source", "condition", "drawn_rows", "drawn_share", "effective_share"),
-            "td_abs_mean",
-        ),
+        "conditions": _columns(facts.conditions, *_CONDITIONS),
         "strata": _columns(
             facts.sampled,
             *("source", "stratum", "timing", "available_rows", "quota_share"),
@@ -84,28 +115,18 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         ),
         "practice": {
             "rule": settings.get("practice", {}).get("rule", "natural"),
-            "arms": _columns(
-                by_arm(facts),
-                *("arm", "natural_share", "first_share", "last_share", "given_share"),
-                *("episodes", "success"),
-            ),
+            "arms": _columns(by_arm(facts), *_PRACTICE, "success"),
         },
         "teacher": {
             **{
                 name: teacher.get(name)
                 for name in ("source", "ratio", "target", "policies", "successes", "mirror")
             },
-            "states": _columns(
-                facts.teacher,
-                *("source", "condition", "asked_rows", "agreement", "plausible_actions"),
-                *("changed", "chosen_agreement"),
-            ),
+            "states": _columns(facts.teacher, *_TEACHER),
         }
         if teacher.get("source", "none") != "none"
         else None,
-        "behaviour_policies": _columns(
-            facts.policies, "source", "behaviour_policy", "rows", "share"
-        ),
+        "behaviour_policies": _columns(facts.policies, *_POLICIES),
         "corrections": {
             "rules": mixture.get("correction") if mixture is not None else None,
             "post_strata": [row["stratum"] for row in logs if row["timing"] == "post"],
@@ -124,45 +145,6 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         "imbalance": evaluation_bias(facts) or None,
         "missing": list(facts.missing),
     }
-
-
-_FED = {
-    "stratum": "stratum",
-    "natural_share": "natural",
-    "wanted_share": "wanted",
-    "drawn_share": "drawn",
-    "logs_share": "from logs",
-    "fresh_share": "fresh",
-    "short_share": "short",
-    "reason": "why short",
-}
-_CONDITIONS = {
-    "source": "source",
-    "condition": "condition",
-    "drawn_rows": "rows",
-    "drawn_share": "drawn",
-    "effective_share": "after weights",
-    "td_abs_mean": "mean absolute TD error at the end",
-}
-_AGES = {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")}
-_POLICIES = {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"}
-_PRACTICE = {
-    "arm": "missions",
-    "natural_share": "natural",
-    "first_share": "wanted at first",
-    "last_share": "wanted at last",
-    "given_share": "given",
-    "episodes": "ended",
-}
-_TEACHER = {
-    "source": "source",
-    "condition": "condition",
-    "asked_rows": "states",
-    "agreement": "behaviour network as the teacher",
-    "plausible_actions": "plausible actions",
-    "changed": "choice of Q changed",
-    "chosen_agreement": "choice as the teacher",
-}
 
 
 def as_markdown(card: dict[str, Any]) -> str:
@@ -187,11 +169,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         "Evaluation shown": card["evaluation"],
     }
     off_policy = [
-        {
-            "measure": row["measure"],
-            "estimator": row["estimator"],
-            "value [95 %]": estimate(row),
-        }
+        {**{name: row[name] for name in ("measure", "estimator")}, "value [95 %]": estimate(row)}
         for row in card["off_policy"]
     ]
     tables = {
@@ -267,18 +245,13 @@ def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
         return None
     rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
     by_quota = any(rule.get("share", "natural") != "natural" for rule in rules)
-    if by_quota:
-        return "quotas by stratum, each of its rows alike"
-    return "uniform over the ring"
+    return "quotas by stratum, each of its rows alike" if by_quota else "uniform over the ring"
 
 
 def _drawn_share(facts: Facts, source: str) -> float | None:
     rows = sum(row["drawn_rows"] for row in facts.sampled)
-    return (
-        sum(r["drawn_rows"] for r in facts.sampled if r["source"] == source) / rows
-        if rows
-        else None
-    )
+    of_source = sum(row["drawn_rows"] for row in facts.sampled if row["source"] == source)
+    return of_source / rows if rows else None
 
 
 def _keys(rows: Rows, *names: str) -> list[tuple[Any, ...]]:

@@ -10,7 +10,6 @@ from typing import Any
 from restock.errors import counted, verdict_said
 from restock.report.look import charts
 from restock.report.look.blocks import (
-    MAX_NAMED,
     Figure,
     Rows,
     Section,
@@ -72,7 +71,7 @@ def verdict(found: dict[str, Any]) -> dict[str, str]:
 def headline(found: dict[str, Any], first: str, second: str) -> str:
     """Say where the second differs from the first, by how much and how surely."""
     if found["verdict"] != "comparable":
-        return f"{second} and {first} cannot be compared: {why_refused(found)}"
+        return f"{second} and {first} cannot be compared: {found['why']}"
     rows = [row for row in found["outcomes"] if row["perturbation"] == "none"] or found["outcomes"]
     known = [row for row in rows if row["difference_low"] is not None]
     better = [row for row in known if row["difference_low"] > 0]
@@ -92,30 +91,13 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
     )
 
 
-def why_refused(found: dict[str, Any]) -> str:
-    """Say what the gate found; a study has said it already."""
-    if found.get("why"):
-        return str(found["why"])
-    if found["refused"]:
-        return f"they differ in {', '.join(found['refused'])}, which is not the treatment"
-    names = [
-        words(check["name"])
-        for check in found["checks"]
-        if check["verdict"] == found["verdict"] and check.get("decides", True)
-    ]
-    shown = ", ".join(list(dict.fromkeys(names))[:MAX_NAMED])
-    if found["verdict"] == "inconclusive":
-        return f"too few episodes or seeds to show that they were fed the same ({shown})"
-    return f"their critics were fed differently ({shown})"
-
-
 def outcome_sections(
     found: dict[str, Any], first: str, second: str, prefix: str = ""
 ) -> list[Section | None]:
     """Return the outcomes, or why there are none."""
     title, treatment = f"{second} against {first}", _treatment(found)
     if found["verdict"] != "comparable":
-        text = f"{verdict(found)['text'].capitalize()}: {why_refused(found)}."
+        text = f"{verdict(found)['text'].capitalize()}: {found['why']}."
         return [Section(f"{prefix}outcomes", title, intro=treatment, callout=text)]
     rows = found["outcomes"]
     if not rows:
@@ -238,14 +220,15 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
         {
             "check": words(row["name"]),
             "part": words(row["part"]),
-            "verdict": verdict_said(row["verdict"], decides=row.get("decides", True)),
+            first: _setting(row["first"]),
+            second: _setting(row["second"]),
             "value": number(row["value"]),
             "95 %": _ends(row["low"], row["high"]),
             "limit": f"{row['limit']:g}",
+            "verdict": verdict_said(row["verdict"], decides=row["decides"]),
         }
         for row in sorted(
-            found["checks"],
-            key=lambda row: (not row.get("decides", True), order[row["verdict"]]),
+            found["checks"], key=lambda row: (not row["decides"], order[row["verdict"]])
         )
     ]
     return Section(
@@ -255,14 +238,16 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
         "and what the critics were fed, by equivalence tests. Failed checks come first; what the "
         "treatment allows to differ is shown last, and decides nothing.",
         tables=[
-            Table(differences, title="What differs"),
+            Table(differences, title=f"What differs (treatment: {found['treatment']})"),
             Table(checks, title="What was fed", folded=True),
         ],
     )
 
 
 def _setting(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
 def _ends(low: float | None, high: float | None) -> str:
@@ -375,7 +360,7 @@ def _study_gate(comparisons: Rows) -> Section:
             "baseline": one["baseline"],
             "treatment": one["treatment"],
             "verdict": one["verdict"],
-            **({"why": _why(one)} if any(map(_why, comparisons)) else {}),
+            "why": one["why"],
         }
         for one in comparisons
     ]
@@ -386,10 +371,6 @@ def _study_gate(comparisons: Rows) -> Section:
         "than the treatment, or if there is too little data to decide.",
         tables=[Table(rows)],
     )
-
-
-def _why(one: dict[str, Any]) -> str:
-    return "" if one["verdict"] == "comparable" else why_refused(one)
 
 
 def _contrasts(contrasts: Rows, rare: list[str]) -> Section | None:

@@ -24,6 +24,7 @@ from restock.report.run.floor import films_section, floor_section
 from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
 from restock.stats import interval_text, wilson
+from restock.train.run.kept_evaluations import measured_row
 
 
 def page(facts: Facts) -> dict[str, Any]:
@@ -120,19 +121,9 @@ def success(facts: Facts) -> Section | None:
             "perturbation": row["perturbation"],
             "kind of episode": row["cell"],
             "policy": row["policy"],
-            "success": "no goal"
-            if row["success"] is None
-            else f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]",
-            "episodes": row["episodes"],
-            "discounted return": measured(row, "discounted_return", ".2f"),
-            "bumps per km": measured(row, "bumps_per_km", ".1f"),
-            "least distance to people": measured(row, "closest_person_least_m", ".2f", " m"),
-            "time to goal": measured(row, "time_s", ".1f", " s"),
-            "time lost to the planner": ""
-            if row["policy"] == "planner"
-            else measured(row, "time_lost_s", "+.1f", " s"),
+            **measured_row(row),
         }
-        for row in sorted(shown, key=lambda row: (places[_place(row)], row["policy"] != "agent"))
+        for row in sorted(shown, key=lambda row: (places[_place(row)], row["policy"] != OWN))
         if row["policy"] != "random"
     ]
     tables = [
@@ -165,8 +156,8 @@ def _success_table(perturbation: str, rows: Rows) -> Table:
         shown,
         title="Success, return and safety side by side" + ("" if clean else f": {perturbation}"),
         caption="Intervals are 95 % over episodes. People include forklifts; the distance is "
-        "the true one from the edge of the body. Time lost is over the missions in which "
-        "both arrived."
+        "the true one from the edge of the body. Time lost to the planner is over the missions in "
+        "which both arrived."
         if clean
         else "",
         folded=not clean,
@@ -386,15 +377,7 @@ def ways_section(facts: Facts) -> Section | None:
             "kind of episode": words(row["cell"])
             + ("" if row["perturbation"] == "none" else f", {row['perturbation']}"),
             "policy": names[row["policy"]],
-            "success": interval_text(
-                row["success"], row["success_low"], row["success_high"], ".0%"
-            ),
-            "ways": row["episodes"],
-            "bumps an episode": f"{row['bumps_per_episode']:.2f}",
-            "time to goal": "" if row["time_s"] is None else f"{row['time_s']:.1f} s",
-            "time lost to the planner": ""
-            if row["time_lost_s"] is None or row["policy"] == "planner"
-            else f"{row['time_lost_s']:+.1f} s",
+            **measured_row(row),
         }
         for row in rows
     ]

@@ -23,13 +23,12 @@ from restock.report.run.facts import Facts
 from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import AFTER, BEFORE
 from restock.train.twin.calibration.twin_gap import (
-    DOCUMENT,
-    FOLDER,
     TRUSTED,
     UNDECIDED,
     UNKNOWN,
     UNTRUSTED,
     TwinGap,
+    gap_folder,
     read_gap,
 )
 
@@ -55,16 +54,14 @@ def source_name(source: str) -> str:
 
 def find_gap(facts: Facts) -> TwinGap | None:
     """Find the gap of a run: RUN/gap, or the gap folder of its panel's store."""
-    places = [facts.run / FOLDER]
+    places = [facts.run]
     if facts.panel is not None and "://" not in str(facts.panel.header.store):
-        places.append(Path(facts.panel.header.store) / FOLDER)
-    for place in places:
-        if (place / DOCUMENT).is_file():
-            try:
-                return read_gap(place)
-            except RestockError as error:
-                facts.missing.append(f"Not shown, since it could not be read: {error}")
-    return None
+        places.append(Path(facts.panel.header.store))
+    try:
+        return None if (folder := gap_folder(places)) is None else read_gap(folder)
+    except RestockError as error:
+        facts.missing.append(f"Not shown, since it could not be read: {error}")
+        return None
 
 
 def run_section(facts: Facts) -> Section | None:
