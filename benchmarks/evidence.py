@@ -11,6 +11,7 @@ runs (docs/evidence.md):
     practice      the twin can make it: practice by success, quotas on the logs, both, neither
     archive       the first again, with the incidents in a store of their own, weighted back to the
                   day's rates; and against half of the logged rows from it, as kept
+    novelty       the first again, without the rule of one rare kind: a quota on what is novel
 
 Records what a question needs of the stand-in fleet (a day of hours, and for all but `practice` an
 archive of incident bags) and ingests it, then runs the study. What is there is not done again: the
@@ -44,7 +45,7 @@ from restock.train.study.study import DONE, Study, StudyPlan, load_study
 from restock.train.study.study_run import findings, run_study
 
 HERE = Path(__file__).parent / "evidence"
-QUESTIONS = ("twin-nominal", "lead", "ring", "practice", "archive")
+QUESTIONS = ("twin-nominal", "lead", "ring", "practice", "archive", "novelty")
 RATES = "odom=10,imu=10,scan=5,joint_states=5,amcl_pose=5,tf=5,bumper=5"
 RARE = ("wheel_slip", "blocked_aisle", "near_collision")
 
@@ -81,6 +82,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--hours", type=int, default=24, help="of logs, one recording each")
     parser.add_argument("--workers", type=int, default=1, help="recordings, then runs, at a time")
+    parser.add_argument("--seeds", type=int, help="only the first so many")
     parser.add_argument("--primary", action="store_true", help="only the primary contrast's arms")
     parser.add_argument("--quick", action="store_true", help="a tiny one, to see that it runs")
     options = parser.parse_args()
@@ -93,6 +95,7 @@ def main() -> int:
 
 def _answer(options: argparse.Namespace) -> int:
     study = load_study(HERE / f"{options.question}.toml")
+    study = msgspec.structs.replace(study, seeds=study.seeds[: options.seeds])
     hours = 1 if options.quick else options.hours
     if options.primary or options.quick:
         study = primary_arms(study)

@@ -8,6 +8,7 @@ kept as they come, text as codes in as few bytes as its dictionary needs.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -26,6 +27,7 @@ from restock.ingest.task.condition_sql import not_an_expression, not_repeatable
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.strata import ResolvedStratum
+from restock.replay.store.definitions import install_novelty
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import hint
 
@@ -307,7 +309,7 @@ def read_candidates(
     boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0` …, and `state_0` …
     where the row's state alone has one of its own; text columns come as dictionaries, in order of
     appearance; `store` (int) says which store a row is from. Predicates see `conditions` as the
-    mixture's `uncertain` has them.
+    mixture's `uncertain` has them, and the columns of `novelty`.
 
     Raises:
         ConfigError: a predicate that does not run, or could choose other rows another time.
@@ -337,10 +339,15 @@ def read_candidates(
     )
     store = STORE_COLUMN if several_stores else "0"
     source, has_uncertain = "transitions", "false"
-    if "uncertain" in connection.sql("FROM transitions LIMIT 0").columns:
+    columns = connection.sql("FROM transitions LIMIT 0").columns
+    if "uncertain" in columns:
         has_uncertain = "coalesce(len(uncertain) > 0, false)"
         if mixture.uncertain == "nominal":
             source = f"(SELECT * REPLACE ({_CERTAIN} AS conditions) FROM transitions)"
+    named = re.findall(r"\bnovel(?:ty)?\b", " ".join(sql for _, sql in predicates.values()).lower())
+    if not set(named) <= set(columns):
+        install_novelty(connection)
+        source = f"{source} LEFT JOIN novelty USING (transition_id)"
     query = (
         f"SELECT {meta_columns(connection)}, task_hash, episode_index, ({store})::TINYINT AS store,"
         " coalesce(primary_condition, '') <> '' AND conditions IS NOT NULL AS labelled,"

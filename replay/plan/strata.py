@@ -24,6 +24,8 @@ from restock.replay.mixture.mixture import (
 
 NO_STRATUM = -1
 NOMINAL_PRIORITY = 1000
+NOVEL = "novel"  # a stratum of this name needs no `where`: the column of `novelty`
+NOVEL_PRIORITY = 999  # what no condition names, before nominal
 WHERE_PRIORITY = 50
 
 
@@ -133,6 +135,8 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         states = (c for c in of_kind(known.values(), "outcome") if c.timing == "pre")
         before = ", ".join(f"'{c.name}'" for c in states)
         state_predicate = f"NOT list_has_any(conditions, [{before}]::VARCHAR[])"
+    elif rule.name == NOVEL and NOVEL not in known:
+        predicate, priority, timing = NOVEL, NOVEL_PRIORITY, "pre"
     elif rule.name in known:
         condition = known[rule.name]
         column = "conditions" if condition.kind == "outcome" else "exposures"
@@ -143,8 +147,8 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
             f"stratum {rule.name!r} is not a condition or exposure of this store, and has no "
             "`where`",
             where="mixture",
-            remedy=f"name one of {', '.join([NOMINAL, *sorted(known)])}; or give it a `where`; or"
-            " add it to the profile and run `restock store label`",
+            remedy=f"name one of {', '.join([NOMINAL, NOVEL, *sorted(known)])}; or give it a"
+            " `where`; or add it to the profile and run `restock store label`",
         )
     if rule.unit == "episode":
         # Chosen by what the whole episode met, not by what came of this step.

@@ -318,21 +318,21 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
     """Return what is held of a store of this size."""
-    rows = _rows(connection)
+    rows = stored_rows(connection)
     return [
         *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
         *(HELD if 0 < rows <= FEW_ROWS else ()),
     ]
 
 
-def _rows(connection: duckdb.DuckDBPyConnection) -> int:
+def stored_rows(connection: duckdb.DuckDBPyConnection) -> int:
     """Return how many transitions its files hold."""
     return connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0] or 0
 
 
 def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
     """Return whether it is that of a store without transitions."""
-    return connection in _OF and not _rows(connection)
+    return connection in _OF and not stored_rows(connection)
 
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
@@ -362,6 +362,16 @@ def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
         install_named(connection, "repeated_rows")
     else:
         connection.execute(definitions(names=["shared_rows.sql", "repeated_rows.sql"]))
+
+
+def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
+    """Create the table `novelty`, over any `transitions`; that of a store may have kept it."""
+    if connection in _OF:
+        install_named(connection, "novelty")
+    else:
+        from restock.replay.store.novelty import read_novelty  # pyarrow.compute is slow to import
+
+        connection.register("novelty", read_novelty(connection))
 
 
 def _of_store(observation_type: str, names: Sequence[str]) -> str:

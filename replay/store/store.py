@@ -158,7 +158,8 @@ class Store:
             self.bare,
             self.observation_type,
             summaries=summaries,
-            replaced={SHARED: self._install_shared_rows} if summaries else {},
+            replaced={("novelty",): self._install_novelty}
+            | ({SHARED: self._install_shared_rows} if summaries else {}),
         )
 
     def __enter__(self) -> Store:
@@ -385,6 +386,17 @@ class Store:
         recordings = {one["ingest_id"]: one["recording_id"] for one in held}
         rows = sum(one["rows"] for one in held)
         install_shared_rows(self.bare, self._summaries.row_groups, recordings, rows)
+
+    def _install_novelty(self) -> None:
+        """Put what is measured, now or when a query first asked, in place of the view `novelty`."""
+        from restock.replay.store.novelty import kept_novelty  # pyarrow.compute is slow to import
+
+        self.bare.register("found_novelty", kept_novelty(self))
+        self.bare.execute(
+            "CREATE TABLE stored_novelty AS FROM found_novelty;"
+            " CREATE OR REPLACE VIEW novelty AS FROM stored_novelty"
+        )
+        self.bare.unregister("found_novelty")
 
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """Make `stored_ingests`, what the files hold, and a view `stored_…` of each table.

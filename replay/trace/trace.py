@@ -20,6 +20,7 @@ from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
+from restock.replay.store.novelty import strangest
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store, is_store
 from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_of, sql_file
@@ -71,15 +72,22 @@ def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None
     return trace
 
 
-def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
-    """Return a run's audited rows with the largest TD errors, with the names `trace_row` takes."""
-    if not (Path(run) / RUN_CONFIG).is_file():
+def listed_rows(place: str | Path, limit: int = 20) -> list[dict[str, Any]]:
+    """Return a run's audited rows with the largest TD errors, or the strangest rows of a store.
+
+    Each has its name for `trace_row`, `row`.
+    """
+    run = Path(place)
+    if not (run / RUN_CONFIG).is_file():
+        if is_store(location := Location.of(place)):
+            with Store(location) as store:
+                return strangest(store, limit)
         raise RunError(
-            "is not a run: rows can be listed for a run only",
-            where=str(run),
-            remedy="give ROW: a row number of a panel, or a transition id of a store",
+            "is not a run or a store: rows can be listed for these only",
+            where=str(place),
+            remedy="give ROW, a row number of a panel",
         )
-    table = _run_table(Path(run), "audit")
+    table = _run_table(run, "audit")
     with duckdb.connect() as connection, passed_in(connection, audit=table):
         return rows_of(connection, sql_file("trace_rows.sql"), {"limit": limit})
 

@@ -26,7 +26,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.replay.trace.trace import audited_rows, trace_row
+from restock.replay.trace.trace import listed_rows, trace_row
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 MIXTURE = parse_mixture(
@@ -171,7 +171,7 @@ def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places):
 
 
 def test_audited_rows_are_listed_by_their_error(places):
-    assert [row["row"] for row in audited_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
+    assert [row["row"] for row in listed_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
 
 
 def test_a_row_of_the_panel_can_be_followed_too(places):

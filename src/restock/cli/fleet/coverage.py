@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ExitCode, figure
+from restock.errors import ExitCode, figure, quoted
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
@@ -47,6 +47,7 @@ class CoverageCommand:
         from restock.cli.command_line import refuse
         from restock.errors import by_priority, uncertain_labels
         from restock.files import expect_file_place
+        from restock.replay.store.novelty import at_hand, novel_rows, novel_rows_said
         from restock.replay.store.store import Store
 
         if self.out is None:
@@ -57,15 +58,21 @@ class CoverageCommand:
             output.say_unverified(store)
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             order = store.priority()
+            novel = novel_rows(store) if self.out or at_hand(store) else None
             if self.out is not None:
                 with output.progress("page", 3) as advance:
                     page = self._write(store, self.out, advance)
                 output.say(f"wrote {page}")
+        known = [] if novel is None else [novel]
         if self.json:
-            output.print_json(rows)
+            output.print_json(rows + known)
         else:
-            output.print_table([_line(row) for row in rows], title="rows that hold each condition")
+            lines = [_line(row) for row in rows + known]
+            output.print_table(lines, title="rows that hold each condition")
             output.print_text(by_priority(order))
+            said = "Novelty was not measured yet." if novel is None else novel_rows_said(novel)
+            said += f" `restock trace {quoted(self.store)}` lists the strangest rows."
+            output.print_text(said)
             if guessed := {r["condition"]: n for r in rows if (n := r["uncertain_recordings"])}:
                 said = uncertain_labels(guessed, max(guessed.values()))
                 output.print_text(said)
@@ -116,7 +123,7 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
         "zones": row["zones"],
         "recordings": row["recordings"],
         "who drove": ", ".join(str(name) for name in row["behaviour_policies"] or () if name),
-        "by priority": row["primary_rows"],
+        "by priority": row.get("primary_rows", ""),
     }
 
 

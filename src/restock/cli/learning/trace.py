@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 _LONG = 6  # entries of a list that are printed
 # Columns of audited rows on a narrow terminal; `row` shows the others.
-_NARROW = ("row", "source", "condition", "age_days", "action", "reward", "q", "td")
+_NARROW = (
+    *("row", "source", "novelty", "condition", "strange"),
+    *("age_days", "action", "reward", "q", "td"),
+)
 _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
 
 
@@ -25,12 +28,14 @@ _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and 
 class TraceCommand:
     """Trace a sampled row to its source, down to the recording's messages.
 
-    For a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. Without
-    ROW, the audited rows with the largest TD errors are listed. For a PANEL, ROW is a row number;
-    for a STORE, a transition id. It shows the audited row, the row of the panel and of the store
-    from which it was drawn, the recording and the time in it, and the messages of a given recording
-    that were held at that tick. For a fresh row, it shows the episode in the twin, and the spec
-    that generates it again.
+    For a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. For a
+    PANEL, ROW is a row number; for a STORE, a transition id. It shows the audited row, the row of
+    the panel and of the store from which it was drawn, the recording and the time in it, and the
+    messages of a given recording that were held at that tick. For a fresh row, it shows the episode
+    in the twin, and the spec that generates it again.
+
+    Without ROW, it lists rows: of a RUN, the audited ones with the largest TD errors; of a STORE,
+    the strangest of twenty episodes, with what is strange about each.
 
     A view is an MCAP file of five seconds before and after the row: the store's columns of each
     step, labels, the critic's value and TD error, and, if the recording is given, scans, plans and
@@ -55,19 +60,18 @@ class TraceCommand:
     def run(self) -> None:
         """Trace, and print what was found."""
         from restock.cli import output
-        from restock.replay.trace.trace import audited_rows, trace_row
+        from restock.replay.trace.trace import listed_rows, trace_row
 
         self._check_view()
         if self.row is None:
-            listed = audited_rows(self.place)
+            listed = listed_rows(self.place)
             if self.json:
                 output.print_json(listed)
                 return
             narrow = sys.stdout.isatty() and output.too_wide(listed)
-            columns = _NARROW if narrow else None
-            output.print_parted(
-                listed, columns, key=("row",), title="audited rows, largest TD error first"
-            )
+            columns = [name for name in _NARROW if name in listed[0]] if narrow else None
+            first = "strangest" if listed and "novelty" in listed[0] else "largest TD error"
+            output.print_parted(listed, columns, key=("row",), title=f"rows, {first} first")
             if narrow:
                 output.say("more columns are shown in a wider terminal, a file or a pipe")
             if listed:
@@ -99,7 +103,7 @@ class TraceCommand:
             raise ConfigError(
                 "needs one row",
                 where="--view",
-                remedy=f"give ROW; for a run, `restock trace {quoted(self.place)}` lists some rows",
+                remedy=f"give ROW: `restock trace {quoted(self.place)}` lists some of them",
             )
 
     def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:

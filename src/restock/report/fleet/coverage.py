@@ -8,10 +8,11 @@ from typing import Any
 import altair as alt
 from markupsafe import Markup
 
-from restock.errors import by_priority, counted, figure, plural, uncertain_labels
+from restock.errors import by_priority, counted, figure, plural, quoted, uncertain_labels
 from restock.replay.fleet.drift import Drift
 from restock.replay.fleet.shopping_list import readable
 from restock.replay.store.definitions import install_named
+from restock.replay.store.novelty import novel_rows, novel_rows_said, strangest
 from restock.replay.store.store import Store
 from restock.report.fleet.drift import drift_sections
 from restock.report.look import charts, floor_map
@@ -45,6 +46,7 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     bounds["cell_m"] = cell_m
     found["visited"] = ask(store.connection, sql["visited"], cell_m=cell_m)
     found["rare"] = ask(store.connection, sql["rare"], most=MAX_DOTS)
+    found["novel"], found["strangest"] = [novel_rows(store)], strangest(store)
     found["priority"] = [{"condition": name} for name in store.priority()]
     return found
 
@@ -65,6 +67,7 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
     sections = [
         _shelves(found["shelves"], in_words, once),
         shopping_section(gaps),
+        _strangest(found, gaps["store"]),
         _weeks(found["weeks"], in_words, once),
         _robots(found["robots"]),
         _map(found, colours),
@@ -192,6 +195,32 @@ def _bars(rows: Rows, colours: dict[str, str]) -> Drawing:
         return alt.layer(bars, texts).properties(height=30 * len(names))
 
     return charts.draw(chart)
+
+
+def _strangest(found: dict[str, Rows], place: str) -> Section | None:
+    if not (rows := found["strangest"]):
+        return None
+    shown = [
+        {
+            "row": row["row"],
+            "novelty": f"{row['novelty']:.2f}",
+            "what is strange": row["strange"],
+            "condition": words(row["condition"]),
+            "zone": row["zone"] or "",
+            "robot": row["robot"] or "",
+            "logged": f"{row['logged_time']:%Y-%m-%d %H:%M:%S}",
+            "recording": row["source_file"],
+        }
+        for row in rows
+    ]
+    return Section(
+        "strangest",
+        "What does no rule name?",
+        intro=f"{novel_rows_said(found['novel'][0])} These are the strangest, one an episode, with"
+        " the entries of the observation that are furthest from the nearest rows (their mean)."
+        f" `restock trace {quoted(place)} ROW` follows one to its recording.",
+        tables=[Table(shown)],
+    )
 
 
 def _weeks(rows: Rows, colours: dict[str, str], once: str) -> Section | None:

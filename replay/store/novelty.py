@@ -1,0 +1,231 @@
+"""Novelty: how far an observation is from those of other episodes. It finds what no rule names.
+
+A row's novelty is the mean distance from its observation, as the task scales it, to the NEAREST of
+REFERENCE rows of the task, without those of the row's own episode. The reference is drawn by ids,
+so neither files nor threads change it. Because it is bounded, the cost grows with the rows alone,
+and the nearest are always the same part of all driving: what is rare stays strange, however many
+rows a store has of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from restock.arrays import F32, Ints
+from restock.errors import StoreError
+from restock.replay.store.definitions import stored_rows
+from restock.replay.store.parquet_views import passed_in
+
+if TYPE_CHECKING:
+    from restock.replay.store.store import Store
+
+REFERENCE = 2_000  # rows of each task that others are compared with
+NEAREST = 10  # of them
+NOVEL_SHARE = 0.01  # of a task's rows are `novel`, those of the largest novelty
+QUICK_ROWS = 100_000  # measured within seconds
+KEPT = "novelty.parquet"  # in a store: the table `novelty` of the files that it names
+_BATCH_ROWS = 65_536
+_AT_A_TIME = 512  # rows that are compared
+_ENTRIES = 3  # of an observation that are named as what is strange about it
+_COLUMNS = "task_hash, episode_id, transition_id, observation"
+# The order of `hash` may change with DuckDB's version.
+_REFERENCE = f"""
+    SELECT {_COLUMNS}
+    FROM transitions
+    WHERE transition_id IN (
+        SELECT unnest(
+            arg_min(transition_id, md5_number_lower(transition_id::VARCHAR), {REFERENCE})
+        )
+        FROM transitions
+        GROUP BY task_hash
+    )
+    ORDER BY transition_id
+"""
+_MEASURED = pa.schema({"task": pa.int16(), "transition_id": pa.int64(), "novelty": pa.float32()})
+_NOVELTY = f"""
+    SELECT transition_id, novelty, novelty > threshold AS novel
+    FROM measured
+    JOIN (
+        SELECT task, quantile_cont(novelty, {1 - NOVEL_SHARE}) AS threshold
+        FROM measured
+        GROUP BY task
+    ) USING (task)
+    ORDER BY transition_id
+"""
+_NOVEL_ROWS = """
+    SELECT
+        'novel' AS condition,
+        'pre' AS timing,
+        count(*) AS rows_held,
+        count(*) / nullif((SELECT count(*) FROM novelty), 0) AS held_share,
+        count(DISTINCT episode_id) AS episodes_held,
+        (count(DISTINCT episode_id) FILTER (WHERE success))
+            / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0)
+            AS success_share,
+        count(DISTINCT recording_id) AS recordings,
+        count(DISTINCT zone) AS zones,
+        list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
+        count(*) FILTER (WHERE len(conditions) = 0) AS nominal_rows,
+        0 AS uncertain_recordings
+    FROM transitions
+    JOIN (SELECT transition_id FROM novelty WHERE novel) USING (transition_id)
+    JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
+"""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """R rows of one task that others are compared with."""
+
+    observation: F32  # (R, D)
+    episodes: pa.Array  # ids
+    episode: Ints  # (R,) index into them
+
+    @classmethod
+    def of(cls, rows: pa.Table) -> Reference:
+        coded = rows["episode_id"].combine_chunks().dictionary_encode()
+        return cls(_observations(rows), coded.dictionary, coded.indices.to_numpy())
+
+    def compare(self, observation: F32, episode_id: pa.Array) -> tuple[Ints, F32]:
+        """Return the nearest rows of other episodes, (N, NEAREST), and the novelty, (N,).
+
+        The novelty is NaN if there are not so many.
+        """
+        near = np.zeros((len(observation), NEAREST), np.int64)
+        novelty = np.full(len(observation), np.nan, np.float32)
+        if len(self.observation) < NEAREST:
+            return near, novelty
+        own = pc.index_in(episode_id, value_set=self.episodes).fill_null(-1).to_numpy()
+        square = np.square(self.observation).sum(axis=1)
+        for begin in range(0, len(observation), _AT_A_TIME):
+            part = slice(begin, begin + _AT_A_TIME)
+            # Squared distances, but for a number of each row: (n, R).
+            distance = square - 2 * (observation[part] @ self.observation.T)
+            distance[own[part, None] == self.episode] = np.inf
+            found = np.argpartition(distance, NEAREST - 1, axis=1)[:, :NEAREST]
+            found.sort(axis=1)  # the sum must not depend on how they were found
+            gap = observation[part, None] - self.observation[found]
+            near[part] = found
+            novelty[part] = np.linalg.norm(gap, axis=2).mean(axis=1)
+            lacking = np.isinf(np.take_along_axis(distance, found, axis=1)).any(axis=1)
+            novelty[part][lacking] = np.nan
+        return near, novelty
+
+
+def read_novelty(connection: duckdb.DuckDBPyConnection) -> pa.Table:
+    """Return `transition_id`, `novelty` and `novel` of each of the connection's `transitions`."""
+    references = _read_references(connection)
+    measured = [_MEASURED.empty_table()]
+    rows = connection.sql(f"SELECT {_COLUMNS} FROM transitions").to_arrow_reader(_BATCH_ROWS)
+    for batch in rows:
+        for number, (task, reference) in enumerate(references.items()):
+            part = batch.filter(pc.equal(batch["task_hash"], task))
+            _, novelty = reference.compare(_observations(part), part["episode_id"])
+            # A copy: any column of DuckDB's batch holds all of it, observations too.
+            ids = part["transition_id"].to_numpy().copy()
+            known = pa.array(novelty, from_pandas=True)  # NaN is null
+            arrays = [pa.repeat(pa.scalar(number, pa.int16()), len(ids)), pa.array(ids), known]
+            measured.append(pa.table(arrays, schema=_MEASURED))
+    with passed_in(connection, measured=pa.concat_tables(measured)):
+        return connection.sql(_NOVELTY).to_arrow_table()
+
+
+def kept_novelty(store: Store) -> pa.Table:
+    """Return what `read_novelty` does, from the store if it was measured of the same files.
+
+    Else measure it, and keep it in the store if that can be written.
+    """
+    if _is_kept(store):
+        return store.path.read(KEPT)
+    table = read_novelty(store.connection).replace_schema_metadata(_mark(store))
+    with suppress(OSError, StoreError):
+        store.path.write(table, KEPT)
+    return table
+
+
+def at_hand(store: Store) -> bool:
+    """Return whether the novelty of its rows was measured, or is within seconds."""
+    return stored_rows(store.bare) <= QUICK_ROWS or _is_kept(store)
+
+
+def _is_kept(store: Store) -> bool:
+    with suppress(OSError, StoreError, pa.ArrowException):
+        return bool(store.path.read_schema(KEPT).metadata == _mark(store))
+    return False
+
+
+def _mark(store: Store) -> dict[bytes, bytes]:
+    of = repr((REFERENCE, NEAREST, NOVEL_SHARE, sorted(store.files["stored_transitions"])))
+    return {b"of": blake2b(of.encode(), digest_size=16).hexdigest().encode()}
+
+
+def strangest(store: Store, limit: int = 20) -> list[dict[str, Any]]:
+    """Return the rows of the largest novelty, at most one an episode, the strangest first.
+
+    `strange` names the entries of the observation that are furthest from the nearest rows, each
+    with its value and their mean.
+    """
+    rows = store.sql(
+        "SELECT transition_id::VARCHAR AS row, round(novelty::DOUBLE, 2) AS novelty, '' AS strange,"
+        " primary_condition AS condition, zone, robot, logged_time, source_file, step_index,"
+        " task_hash, episode_id, observation"
+        " FROM transitions JOIN novelty USING (transition_id) WHERE novelty.novelty IS NOT NULL"
+        " QUALIFY row_number() OVER"
+        " (PARTITION BY episode_id ORDER BY novelty.novelty DESC, transition_id) = 1"
+        f" ORDER BY novelty.novelty DESC, transition_id LIMIT {limit}"
+    ).to_arrow_table()
+    references = _read_references(store.connection)
+    found: list[dict[str, Any]] = rows.drop_columns(["observation"]).to_pylist()
+    for number, row in enumerate(found):
+        task, one = row.pop("task_hash"), rows.slice(number, 1)
+        (observed,) = observation = _observations(one)
+        near, _ = references[task].compare(observation, one["episode_id"])
+        usual = references[task].observation[near[0]].mean(axis=0)
+        names = store.task(task).observation_names
+        furthest = np.argsort(-np.abs(observed - usual), kind="stable")[:_ENTRIES]
+        row["strange"] = ", ".join(
+            f"{names[entry]} {observed[entry]:.2f} (near: {usual[entry]:.2f})" for entry in furthest
+        )
+    return found
+
+
+def novel_rows(store: Store) -> dict[str, Any]:
+    """Return a line for the novel rows, as `coverage_by_condition` has one for each condition.
+
+    `nominal_rows` are those of them in which no condition holds.
+    """
+    (line,) = store.sql(_NOVEL_ROWS).to_arrow_table().to_pylist()
+    return dict(line)
+
+
+def novel_rows_said(found: Mapping[str, Any]) -> str:
+    """Say what a line of `novel_rows` means."""
+    return (
+        f"Novel are the {NOVEL_SHARE:.0%} of the rows whose observations are furthest from those of"
+        f" other episodes: {found['nominal_rows']:,} of {found['rows_held']:,} hold no condition."
+    )
+
+
+def _read_references(connection: duckdb.DuckDBPyConnection) -> dict[str, Reference]:
+    """Return the reference of each task."""
+    rows = connection.sql(_REFERENCE).to_arrow_table()
+    tasks = rows["task_hash"].unique().to_pylist()
+    return {task: Reference.of(rows.filter(pc.equal(rows["task_hash"], task))) for task in tasks}
+
+
+def _observations(rows: pa.Table | pa.RecordBatch) -> F32:
+    """Return the observations of one task's rows, (N, D)."""
+    column = rows["observation"]
+    lists = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    flat = lists.flatten().to_numpy(zero_copy_only=False)
+    observation: F32 = flat.reshape(len(rows), -1) if len(rows) else np.empty((0, 1), np.float32)
+    return observation
