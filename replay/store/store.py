@@ -391,7 +391,10 @@ class Store:
         """Put what is measured, now or when a query first asked, in place of the view `novelty`."""
         from restock.replay.store.novelty import kept_novelty  # pyarrow.compute is slow to import
 
-        self.bare.register("found_novelty", kept_novelty(self))
+        try:
+            self.bare.register("found_novelty", kept_novelty(self))
+        except duckdb.Error as error:
+            raise damage(error, where=str(self.path)) or error from error
         self.bare.execute(
             "CREATE TABLE stored_novelty AS FROM found_novelty;"
             " CREATE OR REPLACE VIEW novelty AS FROM stored_novelty"

@@ -165,6 +165,7 @@ def store_verbs(store: Path, out: Path) -> list[list[str]]:
     path = str(store)
     return [
         ["sql", path, "SELECT sum(reward), count(conditions) FROM transitions, coverage"],
+        ["sql", path, "SELECT avg(novelty) FROM novelty"],
         ["audit", path],
         ["audit", path, "--capacity"],
         ["mix", path, "--mixture", "coverage", "--out", str(out / "panel")],
@@ -184,7 +185,7 @@ def test_a_store_with_a_damaged_file_is_said(table, how, root, tmp_path, capsys)
         file.write_bytes(content[:8] + bytes(byte ^ 0x55 for byte in content[8:40]) + content[40:])
     else:
         damage(file, how)
-    codes = [check(argv, store, capsys) for argv in store_verbs(store, tmp_path)[:5]]
+    codes = [check(argv, store, capsys) for argv in store_verbs(store, tmp_path)[:6]]
     assert 2 in codes
     if how != "a page":
         assert set(codes) == {2}
