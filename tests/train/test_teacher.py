@@ -373,17 +373,6 @@ def test_a_kept_policy_comes_back_with_its_filter(taught: Any) -> None:
     policy.load_state_dict(weights)
     assert isinstance(policy, FilteredNetwork)
     assert float(policy.ratio) == 0.5
-    learner = Learner(taught.config, TASK.observation_size, len(TASK.actions))
-    assert learner.behaviour is not None
-    learner.behaviour.in_force = 0.25
-    learner.take_over(weights)
-    assert learner.behaviour.in_force == 0.25  # the run's own
-    for one, other in (
-        (learner.network, policy.values),
-        (learner.behaviour.network, policy.behaviour),
-    ):
-        for name, value in one.state_dict().items():
-            assert torch.equal(value, other.state_dict()[name]), name
 
 
 def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:

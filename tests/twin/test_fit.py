@@ -40,7 +40,11 @@ from restock.train.twin.calibration.open_loop import (
     replay_segments,
     split_at,
 )
-from restock.train.twin.physics.perturbation import Perturbation, load_perturbation, load_schedule
+from restock.train.twin.physics.perturbation import (
+    Perturbation,
+    find_perturbation,
+    load_perturbation,
+)
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 
 BAGS = SHARED
@@ -212,7 +216,7 @@ def test_a_schedule_of_several_fits_spans_what_all_identified(tmp_path: Path) ->
     fits = [one(0.9, True), one(0.96, False)]
     assert fleet_schedule(fits).ranges == {"gain": (0.9, 0.96)}
     write_fit(tmp_path / "fleet.toml", fits)
-    assert load_schedule(tmp_path / "fleet.toml") == fleet_schedule(fits)
+    assert find_perturbation(str(tmp_path / "fleet.toml"), where="test") == fleet_schedule(fits)
 
 
 def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: LoggedSegments) -> None:

@@ -20,7 +20,7 @@ from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation, load_schedule
+from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation, find_perturbation
 
 
 def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:
@@ -284,7 +284,7 @@ def test_every_shipped_perturbation_drives(name: str) -> None:
 def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text('name = "fleet"\n[ranges]\npayload_kg = [0, 50]\nlatency_s = [0.05, 0.2]\n')
-    schedule = load_schedule(path)
+    schedule = find_perturbation(str(path), where="test")
     made = WarehouseVectorEnv(8, perturbation=schedule)
     _, info = made.reset(seed=4)
     assert set(info["perturbation"]) == {"fleet"}
@@ -302,7 +302,7 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
     np.testing.assert_array_equal(made.perturbation_name, again.perturbation_name)
     path.write_text("[ranges]\npayload_kg = [0, 500]\n")
     with pytest.raises(ConfigError, match=r"payload_kg must rise within \[0, 150\]"):
-        load_schedule(path)
+        find_perturbation(str(path), where="test")
 
 
 @pytest.mark.parametrize(

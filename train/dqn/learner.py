@@ -7,7 +7,7 @@ that the config, metrics and checkpoints of a run all carry.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -219,19 +219,6 @@ class Learner(Stateful):
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the best action (N,) of each observation (N, D), among the plausible ones."""
         return greedy_actions(self._acting, observation)
-
-    def take_over(self, weights: Mapping[str, Tensor]) -> None:
-        """Copy a kept policy's weights into all networks, and reset Adam's moments."""
-        ratio = None if self.behaviour is None else self.behaviour.in_force
-        self.policy.load_state_dict(weights)
-        kept = self.policy_network.state_dict()
-        for network in (self.network, self.target_network):
-            network.load_state_dict(kept)
-        self.optimizer.forget()
-        if self.behaviour is not None and ratio is not None:
-            self.behaviour.in_force = ratio  # the run's, not that of when the policy was kept
-            self.behaviour.network.load_state_dict(self.behaviour.average.state_dict())
-            self.behaviour.optimizer.forget()
 
 
 class TargetUpdate(Stateful):

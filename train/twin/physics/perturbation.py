@@ -119,15 +119,6 @@ def is_schedule(where: str) -> ConfigError:
     )
 
 
-def load_schedule(path: Path) -> Schedule:
-    """Read a schedule from TOML: `[ranges]` with `field = [low, high]`, and `[base]`.
-
-    Raises:
-        ConfigError: as `load_perturbation`.
-    """
-    return typed(read_toml(path), Schedule, where=str(path), remedy=_FIELDS)
-
-
 def find_perturbation(given: str | Mapping[str, Any], *, where: str) -> Perturbation | Schedule:
     """Return a perturbation from a built-in name, a TOML file or a table.
 
