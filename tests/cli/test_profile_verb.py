@@ -1,26 +1,15 @@
 """`restock profile`: what it says of data that was lost, and the exit codes."""
 
 import json
-import os
-from pathlib import Path
 
-import pytest
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import Drive, cut_bag, write_bag
 
 from restock import cli
 
 
-@pytest.fixture
-def cut(tmp_path: Path) -> Path:
-    """Return a recording that is cut short in the middle."""
-    bag = write_bag(Drive(), tmp_path / "bags" / "cut", storage="mcap")
-    (file,) = bag.glob("*.mcap")
-    os.truncate(file, int(0.8 * file.stat().st_size))
-    return bag
-
-
-def test_losses_are_reported_by_new_and_by_check(tmp_path, cut, capsys):
+def test_losses_are_reported_by_new_and_by_check(tmp_path, capsys):
     """Of a bag whose ingest ended with 3, `new` said nothing, and both ended with 0."""
+    cut = cut_bag(tmp_path / "bags" / "cut")
     file = tmp_path / "robot.toml"
     assert cli.main(["profile", "new", str(cut), "--out", str(file), "--salvage"]) == 3
     said = capsys.readouterr().err

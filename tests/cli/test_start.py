@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.driven_robot import Drive, up_to_the_panel, write_bag
+from support.driven_robot import Drive, start, up_to_the_panel, write_bag
 from support.long import one_in
 
 from restock import cli
@@ -84,12 +84,6 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, bag: Path) -> 
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(RestockError, match="not made by `restock start`"):
         way(tmp_path, Verbs(), bag)
-
-
-def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
-    """Return the exit code, and the document."""
-    code = cli.main(["start", *argv, "--json"])
-    return code, json.loads(capsys.readouterr().out)
 
 
 def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, capsys):

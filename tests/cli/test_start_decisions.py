@@ -1,25 +1,17 @@
 """What `restock start` decides between its stages, and what it says of it at the end."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.driven_robot import Drive, up_to_the_panel, write_bag
+from support.driven_robot import Drive, start, up_to_the_panel, write_bag
 from support.profile_texts import WAREHOUSE
 
-from restock import cli
 from restock.cli.start.decisions import fit_is_worse, node_refuses
 from restock.errors import ConfigError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import load_profile
-
-
-def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
-    """Return the exit code, and the document."""
-    code = cli.main(["start", *argv, "--json"])
-    return code, json.loads(capsys.readouterr().out)
 
 
 def test_a_worse_fit_is_reported_with_its_figures() -> None:

@@ -1,7 +1,5 @@
 """What `restock start` takes beside recordings: damaged ones, definitions, tags, a URDF, a map."""
 
-import json
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,9 @@ import pytest
 from support.driven_robot import (
     Drive,
     columns,
+    cut_bag,
     scans,
+    start,
     typed_topics,
     up_to_the_panel,
     write_bag,
@@ -39,27 +39,13 @@ from restock.train.twin.missions import DEFAULT_CONDITIONS
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
 
 
-def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
-    """Return the exit code, and the document."""
-    code = cli.main(["start", *argv, "--json"])
-    return code, json.loads(capsys.readouterr().out)
-
-
 def commands(document: Any) -> dict[str, str]:
     return {stage["name"]: stage["command"] for stage in document["stages"]}
 
 
-@pytest.fixture
-def damaged(tmp_path: Path) -> Path:
-    """Return a recording that is cut short in the middle."""
-    bag = write_bag(Drive(), tmp_path / "bags" / "damaged", storage="mcap")
-    (file,) = bag.glob("*.mcap")
-    os.truncate(file, int(0.8 * file.stat().st_size))
-    return bag
-
-
-def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, damaged, capsys):
+def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, capsys):
     """And its map of another frame stops it at the floor."""
+    damaged = cut_bag(tmp_path / "bags" / "damaged")
     out, hall = tmp_path / "out", tmp_path / "hall.yaml"
     write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
     hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [200.0, -2.0, 0]\n")
