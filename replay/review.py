@@ -538,3 +538,13 @@ def _of_events(part: int, whole: int) -> ConfidenceInterval:
 def reliability(store: Store) -> pa.Table:
     """Return the view `label_reliability`: how often labels of each probability are true."""
     return store.sql("FROM label_reliability").to_arrow_table()
+
+
+def reliability_rows(bins: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each condition: the true share of steps by tenths of probability."""
+    rows: dict[str, dict[str, Any]] = {}
+    for one in bins:
+        row = rows.setdefault(one["condition"], {"condition": one["condition"]})
+        row |= {f"{tenth / 10:g}+": row.get(f"{tenth / 10:g}+", "") for tenth in range(10)}
+        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
+    return list(rows.values())

@@ -90,8 +90,8 @@ MAY_IMPORT = {
     "report": "look run fleet",
     "report/look": "train/twin/missions",
     "report/run": (
-        "look replay/panel replay/plan replay/sampling replay/store train/evaluation train/judge"
-        " train/run train/twin/calibration train/twin/floors"
+        "look replay replay/panel replay/plan replay/sampling replay/store train/evaluation"
+        " train/judge train/run train/twin/calibration train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/store",
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",

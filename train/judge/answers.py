@@ -208,20 +208,8 @@ def _on_ice(rows: FedRows, moves: F64) -> Bools:
     return np.asarray((slipped & ice[recording])[episode], np.bool_)
 
 
-def _speed(rows: FedRows) -> F64:
-    return rows.after("wheel_speed")
-
-
-def _gyro(rows: FedRows) -> F64:
-    return rows.after("gyro_yaw_rate")
-
-
 def _wheel_turn(rows: FedRows) -> F64:
     return rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
-
-
-def _pose_speed(rows: FedRows) -> F64:
-    return rows.after("localised_speed")
 
 
 def _gained(rows: FedRows) -> F64:
@@ -272,25 +260,25 @@ def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
 
 RELATIONS = (
     Relation("speed of the wheels to the action", ACTION_SPEED, WHEEL_SPEED, COMMANDS,
-             lambda rows: (rows.command()[:, 0], _speed(rows))),
+             lambda rows: (rows.command()[:, 0], rows.after("wheel_speed"))),
     Relation("speed of the pose to the action", ACTION_SPEED, POSE, COMMANDS,
-             lambda rows: (rows.command()[:, 0], _pose_speed(rows))),
+             lambda rows: (rows.command()[:, 0], rows.after("localised_speed"))),
     Relation("yaw rate of the gyroscope to the action", ACTION_TURN, GYROSCOPE, COMMANDS,
-             lambda rows: (rows.command()[:, 1], _gyro(rows))),
+             lambda rows: (rows.command()[:, 1], rows.after("gyro_yaw_rate"))),
     Relation("yaw rate of the wheels to the action", ACTION_TURN, WHEEL_TURN, COMMANDS,
              lambda rows: (rows.command()[:, 1], _wheel_turn(rows))),
     Relation("speed of the pose to the wheels", WHEEL_SPEED, POSE, SENSORS,
-             lambda rows: (_speed(rows), _pose_speed(rows))),
+             lambda rows: (rows.after("wheel_speed"), rows.after("localised_speed"))),
     Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
-             lambda rows: (_gyro(rows), _wheel_turn(rows))),
+             lambda rows: (rows.after("gyro_yaw_rate"), _wheel_turn(rows))),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
              lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
-             lambda rows: (_gyro(rows), _turned_waypoint(rows)), None),
+             lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), None),
     Relation("way to go to the speed of the pose", POSE, PLAN, SENSORS,
-             lambda rows: (_pose_speed(rows), _route_speed(rows)), None),
+             lambda rows: (rows.after("localised_speed"), _route_speed(rows)), None),
     Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
-             lambda rows: _scan_flow(rows, _gyro(rows)), None),
+             lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), None),
     Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, NOW,
              lambda rows: _scan_flow(rows, _wheel_turn(rows)), None),
 )  # fmt: skip
@@ -419,8 +407,7 @@ def held_motion(rows: FedRows) -> list[F64]:
     for lag in range(1, HELD):
         place, known = rows.before(lag)
         held &= known & (rows.action[place] == rows.action)
-    turn = rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
-    motion = np.stack([rows.after("wheel_speed"), turn], axis=1)
+    motion = np.stack([rows.after("wheel_speed"), _wheel_turn(rows)], axis=1)
     return [motion[held & (rows.action == action)] for action in range(len(rows.task.actions))]
 
 

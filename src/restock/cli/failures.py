@@ -36,64 +36,51 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
     """Turn any exception into a RestockError; print its traceback if the environment asks."""
     print_traceback(error)
     where = f"restock {' '.join(args)}"
+
+    def known(what: str, remedy: str, place: str = where) -> RestockError:
+        return RestockError(what, where=place, remedy=remedy)
+
     if full := _out_of_memory(error):
-        return RestockError(
+        return known(
             f"DuckDB's memory limit is too small: {full}",
-            where=where,
-            remedy="free some memory, or use a machine with more: DuckDB may take 80 % of it, or as"
-            " much as RESTOCK_MEMORY_LIMIT in the environment says",
+            "free some memory, or use a machine with more: DuckDB may take 80 % of it, or as much"
+            " as RESTOCK_MEMORY_LIMIT in the environment says",
         )
     if isinstance(error, StoreError) and error.where is None:  # raised where only rows were known
         return StoreError(error.what, where=where, remedy=error.remedy)
     if isinstance(error, RestockError):
         return error
-    kind = type(error)
     if isinstance(error, MemoryError):
-        return RestockError(
-            "there is not enough memory",
-            where=where,
-            remedy="free some memory, or use fewer workers or less data at once",
-        )
+        remedy = "free some memory, or use fewer workers or less data at once"
+        return known("there is not enough memory", remedy)
     if isinstance(error, OSError) and error.strerror:
         files = [str(name) for name in (error.filename, error.filename2) if name is not None]
-        return RestockError(
-            f"cannot be read or written: {error.strerror}",
-            where=" -> ".join(files) or where,
-            remedy="check the path, the permissions and the free space",
-        )
+        what, remedy = error.strerror, "check the path, the permissions and the free space"
+        return known(f"cannot be read or written: {what}", remedy, " -> ".join(files) or where)
     if isinstance(error, UnicodeEncodeError) and _undecoded(error):
-        return RestockError(
+        return known(
             "a path is not UTF-8, as it must be for a store, a panel or a run: "
             + repr(os.fsencode(error.object))[2:-1],
-            where=where,
-            remedy="rename the folder; or set a locale of UTF-8, if the shell has none:"
-            " LC_ALL=C.UTF-8",
+            "rename the folder; or set a locale of UTF-8, if the shell has none: LC_ALL=C.UTF-8",
         )
     if _in_gl(error):  # raised while MuJoCo is imported, by any verb that needs the twin
-        return RestockError(
-            f"MuJoCo cannot use {os.environ[GL]!r}: {first_line(error)}",
-            where=f"{GL} in the environment",
-            remedy=NO_GL,
-        )
+        what = f"MuJoCo cannot use {os.environ[GL]!r}: {first_line(error)}"
+        return known(what, NO_GL, f"{GL} in the environment")
+    kind = type(error)
     package = kind.__module__.split(".")[0]
     if package == "torch" and kind.__name__ == "OutOfMemoryError":
-        return RestockError(
+        return known(
             f"out of GPU memory: {first_line(error)}",
-            where=where,
-            remedy="use --device cpu, a smaller replay.ring_capacity, or a panel that is read in "
-            'chunks (sampling = "chunked" in its mixture)',
+            "use --device cpu, a smaller replay.ring_capacity, or a panel that is read in chunks"
+            ' (sampling = "chunked" in its mixture)',
         )
-    remedy = _REMEDIES.get(package)
-    if remedy is None and isinstance(error, OSError | UnicodeDecodeError):
-        remedy = _CHECK
-    if remedy is None:  # our own mistake, or that of a library
-        return RestockError(
-            f"an unexpected {kind.__name__}: {first_line(error)}",
-            where=where,
-            remedy=f"{_at(error)}{TRACEBACK}=1 shows the traceback; if the files are whole, this is"
-            " a bug: please report it",
-        )
-    return RestockError(first_line(error), where=where, remedy=remedy)
+    if package in _REMEDIES or isinstance(error, OSError | UnicodeDecodeError):
+        return known(first_line(error), _REMEDIES.get(package, _CHECK))
+    return known(  # our own mistake, or that of a library
+        f"an unexpected {kind.__name__}: {first_line(error)}",
+        f"{_at(error)}{TRACEBACK}=1 shows the traceback; if the files are whole, this is a bug:"
+        " please report it",
+    )
 
 
 def _out_of_memory(error: BaseException | None) -> str:

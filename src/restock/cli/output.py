@@ -79,6 +79,11 @@ def print_text(text: str = "") -> None:
     sys.stdout.write(visible(text, keep="\n") + "\n")
 
 
+def names_in(text: str) -> list[str]:
+    """Return the names of an option, which commas separate."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def say_unverified(store: Store) -> None:
     """Say how many files a store has whose checksums nobody has verified; nothing if none."""
     if files := store.unverified():

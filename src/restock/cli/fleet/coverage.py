@@ -14,6 +14,10 @@ from restock.errors import ExitCode, figure, quoted
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
+    from restock.replay.fleet.shopping_list import ShoppingList
+    from restock.replay.mixture.mixture import Mixture
+    from restock.replay.store.audit import Thresholds
+    from restock.replay.store.store import Store
 
 
 @dataclass
@@ -80,28 +84,13 @@ class CoverageCommand:
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import RestockError
         from restock.replay.fleet.drift import measure_drift
-        from restock.replay.fleet.gaps import find_gaps
-        from restock.replay.fleet.shopping_list import document, shopping_list
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
         from restock.report import coverage_page, write_page
-        from restock.train.twin.missions import KINDS
 
         advance(0, "what is missing")
-        yields, gaps = find_gaps(
-            store,
-            load_mixture(self.mixture),
-            name=self.mixture,
-            folder=Path(self.mixture).parent,
-            kinds=KINDS,
-            thresholds=load_thresholds(None),
-        )
-        missing = {
-            "store": str(store.path),
-            "store_version": store.version,
-            "mixture": self.mixture,
-            **document(shopping_list(yields, gaps)),
-        }
+        mixture, thresholds = load_mixture(self.mixture), load_thresholds(None)
+        _, missing = _missing(store, mixture, self.mixture, thresholds)
         advance(1, "drift")
         drift: Drift | str
         try:
@@ -176,13 +165,10 @@ class GapsCommand:
         from restock.cli import output
         from restock.errors import ConfigError
         from restock.files import expect_file_place
-        from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
-        from restock.replay.fleet.shopping_list import document, shopping_list
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
         from restock.replay.store.store import Store
-        from restock.train.twin.missions import KINDS
 
         if self.min_rows < 0:
             raise ConfigError(f"must be 0 or more, got {self.min_rows}", where="--min-rows")
@@ -192,32 +178,46 @@ class GapsCommand:
             refuse_existing(self.missions_out)
         expect_file_place(self.missions_out, "--missions-out")
         with Store(self.store) as store:
-            yields, gaps = find_gaps(
-                store,
-                mixture,
-                name=self.mixture,
-                folder=Path(self.mixture).parent,
-                kinds=KINDS,
-                thresholds=thresholds,
-                min_rows=self.min_rows,
+            found, answer = _missing(
+                store, mixture, self.mixture, thresholds, min_rows=self.min_rows, unit=self.unit
             )
-            place, version = str(store.path), store.version
-        found = shopping_list(yields, gaps, unit=self.unit)
-        answer = {
-            "store": place,
-            "store_version": version,
-            "mixture": self.mixture,
-            "episodes": len(yields),
-            **document(found),
-        }
+            place = f"{store.path}@{store.version}"
         if self.missions_out is not None:
-            plan = of_list(found, store=f"{place}@{version}", mixture=self.mixture)
+            plan = of_list(found, store=place, mixture=self.mixture)
             write_missions(self.missions_out, plan)
             answer["missions_file"] = str(self.missions_out)
         if self.json:
             output.print_json(answer)
         else:
             _print_gaps(answer)
+
+
+def _missing(
+    store: Store,
+    mixture: Mixture,
+    name: str,
+    thresholds: Thresholds | None,
+    *,
+    min_rows: int = 0,
+    unit: Literal["missions", "hours"] | None = None,
+) -> tuple[ShoppingList, dict[str, Any]]:
+    """Return what fills a store's gaps, and all that `restock coverage gaps --json` prints."""
+    from restock.replay.fleet.gaps import find_gaps
+    from restock.replay.fleet.shopping_list import document, shopping_list
+    from restock.train.twin.missions import KINDS
+
+    yields, gaps = find_gaps(
+        store,
+        mixture,
+        name=name,
+        folder=Path(name).parent,
+        kinds=KINDS,
+        thresholds=thresholds,
+        min_rows=min_rows,
+    )
+    found = shopping_list(yields, gaps, unit=unit)
+    place = {"store": str(store.path), "store_version": store.version, "mixture": name}
+    return found, {**place, "episodes": len(yields), **document(found)}
 
 
 def _print_gaps(answer: dict[str, Any]) -> None:

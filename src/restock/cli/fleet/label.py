@@ -168,7 +168,7 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
 def print_scores(path: Path, *, json: bool) -> int:
     """Print precision and recall of each condition, and how reliable the probabilities are."""
     from restock.cli import output
-    from restock.replay.review import label_quality, reliability
+    from restock.replay.review import label_quality, reliability, reliability_rows
     from restock.replay.store.store import Store
 
     with Store(path) as store:
@@ -208,16 +208,6 @@ def score_rows(found: Sequence[LabelQuality]) -> list[dict[str, Any]]:
         }
         for one in found
     ]
-
-
-def reliability_rows(bins: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each condition: the true share of steps by tenths of probability."""
-    rows: dict[str, dict[str, Any]] = {}
-    for one in bins:
-        row = rows.setdefault(one["condition"], {"condition": one["condition"]})
-        row |= {f"{tenth / 10:g}+": row.get(f"{tenth / 10:g}+", "") for tenth in range(10)}
-        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
-    return list(rows.values())
 
 
 def quality_json(one: LabelQuality) -> dict[str, Any]:

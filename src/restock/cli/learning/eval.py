@@ -82,7 +82,7 @@ class EvalCommand:
         return self._drive()
 
     def _drive(self) -> int:
-        from restock.cli.output import print_json, progress, say
+        from restock.cli.output import names_in, print_json, progress, say
         from restock.errors import ExitCode
         from restock.train.evaluation.eval_run import (
             clones_driven,
@@ -96,8 +96,8 @@ class EvalCommand:
         drive = self.episodes != "0"
         plan = plan_evaluation(
             self.run_path,
-            policies=_names(self.policies),
-            perturbations=_names(self.perturbations),
+            policies=names_in(self.policies),
+            perturbations=names_in(self.perturbations),
             episodes=self.episodes if drive else "20",
             first_seed=self.seed,
             layouts=self.layouts,
@@ -173,10 +173,6 @@ class EvalCommand:
             result = evaluate_planned(plan, advance)
         show_off_policy(self.run_path, result, config, as_json=self.json)
         return 0
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def show_measures(rows: list[dict[str, Any]]) -> None:

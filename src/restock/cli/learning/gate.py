@@ -50,7 +50,7 @@ class GateCommand:
     """Print the document as JSON: claim, evidence and limits."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json, print_sections, progress, say
+        from restock.cli.output import names_in, print_json, print_sections, progress, say
         from restock.errors import ExitCode
         from restock.files import write_text
         from restock.report import gate_page, write_page
@@ -61,8 +61,8 @@ class GateCommand:
             self.run_path,
             self.baseline,
             margins=_margins(self.margins),
-            conditions=_names(self.conditions),
-            perturbations=_names(self.perturbations),
+            conditions=names_in(self.conditions),
+            perturbations=names_in(self.perturbations),
             layouts=self.layouts,
             limiter=self.limiter,
             budget=self.budget,
@@ -89,10 +89,11 @@ def _margins(text: str) -> dict[str, float]:
     Raises:
         ConfigError: a part is no name and number.
     """
+    from restock.cli.output import names_in
     from restock.errors import ConfigError
 
     found = {}
-    for part in _names(text):
+    for part in names_in(text):
         name, _, value = part.partition("=")
         try:
             found[name.strip()] = float(value)
@@ -101,7 +102,3 @@ def _margins(text: str) -> dict[str, float]:
                 f"{part!r} is not NAME=NUMBER", where="--margins", remedy="write success=0.05"
             ) from None
     return found
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]

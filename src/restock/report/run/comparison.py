@@ -52,7 +52,7 @@ def comparison_page(found: dict[str, Any]) -> dict[str, Any]:
         "title": f"{second} against {first}",
         "verdict": verdict(found),
         "headline": headline(found, first, second),
-        "lead": found["sentence"] + ".",
+        "lead": f"{found['sentence']}." if found["verdict"] == "comparable" else "",  # or headline
         "cards": cost_cards(found["cost"]),
         "sections": sections,
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from restock.errors import counted, policy_words
+from restock.replay.review import reliability_rows
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Figure,
@@ -312,7 +313,7 @@ def labels_section(facts: Facts) -> Section | None:
     if not facts.labels:
         return None
     rows = [_score(row) for row in facts.labels]
-    reliability = _reliability(facts.reliability)
+    reliability = reliability_rows(facts.reliability)
     tables = [Table(rows)]
     if reliability:
         title = "Steps with probability p: the share that is true should be p"
@@ -345,16 +346,6 @@ def _with_range(value: float | None, events: int | None) -> str:
     if value is None or not events:
         return ""
     return interval_text(value, *wilson(round(value * events), events))
-
-
-def _reliability(bins: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Show the true share of each condition by tenths of probability."""
-    rows: dict[str, dict[str, str]] = {}
-    for one in bins:
-        blank = {f"{tenth / 10:g}+": "" for tenth in range(10)}
-        row = rows.setdefault(one["condition"], {"condition": words(one["condition"]), **blank})
-        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
-    return list(rows.values())
 
 
 OWN = "agent"
