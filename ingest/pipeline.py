@@ -350,8 +350,8 @@ class _Ingest:
         if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
             notes.append(
                 f"in place of its {self.before['transitions']:,} transitions by the profile"
-                f" {other!r}: a store keeps one set of rows of a recording (those of another robot"
-                " in it: in another --store)"
+                f" {other!r}: a store keeps one set of rows per recording (ingest another robot's "
+                "rows of it into another --store)"
             )
         if clock.pace is not None:
             notes.append(
@@ -427,9 +427,9 @@ def unknown_directions(recording: Recording, profile: Profile) -> list[str]:
             if not left:
                 return []
     return [
-        f"{name}: no transform places {frame}, the frame of {unsaid[name].topic}: that its zero"
-        " points straight ahead is a guess; if it does, say so: lidar_at_m and lidar_yaw_rad = 0 in"
-        f" [inputs.{name}]"
+        f"{name}: no transform places {frame}, the frame of {unsaid[name].topic}: its zero is "
+        "assumed to point straight ahead; if it does, set lidar_at_m and lidar_yaw_rad = 0 in "
+        f"[inputs.{name}]"
         for name, frame in frames.items()
         if frame in left
     ]

@@ -112,9 +112,9 @@ def _refusal(
     remedy = "leave it out, or use --repeated keep to ingest it anyway"
     if found.the_less:  # as of a recording that was still being written, or salvaged
         remedy = (
-            f"this one holds more of the drive: {_removal(store, found.recording_id)} takes that"
-            " one out; then ingest this one again (--repeated replace does both), or keep both with"
-            " --repeated keep"
+            f"this one holds more of the drive: {_removal(store, found.recording_id)} removes "
+            "that one; then ingest this one again (--repeated replace does both), or keep both "
+            "with --repeated keep"
         )
     return RecordingError(str(found), where=one.result.path, remedy=remedy)
 
@@ -174,9 +174,9 @@ def _finished(
     elif repeats is not None:
         until = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
         if repeats.the_less:
-            how = f"{_removal(store, repeats.recording_id)} takes out that one, which holds less"
+            how = f"{_removal(store, repeats.recording_id)} removes that one, which holds less"
         else:
-            how = f"{_removal(store, staged.recording_id)} takes this one out"
+            how = f"{_removal(store, staged.recording_id)} removes this one"
         notes.append(f"{until} {how}")
     return replace(one.result, version=version, repeats=repeats, notes=notes)
 
@@ -186,7 +186,7 @@ def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]
 
     Returns the store's version (None if the part stays) and a note for the user.
     """
-    why = "it has steps that this one has not"
+    why = "it has steps that this one lacks"
     if part.is_part:
         (reported,) = remove_recordings(store, [part.recording_id], dry_run=True).recordings
         if not reported.corrections:
@@ -196,7 +196,7 @@ def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]
                 "which was removed"
             )
         why = f"people corrected {counted(reported.corrections, 'label')} of it"
-    return None, f"{part}. It stays, as {why}: {_removal(store, part.recording_id)} takes it out"
+    return None, f"{part}. It stays, as {why}: {_removal(store, part.recording_id)} removes it"
 
 
 class CommitGroup:

@@ -105,7 +105,7 @@ def _discount_of(run: Path, requested: float | None) -> float:
         raise ConfigError(
             f"the evaluations of {run} are discounted by {discount:g}, not {requested:g}",
             where="--discount",
-            remedy="leave it out: returns by step are not kept of an evaluation",
+            remedy="leave it out: an evaluation does not keep its rewards by step",
         )
     return discount
 

@@ -111,7 +111,7 @@ def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
                 watch("looking through the file, bytes", at, end)
             others += opcode not in _MANY
             if others > MAX_OTHERS:
-                raise Malformed(f"more than {MAX_OTHERS:,} records of no messages", at)
+                raise Malformed(f"more than {MAX_OTHERS:,} records that hold no messages", at)
             if opcode == Op.FOOTER:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
                 contents.damaged += check_summary(contents, file, at, stop)
@@ -351,7 +351,7 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
             continue  # within what was walked since
         if contents.cut_chunk is not None:  # it ends where the next begins, at the latest
             contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
-        lost.append(f"{_lost(contents, cut, at)}: reading goes on at the next chunk")
+        lost.append(f"{_lost(contents, cut, at)}: reading continues at the next chunk")
         if contents.cut_chunk is not None:
             contents.chunks.append(contents.cut_chunk)
             contents.cut_chunk = None
@@ -377,7 +377,7 @@ def _lost(contents: Contents, cut: int, until: int) -> str:
     at = f"{until - cut:,} bytes from byte {cut:,} on"
     if contents.cut_chunk is None or contents.cut_chunk.at != cut:
         return f"{at} are lost"
-    return f"{at} are a part of a chunk: only the messages that are whole in it are read"
+    return f"{at} are part of a chunk: only its complete messages are read"
 
 
 def _recognised(file: FileBytes, start: int) -> Iterator[int]:

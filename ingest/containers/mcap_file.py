@@ -236,7 +236,7 @@ class ChunkReader:
         chunk, base, size = part
         if chunk.index and chunk.at not in self.walked:
             self._checks.notes.append(
-                f"chunk at byte {chunk.at:,}: its message index is wrong; walked"
+                f"chunk at byte {chunk.at:,}: its message index is wrong: read message by message"
             )
         positions = self._walk_part(chunk, buffer[base : base + size].data)
         return {

@@ -383,7 +383,8 @@ class Ros1File:
             claimed = Counter(info.connection_counts)
             if counts[info.pos] != claimed or claimed.keys() - self.channels.keys():
                 self.notes.append(
-                    f"chunk at byte {info.pos:,}: its indexes contradict each other; walked"
+                    f"chunk at byte {info.pos:,}: its indexes contradict each other: read message "
+                    "by message"
                 )
                 try:
                     found, _ = walk(self._reader.inflated(info.pos))

@@ -94,7 +94,7 @@ def fit_alarm(
     place = math.floor(miss_rate * (count + 1) + 1e-9)
     if not place or not fitted:
         needed = max(2 * math.ceil(1 / miss_rate - 1e-9) - 3, 2)
-        least = f"; of these, {1 / (count + 1):.2g} is the least" if fitted else ""
+        least = f"; with these, the lowest rate is {1 / (count + 1):.2g}" if fitted else ""
         raise ConfigError(
             f"a miss rate of {miss_rate:g} needs {needed} episodes that failed, there are"
             f" {len(windows)}{least}",

@@ -193,7 +193,9 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _refusal(path: Path, why: str, remedy: str = f"give what `{_EXPORT}` wrote") -> ConfigError:
+def _refusal(
+    path: Path, why: str, remedy: str = f"give a file that `{_EXPORT}` wrote"
+) -> ConfigError:
     """Return the error of a file; names in a hostile one may be millions of characters long."""
     return ConfigError(why[:400], where=str(path), remedy=remedy[:400])
 

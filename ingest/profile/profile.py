@@ -93,7 +93,7 @@ class Profile(Checked, frozen=True):
     shipped_conditions: list[str] = msgspec.field(default_factory=list, name="conditions")
     shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
-    behaviour_policy: str = "unknown"  # the driver, if no topic tells
+    behaviour_policy: str = "unknown"  # the driver, if no topic says so
     # Behaviour policy -> its commands (of a person, of navigation) before one is chosen to drive.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
     # The topic that was chosen among them, if the command is that one smoothed or limited: who

@@ -469,22 +469,22 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
     for name, source in scans.items():
         if source.lidar_at_m is None:
             raise ConfigError(
-                f"`inputs.{name}.lidar_at_m` is missing: of several lidars, each says where it is",
+                f"`inputs.{name}.lidar_at_m` is missing: with several lidars, each needs its place",
                 where=where,
                 remedy="give lidar_at_m = [AHEAD, LEFT], from the middle of the outline, and"
                 " lidar_yaw_rad",
             )
         if source.optional:
             raise ConfigError(
-                f"`inputs.{name}.optional`: of several lidars, none is optional, as rows would"
-                " not tell what it alone sees",
+                f"`inputs.{name}.optional`: with several lidars, none is optional: rows would "
+                "silently lack what only that one sees",
                 where=where,
                 remedy="leave it out, and give recordings without it a profile of their own",
             )
     topics = [source.topic for source in scans.values()]
     if len(set(topics)) < len(topics):
         raise ConfigError(
-            f"`inputs.{list(scans)[-1]}.topic`: two of the lidars have one topic", where=where
+            f"`inputs.{list(scans)[-1]}.topic`: two lidars have the same topic", where=where
         )
 
 

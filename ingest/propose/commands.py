@@ -47,7 +47,7 @@ class CommandChoice:
 
     lines: list[str] = field(default_factory=list)
     policy: str = "unknown"
-    why: str = "the driver, if no topic tells"
+    why: str = "the driver, if no topic says so"
 
     def toml(self, wheelbase_m: float) -> list[str]:
         """Write the tables; a source that steers does so about the command's wheelbase."""

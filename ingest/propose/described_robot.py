@@ -144,7 +144,10 @@ def described_robot(
 
 def _other_base(base: str) -> str:
     usual = f"{', '.join(BASE_FRAMES[:-1])} or {BASE_FRAMES[-1]}"
-    return f"{base!r} is taken for the base, as the other links hang on it: none is named {usual}"
+    return (
+        f"{base!r} is taken for the base, as it is the root of the other links: none is named "
+        f"{usual}"
+    )
 
 
 def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:

@@ -51,7 +51,7 @@ MIN_ASIDE_M = 0.05  # of the middle
 DESCRIBED = "as described"  # the source of a lidar's place
 UPSIDE_DOWN = (
     "the lidar hangs upside down by its frame, so its scans are turned over; if its driver does "
-    "that already, left and right are swapped now: remove upside_down"
+    "that already, left and right are now swapped: remove upside_down"
 )
 
 

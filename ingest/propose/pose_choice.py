@@ -164,7 +164,7 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
         span = recording.span_ns or (0, 0)
         problem = (
             f"no odometry, and {source} has {len(poses)} poses in {(span[1] - span[0]) * 1e-9:.0f}"
-            " s: too few, or too far apart, to tell speeds from;"
+            " s: too few, or too far apart, to compute speeds from;"
             " record nav_msgs/msg/Odometry, or a pose at least every"
             f" {MAX_S / MIN_POSES:.1f} s"
         )
@@ -232,7 +232,7 @@ def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> li
     how = "without a stated accuracy" if usual is None else f"of {usual:.2g} m, mostly"
     return [
         f"# Metres east and north of the origin; fixes {how}. Yaw is the direction of the last",
-        "# track_m driven (backing up looks turned round), or by an IMU that knows north:",
+        "# track_m driven (backing up reverses it), or by an IMU that knows north:",
         "# [inputs.heading], with orientation of sensor_msgs/msg/Imu.",
         *([f"origin_deg = [{origin[0]:.7f}, {origin[1]:.7f}]  # the first fix"] if origin else []),
         f"max_std_m = {MAX_STD_M:g}  # fixes with a larger standard deviation are not used",
@@ -250,7 +250,7 @@ def fix_noise_lines(
         f"max_pose_jump_m = {max(1.0, round(driven_m + 3 * usual, 1)):g}  # between two fixes",
         "",
         "[noise]",
-        f"localiser_m = {max(usual, 0.01):.2g}  # as the fixes say; less would be taken for slip",
+        f"localiser_m = {max(usual, 0.01):.2g}  # as the fixes state; less would be taken for slip",
         "",
     ]
 

@@ -70,8 +70,8 @@ def in_one_recording(robots: Sequence[str]) -> str:
     others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
     return (
         f"of the robot {robots[0]}, one of {len(robots)} in the recording: `restock profile new "
-        f"--robot NAME` proposes another profile, for {others}, of another name; ingest with it "
-        "into another store, as a store keeps one set of rows of a recording"
+        f"--robot NAME` proposes a profile of another name for {others}; ingest with it into "
+        "another store, because a store keeps one set of rows per recording"
     )
 
 
@@ -95,7 +95,7 @@ def profile_lines(
         f"conditions = {json.dumps(_conditions(seen))}",
         *_unknown_lines(seen),
         *_slip_lines(seen),
-        f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever came of them",
+        f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever the outcome",
         f'behaviour_policy = "{seen.chosen.policy}"  # {seen.chosen.why}',
         *_origin_lines(seen),
         "",
@@ -155,7 +155,7 @@ def _slip_lines(seen: Evidence) -> list[str]:
         return []
     return [
         f"# No wheel_slip: poses and wheel speeds are both of {pose[0][0].name}, and there is no"
-        " IMU: nothing would show it."
+        " IMU: slip cannot be detected."
     ]
 
 

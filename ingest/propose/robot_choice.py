@@ -204,7 +204,7 @@ class RobotProposal:
     origin: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rolls: bool = True  # False: a description says that it has no wheels
-    drive_why: str = "A GUESS: the recording does not tell"
+    drive_why: str = "A GUESS: the recording does not show it"
 
     @property
     def described(self) -> bool:
@@ -231,7 +231,9 @@ class RobotProposal:
         values = {k: v for k, v in self.values.items() if k not in _OF_STEERING}
         origin = {key: said for key, said in self.origin.items() if key in values}
         if command_rad is None and not shown.steers:
-            said = shown.why if shown.pivots else f"A GUESS, as its logs do not tell: {shown.why}"
+            said = (
+                shown.why if shown.pivots else f"A GUESS, as its logs do not show it: {shown.why}"
+            )
             return replace(self, values=values, origin=origin, drive_why=said)
         wheelbase_m = round(WHEELBASE_PART * length_m, 3)
         values |= {"drive": "ackermann", "wheelbase_m": wheelbase_m}

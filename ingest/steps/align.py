@@ -329,7 +329,7 @@ def refuse_still_log_time(topic: str, columns: TopicColumns) -> None:
     if len(log) > 1 and log.max() == log.min():
         raise RecordingError(
             f"all {len(log):,} messages on {topic} have the same log time "
-            f"({int(log[0]) / NS:g} s since 1970), so nothing says when they were received",
+            f"({int(log[0]) / NS:g} s since 1970), so it is unknown when they were received",
             remedy="record it again, or write the file again with the times at which its "
             "messages were received",
         )

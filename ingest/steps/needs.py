@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 NEARLY = 0.8  # of a name's letters: /plan is not /scan
 MAX_TOLD = 20  # topics in a message: a fleet's nightly log has one a recording
 OTHER_FIELDS = (
-    "correct the profile; if the messages changed with an update of the robot, ingest the"
-    " recordings from before and from after it with a profile each: a copy with the other field and"
-    " another `name`"
+    "correct the profile; if the messages changed with an update of the robot, ingest the "
+    "recordings from before and after it with a profile each: a copy with the other field and "
+    "another `name`"
 )
 
 
@@ -122,8 +122,8 @@ def wanted_fields(
         raise RecordingError(
             f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
             remedy=f"its topics are {_told(profile, available)}; choose another --profile, or let"
-            " `restock profile new RECORDING` propose one (`restock start RECORDING` does so, and"
-            " goes on from there)"
+            " `restock profile new RECORDING` propose one (`restock start RECORDING` does so and "
+            "continues)"
             if input_problems(profile, available)
             else OTHER_FIELDS,
         )

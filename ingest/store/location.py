@@ -187,8 +187,8 @@ class Location:
             raise StoreError(
                 f"its table `{gone}` is missing, while `{other}` is there",
                 where=self.text,
-                remedy=f"restore {self.table(gone)} from a copy; where there is none, ingest the"
-                " recordings into a new store",
+                remedy=f"restore {self.table(gone)} from a copy; if there is none, ingest the "
+                "recordings into a new store",
             )
 
     def other(self) -> str | None:
@@ -207,7 +207,7 @@ class Location:
             what, remedy = "is a file, not a store", "give the folder of a store"
         elif kind := self.other():
             what = f"is {kind}, not a store"
-            remedy = "give the store that it was made of, or another; its JSON file names that one"
+            remedy = "give its store (its JSON file names it), or another"
         return StoreError(what, where=self.text, remedy=remedy)
 
     def remedy_if_absent(self) -> str:

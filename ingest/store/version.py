@@ -175,14 +175,14 @@ def _damaged(
 
     A checkpoint is `needless` if all commits before it are there.
     """
-    remedy = "where there is none, ingest the recordings into a new store"
+    remedy = "if there is none, ingest the recordings into a new store"
     if newest is not None and file.stem == f"{newest:020}":
         remedy = (
-            "or delete it: the store is then as it was before this commit, which is the last; then"
-            " run again the command that made it"
+            "or delete it, as it is the last commit: the store is then as it was before; then "
+            "run the command that made it again"
         )
     elif needless:
-        remedy = "or delete it and _last_checkpoint beside it: the commits say the same"
+        remedy = "or delete it and _last_checkpoint beside it: the commits contain the same"
     table = file.parent.parent.name
     return StoreError(
         f"its file {table}/{LOG}/{file.name} {problem}",

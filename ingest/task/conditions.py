@@ -365,13 +365,13 @@ def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -
             f"its SQL takes too long: the conditions may take {limit_s:.0f} s on"
             f" {len(steps):,} steps",
             where=where,
-            remedy="make it simpler, or shorten what its windows look at",
+            remedy="make it simpler, or shorten its windows",
         ) from error
     if isinstance(error, duckdb.OutOfMemoryException):
         raise ConfigError(
             f"its SQL takes more memory than conditions may ({SANDBOX['memory_limit']})",
             where=where,
-            remedy="make the values that it computes smaller, or shorten what its windows look at",
+            remedy="make the values that it computes smaller, or shorten its windows",
         ) from error
     raise ConfigError(
         f"its SQL fails on the steps: {_first_line(error)}",
@@ -392,7 +392,7 @@ def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> 
         if reason := refusal(sql, condition.timing):
             where = f"`let` {name!r} of condition {condition.name!r}" if name else None
             curly = (
-                "in curly brackets are times, {1.6 s}, and ways, {0.2 m}" if "{" in sql else None
+                "curly brackets hold times, {1.6 s}, or distances, {0.2 m}" if "{" in sql else None
             )
             raise ConfigError(reason, where=where or _where(condition, which), remedy=curly)
 

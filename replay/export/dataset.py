@@ -77,16 +77,16 @@ def card(selection: Selection, counts: Counts, contents: Contents, to: str) -> s
         f"{reported['transitions']:,} transitions of {task.control_period_s:g} s in"
         f" {reported['trajectories']:,} trajectories, made from recordings by Restock:"
         f" {reported['terminated']:,} terminated, {reported['truncated']:,} truncated,"
-        f" {reported['cut']:,} cut where rows were left out.",
+        f" {reported['cut']:,} cut if rows were left out.",
         "",
         f"Read it with `{READ[to]}`.",
         "",
-        *("## What is in it", ""),
+        *("## Contents", ""),
         f"- Action: {action}.",
         f"- Observation: {selection.observation_size} numbers, by name: "
         + ", ".join(f"`{name}`" for name in task.observation_names)
         + ".",
-        "- Reward: that of the task, recomputed from what was logged.",
+        "- Reward: the task's, recomputed from the logged signals.",
         *(
             f"- `observation.images.{camera}`: at each step the last frame of the camera"
             f" `{camera}`, as far as it can be as recorded."
@@ -100,9 +100,9 @@ def card(selection: Selection, counts: Counts, contents: Contents, to: str) -> s
         "",
         *("## Before it is used", ""),
         "- Conditions are labels by rules over the signals, not the truth.",
-        "- It is what somebody logged: how often a condition occurs here need not be how often it"
-        " occurs.",
-        "- A trajectory that was cut goes on: bootstrap there.",
+        "- It is what somebody logged: a condition may be more or less frequent here than in the "
+        "field.",
+        "- A trajectory that was cut did not end there: bootstrap.",
         "",
         "No licence was given: without one, nobody else may use it. Write `license:` above.",
     ]

@@ -76,7 +76,7 @@ def of_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:
     """
     if not found.orders:
         raise ConfigError(
-            "there is nothing to write a missions file of: "
+            "there is nothing to write to a missions file: "
             + ("no gap has a known rate" if found.gaps else "there are no gaps"),
             where=store,
             remedy="leave out --missions-out" + ("; write one by hand" if found.gaps else ""),

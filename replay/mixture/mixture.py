@@ -137,7 +137,7 @@ class OtherStore(Checked, frozen=True):
     def check(self) -> None:
         _check_rates(self.represents)
         _require(
-            bool(self.name) and "/" not in self.name, f"name {self.name!r} is not one for a store"
+            bool(self.name) and "/" not in self.name, f"name {self.name!r} is not valid for a store"
         )
         _require(
             self.name not in ("logs", "fresh"), f"a store cannot be called {self.name!r}: taken"
@@ -155,8 +155,8 @@ class SourceShares(Checked, frozen=True):
         _check_rates(self.represents)
         _require(
             self.represents != "archive",
-            'sources.represents: an "archive" stands for the main store\'s rates, and this is it:'
-            " give the rates as a table",
+            'sources.represents: an "archive" stands for the main store\'s rates, and this is the '
+            "main store: give the rates as a table",
         )
         portions = [self.logs, *(store.share for store in self.stores)]
         names = [store.name for store in self.stores]
@@ -296,7 +296,7 @@ class EachCondition(StratumLimits, frozen=True, kw_only=True):
 
     share: Literal["natural", "equal"] = "natural"
     kind: Literal["outcome", "exposure"] = (
-        "outcome"  # conditions, or situations whatever came of them
+        "outcome"  # conditions, or situations whatever the outcome
     )
 
 

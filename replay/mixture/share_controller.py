@@ -383,16 +383,16 @@ class ShareController(Stateful):
         """Return in words why a stratum gets less of a batch than its quota."""
         rows = sum(of.rows for of, i in zip(self.strata, self._of, strict=True) if i == stratum)
         limit = self.max_replays
-        reason = "the logs have no row of it"
+        reason = "the logs have no rows of it"
         if rows:
             reason = f"its {rows:,} logged rows"
             reason += " are all there is" if limit is None else f" give {limit:,} draws each"
         if self.fresh is None:
             return reason
         if not self.fresh[stratum]:
-            return f"{reason}, and the twin gives no fresh rows of it"
+            return f"{reason}, and the twin has no fresh rows of it"
         if not self.boosted[stratum]:
-            return f"{reason}, and fresh rows are not boosted where importance weights correct it"
+            return f"{reason}, and fresh rows are not boosted if importance weights correct it"
         if not self.online:
             return f"{reason}, and the offline phase has no fresh rows"
         return f"{reason}, and the ring has too few fresh rows of it"
@@ -439,8 +439,8 @@ class ShareController(Stateful):
                 f"the offline phase draws {offline:,.0f} rows of {source.name}, which its"
                 f" {source.rows.sum():,} rows do not allow at {self.max_replays} draws each",
                 remedy="lower schedule.offline_updates to"
-                f" {np.floor(1000 * fill / offline) / 10:g}% of what it is, raise"
-                " max_replays_per_row, or ingest more",
+                f" {np.floor(1000 * fill / offline) / 10:g}% of its value, raise "
+                "max_replays_per_row, or ingest more",
             )
         online = ahead - offline
         filled = plan.scale if online <= 0 else min(max(fill - offline, 0.0) / online, 1.0)

@@ -174,9 +174,9 @@ def look_for_archives(
             if name in strata
             else []
         ),
-        '"natural" (it is as it occurs)',
+        '"natural" (its own rates)',
     ]
-    remedy = f"set in {place} what its rows represent: represents = {' or '.join(choices)}"
+    remedy = f"set in {place} which rates its rows represent: represents = {' or '.join(choices)}"
     if refused:
         raise MixtureError(f"the source {source!r} looks like an archive: {what}", remedy=remedy)
     return (f"the source {source!r} may be an archive: {what}; {remedy}",)
@@ -318,8 +318,8 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: flo
     if low.sum() > rest + 1e-9 or high.sum() < rest - 1e-9:
         names = ", ".join(rules[i].name for i in np.flatnonzero(flexible).tolist())
         raise MixtureError(
-            f"the floors of {names} sum to {low.sum():g} and their caps to {high.sum():g}, which"
-            f" leave no way to share out {rest:g}",
+            f"the floors of {names} sum to {low.sum():g} and their caps to {high.sum():g}, which "
+            f"leave no way to divide {rest:g}",
             remedy="lower a floor or a given share, or raise a cap",
         )
     return given + rest_within(base, low, high, max(rest, 0.0))

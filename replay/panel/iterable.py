@@ -127,7 +127,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         if moving or needs_td(self.panel):
             follows = "environment steps" if moving else "TD errors"
             raise MixtureError(
-                f"the mixture's draws follow {follows}, which a data set does not receive",
+                f"the mixture's draws depend on {follows}, which a data set does not receive",
                 where=str(self.path),
                 remedy="draw with `sampler_for(panel, …)`, which has `update` and `move_to`",
             )
@@ -136,7 +136,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         """Skip the draws of earlier passes, which count towards the limit."""
         if epoch and self.batches is None:
             raise MixtureError(
-                "an endless pass has no next one where max_replays_per_row is of all passes",
+                "an endless data set cannot start another pass if max_replays_per_row is set",
                 where=str(self.path),
                 remedy="give `batches`",
             )
@@ -145,7 +145,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
                 f"pass {epoch} was given already, and its rows may be drawn"
                 f" {self._limit:g} times in all",
                 where=str(self.path),
-                remedy=f"go on with set_epoch({epoch + 1})",
+                remedy=f"continue with set_epoch({epoch + 1})",
             )
         self._begun[number % _MAX_WORKERS] = epoch + 1
         for _ in range(epoch * ranks * (self.batches or 0)):

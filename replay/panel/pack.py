@@ -128,7 +128,7 @@ class PackedFile:
                 if (writing := self._writing.pop(number, None)) is not None:
                     writing.result()
                 if not read_into(held, self._file, number * self._block_bytes):
-                    raise PanelError("what was written of it is gone", where=str(self._path))
+                    raise PanelError("its written files are gone", where=str(self._path))
             self._held[number] = held
         return held
 

@@ -74,13 +74,13 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
             raise MixtureError(
                 f"every row is older than max_age_days = {mixture.max_age_days:g}: the newest is"
                 f" {youngest:,.1f} days old",
-                remedy="raise it, or set in the mixture the date to which ages are counted: as_of "
-                "= 2026-01-31T00:00:00Z",
+                remedy="raise it, or set in the mixture the date from which ages count back:"
+                " as_of = 2026-01-31T00:00:00Z",
             )
         out.add("too old", too_old)
     if mixture.max_versions_behind is not None:
         behind = versions_behind(table)
-        out.add("of an old version of its policy", behind > mixture.max_versions_behind)
+        out.add("from an old version of its policy", behind > mixture.max_versions_behind)
     out.admitted = ~out.gone
     out.add("evaluation split", split.held)
     out.add("gap before the evaluation split", split.gap)
@@ -147,8 +147,8 @@ def repeats_of(
         raise MixtureError(
             f"all {int(repeated.sum())} rows outside the evaluation split repeat its steps:"
             " the same drive is in the store more than once",
-            remedy="take the repeated recordings out with `restock store remove STORE RECORDING`"
-            " (the audit `repeated_steps` lists them), or ingest more",
+            remedy="remove the repeated recordings with `restock store remove STORE RECORDING` "
+            "(the audit `repeated_steps` lists them), or ingest more",
         )
     return repeated
 
@@ -296,7 +296,7 @@ def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
         finer = "within_episode" if group == "episode" else "episode"
         warning = (
             f"the evaluation split holds out {held.mean():.0%} of the rows, where {rule.share:.0%}"
-            f" were asked for: {kept} of {counted(of, group)}, whole; [evaluation_split]"
+            f" were requested: {kept} of {counted(of, group)}, whole; [evaluation_split]"
             f' by = "{finer}" comes nearer'
         )
     return EvaluationRows(held, none, rule.by, warning=warning)

@@ -281,7 +281,7 @@ def plan_panel(
     if out.gone.all():
         reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in out.reasons.items())
         raise MixtureError(
-            f"no row is left: {reasons}", remedy="change what leaves out too much in the mixture"
+            f"no row is left: {reasons}", remedy="correct what leaves out too much in the mixture"
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata))

@@ -89,7 +89,7 @@ def taken_by_others(
         remedy = (
             _less_often(other, _usual_steps(table, taker, admitted))
             if rest
-            else f"give {named.name} priority = {other.priority - 1}, which is before {other.name}"
+            else f"give {named.name} priority = {other.priority - 1}, to come before {other.name}"
         )
         unit = "episode" if rule.unit == "episode" else "row"
         found[named.name] = (

@@ -534,10 +534,10 @@ def export_views(store: Store, out: str | Path) -> Path:
         raise StoreError(
             "views of a store on S3 cannot be exported to other DuckDBs",
             where=str(store.path),
-            remedy="ask it with `restock sql`, or from Python with restock.open()",
+            remedy="query it with `restock sql`, or from Python with restock.open()",
         )
     if not all(store.files.values()):
-        raise StoreError("it holds no recordings to look at", where=str(store.path))
+        raise StoreError("it holds no recordings to view", where=str(store.path))
     partial = out.with_name(f".{out.name}.partial")
     partial.unlink(missing_ok=True)
     out.parent.mkdir(parents=True, exist_ok=True)

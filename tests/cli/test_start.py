@@ -260,7 +260,7 @@ def test_a_person_chooses_among_command_topics(tmp_path, capsys):
 
 def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
     """Of a stranger's Neato "fqe 4.18" stood beside "logged -1.05", as if it were a gain."""
-    few = "1 episode, and weights take at least 5"
+    few = "1 episode, and weights need at least 5"
     rows = [
         {"measure": "return", "condition": "all", "episodes": 1, "low": None, "high": None}
         | {"estimator": name, "value": value, "refused": None if value else few}

@@ -286,7 +286,7 @@ def test_one_lidar_beside_the_middle_has_its_place(tmp_path, capsys):
     [
         (two_lidars().replace("[inputs.scan]", "[inputs.scan_3]"), "without `inputs.scan`"),
         (two_lidars(rear="optional = true"), "inputs.scan_2.optional"),
-        (two_lidars().replace("/scan_rear", "/scan_front"), "two of the lidars have one topic"),
+        (two_lidars().replace("/scan_rear", "/scan_front"), "two lidars have the same topic"),
         (
             two_lidars().replace(f"lidar_at_m = [-0.28, -0.22]\nlidar_yaw_rad = {REAR[2]}\n", ""),
             "inputs.scan_2.lidar_at_m` is missing",

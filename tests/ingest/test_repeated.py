@@ -60,7 +60,7 @@ def test_the_whole_after_a_part_is_said(part, third, tmp_path, capsys):
     }
     (note,) = (note for note in whole["notes"] if "a part of the same drive twice" in note)
     assert str(part) in note
-    assert f"`restock store remove {store} {first['recording_id']}` takes out that one" in note
+    assert f"`restock store remove {store} {first['recording_id']}` removes that one" in note
 
 
 def test_the_whole_takes_the_place_of_a_part_where_asked(part, third, tmp_path, capsys):

@@ -102,7 +102,7 @@ def test_of_a_chunk_that_is_cut_what_is_read_is_not_called_lost(tmp_path: Path) 
     path.write_bytes(path.read_bytes()[: (start + stop) // 2])
     decoded, reasons, _ = read(path)
     assert 0 < decoded < COUNT
-    assert f"from byte {start:,} on are a part of a chunk: only the messages" in reasons[1]
+    assert f"from byte {start:,} on are part of a chunk: only its complete" in reasons[1]
     assert not any("are lost" in reason for reason in reasons)
 
 

@@ -103,7 +103,7 @@ def test_what_neither_has_is_short_and_nominal_does_not_take_it():
     row = shares.forecast()[2]
     assert row["short_share"] == pytest.approx(0.3 - row["logs_share"])
     assert row["reason"] == (
-        "its 559 logged rows give 400 draws each, and the twin gives no fresh rows of it"
+        "its 559 logged rows give 400 draws each, and the twin has no fresh rows of it"
     )
     with pytest.raises(MixtureError, match=r"near wants 30\.0% of the rows fed and gets 0\.4%"):
         controller(1_800_000, known=(True, True, False), text="shortfall = 'refuse'\n" + QUOTAS)

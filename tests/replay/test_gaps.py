@@ -222,8 +222,8 @@ def test_mix_and_gaps_say_the_same_hours(text, tmp_path, capsys):
     amount, low, high = map(figure, ends)
     assert f"would fill it: {amount} h of driving ({low} to {high})\n" in mixed_text
     assert f" {amount} ({low} to " in gaps_text
-    assert "hours: of driving as in these logs, with nothing chosen" in mixed_text
-    assert "hours: of driving as logged so far" in gaps_text
+    assert "hours: driving like that in these logs, not chosen" in mixed_text
+    assert "hours: driving like that logged so far" in gaps_text
 
 
 def test_the_plan_is_the_least_that_fills_every_gap():

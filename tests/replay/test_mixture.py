@@ -368,7 +368,7 @@ def test_the_verb_explains_then_packs_and_never_overwrites(store_path, tmp_path,
 def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, capsys):
     assert cli.main(["mix", str(store_path), "--dry-run"]) == 0
     text = capsys.readouterr().out
-    assert "these numbers are for 2,560,000 logged rows drawn" in text
+    assert "these numbers are for 2,560,000 draws of logged rows" in text
     assert "no row is drawn more than 400 times (max_replays_per_row)" in text
     # Few rows: at the default training budget they bear less.
     assert "warning: at the default training budget (51,500 updates of 128 rows)" in text
@@ -376,7 +376,7 @@ def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, capsy
     requested = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
     assert cli.main(requested) == 0
     text = capsys.readouterr().out
-    assert "these numbers are for 12,800 logged rows" in text
+    assert "these numbers are for 12,800 draws of logged rows" in text
     assert "max_replays_per_row" not in text
 
 

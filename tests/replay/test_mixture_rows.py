@@ -90,7 +90,7 @@ def test_old_versions_of_a_policy_are_left_out(transitions):
     kept = taken(newest)
     assert set(kept["behaviour_version"].to_pylist()) == {"v3", None}
     gone = int(((policy == "planner") & (recording < 3)).sum())
-    assert newest.left_out == {"of an old version of its policy": gone}
+    assert newest.left_out == {"from an old version of its policy": gone}
     one_back = planned(changed, "max_versions_behind = 1\n" + NO_SPLIT + EVERY)
     assert set(taken(one_back)["behaviour_version"].to_pylist()) == {"v2", "v3", None}
 

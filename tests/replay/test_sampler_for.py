@@ -245,7 +245,7 @@ def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels):
         assert [batch["row"].tolist() for batch in loader] != first
     endless = PanelDataset(panels("limited"), BATCH, seed=0)
     endless.set_epoch(1)
-    with pytest.raises(MixtureError, match="an endless pass has no next one"):
+    with pytest.raises(MixtureError, match="an endless data set cannot start another pass"):
         next(iter(endless))
 
 

@@ -70,7 +70,7 @@ def test_a_clone_acts_as_the_drivers_did_and_says_how_well(panel: Panel, tmp_pat
     assert reported.repeating is not None
     assert reported.repeating < 0.3
     assert reported.poor is None
-    assert "held-out rows it finds" in reported.text
+    assert "held-out rows the drivers' action is its likeliest" in reported.text
     observation = np.array(panel.rows[:200, : panel.observation_size])
     action, probability = policy.act(None, observation)
     of_each = cloned_probabilities(policy.network, observation)

@@ -143,7 +143,7 @@ def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
     assert plan_evaluation(run, episodes=1000).warnings == []
     assert plan_evaluation(run, first_seed=90_000, policies=["planner"]).warnings == []
     (said,) = plan_evaluation(run, first_seed=89_991, episodes=10).warnings
-    assert "among those by which the run's policy was chosen (90000 to 90009)" in said
+    assert "among those that selected the run's policy (90000 to 90009)" in said
 
 
 def test_limiter_interventions_are_counted(tmp_path, capsys):

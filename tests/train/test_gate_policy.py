@@ -162,7 +162,7 @@ def test_a_twin_that_is_not_trusted_gives_no_verdict(run, monkeypatch, capsys):
 
     monkeypatch.setattr(gate, "find_gap", lambda run: Gap())
     assert main(["gate", str(run), "--baseline", "planner"]) == 2
-    assert "not to be trusted in wheel_slip" in capsys.readouterr().err
+    assert "cannot be trusted in wheel_slip" in capsys.readouterr().err
     assert plan_gate(run, "planner", conditions=("nominal",)).gap is not None
 
 

@@ -147,7 +147,7 @@ def test_too_few_episodes_are_not_called_a_policy_that_disagrees() -> None:
     """A single episode is worth one, whatever the policy: that says nothing of agreement."""
     alone = logged(1, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
     answers = {e.estimator: e.refused for e in _estimates(alone)}
-    assert answers["pdwis"] == "1 episode, and weights take at least 5"
+    assert answers["pdwis"] == "1 episode, and weights need at least 5"
     assert answers["fqe"] is None
 
 

@@ -84,7 +84,7 @@ def test_training_ends_as_ever_where_a_tracker_fails(tmp_path, monkeypatch, caps
     failures = tracked(tmp_path / "a")["failures"]
     assert failures["wandb"] == {"failed": 1, "first": "OSError: no route to host"}
     assert failures["mlflow"]["failed"] == GIVE_UP_AFTER
-    assert "wandb failed, training goes on" in capsys.readouterr().err
+    assert "wandb failed, training continues" in capsys.readouterr().err
 
 
 def test_tracker_that_is_not_installed_is_refused_first(tmp_path, monkeypatch, capsys):

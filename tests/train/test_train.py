@@ -101,7 +101,7 @@ def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys):
     assert main([*words, "--set", "env.conditions={nominal=1.0, wheel_slip=0.0}"]) == 0
     captured = capsys.readouterr()
     assert "warning: wheel_slip will be short by" in captured.err
-    assert "and the twin gives no fresh rows of it" in captured.err
+    assert "and the twin has no fresh rows of it" in captured.err
     slip = next(
         row
         for row in json.loads(captured.out)["panel"]["forecast"]

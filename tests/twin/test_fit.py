@@ -260,7 +260,7 @@ def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixtu
             fit(store, FitConfig(recordings=("nobody",)))
         with pytest.raises(StoreError, match=r"fewer than 8 \(of \d+: \d+ held out"):
             fit(store, FitConfig(parameters=("gain",), horizon_s=10.0))
-        with pytest.raises(StoreError, match="no stretch of 60 s"):
+        with pytest.raises(StoreError, match="no segment of 60 s"):
             fit(store, FitConfig(parameters=("gain",), horizon_s=60.0))
         with pytest.raises(ConfigError, match="must be a multiple of the control period"):
             fit(store, FitConfig(parameters=("gain",), horizon_s=0.35))

@@ -203,13 +203,13 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(floor)]
     assert main(arguments) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "only 0% of the lidar's returns lie on walls of the map" in said
+    assert "only 0% of the lidar's returns are on walls of the map" in said
     assert "--by scans" in said
     assert not floor.exists()
     assert main([*arguments, "--by", "map", "--footprint", "0.4x0.4"]) == 0  # it was asked for
     near = OccupancyGrid(hall(), CELL_M, (0.4, 0.4, 0.0))  # of a robot that is badly localised
     made = survey(write_bag(tmp_path / "near", poses=lap(), grid=near, scanned=hall()))
-    assert any("of the lidar's returns lie on walls" in note for note in made.notes)
+    assert any("of the lidar's returns are on walls" in note for note in made.notes)
 
 
 @pytest.mark.parametrize(

@@ -152,15 +152,15 @@ class EvaluationPlan:
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
         if self.missions is not None:
-            flattered = "its policy was chosen on such routes: its success is overestimated"
+            flattered = "its policy was selected on such routes: its success is overestimated"
             return [self.missions.text, *([flattered] if chosen.missions != DRAWN else [])]
         if "agent" not in self.policies or not (
             chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
         ):
             return []
         return [
-            f"seeds {self.first_seed} to {last - 1} are among those by which the run's policy was "
-            f"chosen ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is "
+            f"seeds {self.first_seed} to {last - 1} are among those that selected the run's "
+            f"policy ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is "
             "overestimated"
         ]
 

@@ -148,7 +148,7 @@ class EssGate:
             return None
         if len(logged) < self.episodes:  # refused even if policy and logs agree to the end
             noun = "episode" if len(logged) == 1 else "episodes"
-            return f"{len(logged)} {noun}, and weights take at least {self.episodes:g}"
+            return f"{len(logged)} {noun}, and weights need at least {self.episodes:g}"
         return (
             f"the importance weights leave an effective sample of {least:.1f} of {len(logged)}"
             f" episodes, less than {max(self.episodes, self.share * len(logged)):.1f}: policy and"

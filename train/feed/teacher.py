@@ -129,11 +129,11 @@ class AskedTeacher(Stateful):
             label = np.asarray(given)
         except (TypeError, ValueError) as error:  # rows of several lengths, a tensor on a GPU
             raise self._refused(
-                f"returned a {type(given).__name__} that is no array: {first_line(error)}"
+                f"returned a {type(given).__name__} that is not an array: {first_line(error)}"
             ) from error
         if label.shape != (count,) or not np.issubdtype(label.dtype, np.integer):
             what = "nothing" if given is None else f"{label.dtype} {label.shape}"
-            raise self._refused(f"returned {what}, not {count} whole numbers, one an environment")
+            raise self._refused(f"returned {what}, not {count} whole numbers, one per environment")
         outside = (label < UNKNOWN) | (label >= len(self._actions))
         if outside.any():
             env_index = int(np.flatnonzero(outside)[0])
@@ -213,8 +213,8 @@ def _raised(what: str, called: Any, error: BaseException) -> TeacherFailed:
     return TeacherFailed(
         f"{what} raised {type(error).__name__}{said}",
         where=_place(called, error),
-        remedy="correct it: it is asked by act(env, observation), and a class is made without"
-        " arguments",
+        remedy="correct it: it is called as act(env, observation), and a class is created without "
+        "arguments",
     )
 
 

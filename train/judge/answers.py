@@ -275,7 +275,7 @@ RELATIONS = (
              lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
              lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), None),
-    Relation("way to go to the speed of the pose", POSE, PLAN, SENSORS,
+    Relation("remaining distance to the speed of the pose", POSE, PLAN, SENSORS,
              lambda rows: (rows.after("localised_speed"), _route_speed(rows)), None),
     Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
              lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), None),

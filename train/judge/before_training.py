@@ -57,7 +57,7 @@ _STATUS: dict[str, Status] = {TRUSTED: "ok", UNDECIDED: "undecided", UNTRUSTED: 
 
 def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
     """Yield a row for each condition of the first of `places` (a run, a store) that has a gap."""
-    what = "where the twin ends when it drives what was logged"
+    what = "where the twin ends when it drives the logged commands"
     folder = gap_folder(places)
     if folder is None:
         shown = places[0] / FOLDER if places else f"STORE/{FOLDER}"

@@ -67,7 +67,7 @@ COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever e
 _LABELS = {  # by how the name of their checks, one a condition, begins
     "fed labels: ": (
         "LABELS_CHANGED",
-        "labels in the panel differ from the store's, of which it was made: wrong in",
+        "labels in the panel differ from those of its store: wrong in",
         "something changed labels after mixing: make the panel again with `restock mix`",
     ),
     "labels: ": (
@@ -362,7 +362,7 @@ KINDS = (
     Kind(
         "TERMINATIONS_LOST",
         ("terminated at the goal", "terminations"),
-        "of the logs' episodes that end at their goal {terminated_at_the_goal.logs:.0%} are "
+        "{terminated_at_the_goal.logs:.0%} of the logs' episodes that end at their goal are "
         "terminated there: in the others the critic bootstraps beyond the end",
         "check that the profile's [task] has the robot's goal radius, and ingest the logs again",
     ),
@@ -397,8 +397,8 @@ KINDS = (
     Kind(
         "LIDAR_SCALED",
         ("lidar scale",),
-        "the scale of the logs' lidar is {lidar_scale.effect:.2g} times the twin's: so much nearer "
-        "does what is ahead come for each metre driven",
+        "the scale of the logs' lidar is {lidar_scale.effect:.2g} times the twin's: things ahead "
+        "come nearer by this factor for each metre driven",
         "check the unit and the range of [inputs.scan], and [task] range_max_m",
     ),
     Kind(
@@ -411,7 +411,7 @@ KINDS = (
         "EPISODES_REPEATED",
         ("repeated episodes",),
         "{repeated_episodes.logs:.0%} of the rows belong to episodes that are stored twice",
-        "`restock audit` lists the recordings (repeated_steps): take one of them out with `restock"
-        " remove STORE RECORDING`",
+        "`restock audit` lists the recordings (repeated_steps): remove one of them with `restock "
+        "store remove STORE RECORDING`",
     ),
 )

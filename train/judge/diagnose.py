@@ -306,7 +306,7 @@ def confirm(
     what = None
     if rows_at_fault and cause in _NOT_CONFIRMED:
         what = "by its own figures, and only its rows are at fault: another run cannot confirm that"
-        remedy = "correct the rows, mix again, and ask `restock diagnose PANEL` about them"
+        remedy = "correct the rows, mix again, and check them with `restock diagnose PANEL`"
     elif cause in _NOTHING:
         what = "there is nothing to confirm"
     elif cause == "ACTION_COVERAGE":

@@ -355,7 +355,7 @@ def _refuse_meaningless(plan: GatePlan, config: TrainConfig) -> None:
     chosen = config.evaluation
     if chosen.seed < last and first.first_seed < chosen.seed + chosen.episodes:
         raise ConfigError(
-            f"the policy was chosen by missions of the seeds {chosen.seed} to"
+            f"the policy was selected on missions of the seeds {chosen.seed} to"
             f" {chosen.seed + chosen.episodes - 1}, which are among these",
             where="--seed",
             remedy=f"leave it out: the default is {FIRST_SEED}",
@@ -373,7 +373,7 @@ def _refuse_meaningless(plan: GatePlan, config: TrainConfig) -> None:
         )
     if bad := sorted(set(plan.gap.untrusted) & set(kinds)) if plan.gap is not None else []:
         raise RunError(
-            f"the twin is not to be trusted in {', '.join(bad)}: its gap to the logs is too large",
+            f"the twin cannot be trusted in {', '.join(bad)}: its gap to the logs is too large",
             where=where,
             remedy="fit the twin (`restock twin fit`), or leave these out with --conditions",
         )
@@ -504,7 +504,7 @@ def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
     first = plan.plans[0]
     yield (
         f"A policy that is worse by a margin or more in any condition passes with a probability of"
-        f" at most {ERROR:.0%}, whenever one looks; this is of missions drawn as the twin draws"
+        f" at most {ERROR:.0%}, whenever one looks; this holds for missions as the twin draws"
         " them, not of the robot's own day."
     )
     if plan.gap is None:
@@ -515,17 +515,17 @@ def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
         shown = ", ".join(f"{_words(one.condition)} {one.verdict}" for one in plan.gap.verdicts)
         yield f"The twin by its gap to the logs: {shown}."
     if left := [kind for kind in KINDS if kind not in first.episodes]:
-        yield f"Conditions that were not asked: {', '.join(map(_words, left))}."
+        yield f"Conditions that were not tested: {', '.join(map(_words, left))}."
     if left := [name for name in PERTURBATIONS if name not in (*first.perturbations, "nominal")]:
-        yield f"Perturbations that were not asked: {', '.join(left)}."
+        yield f"Perturbations that were not tested: {', '.join(left)}."
     if left := [name for name in MEASURES if name not in plan.margins]:
-        yield f"Measures that were not asked: {', '.join(map(_words, left))}."
+        yield f"Measures that were not tested: {', '.join(map(_words, left))}."
     yield f"Floors: {'; '.join(one.layouts for one in plan.plans)}."
     for cell in cells:
         if cell["pairs_unknown"]:
             yield (
                 f"{cell['name']}: in {cell['pairs_unknown']:,} of {cell['pairs_driven']:,} pairs"
-                " the measure says nothing."
+                " the measure is unknown."
             )
 
 

@@ -99,7 +99,7 @@ class DiagnosisLimits:
     relative: float = 3.0  # and G_k over the median G
     gap_everywhere: float = 6.0  # the median G: everything is worse held out
     lag: float = 0.25  # L: the target is far behind
-    no_lag: float = 0.002  # L below this: there is no target network to speak of
+    no_lag: float = 0.002  # L below this: there is effectively no target network
     clock: float = 2.0  # S
     explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
     supply: float = 0.1  # a condition's share of replay over its share of what driving meets

@@ -140,10 +140,10 @@ class Events:
             count.in_a_row += 1
             if count.failed == 1:
                 count.first = f"{type(error).__name__}: {first_line(error)}"
-                self._say(f"{name} failed, training goes on: {count.first}")
+                self._say(f"{name} failed, training continues: {count.first}")
             if count.in_a_row == GIVE_UP_AFTER:
                 self._open = [sink for sink in self._open if sink.name != name]
-                self._say(f"{name} failed {GIVE_UP_AFTER} times in a row: left alone from here on")
+                self._say(f"{name} failed {GIVE_UP_AFTER} times in a row: disabled from here on")
         else:
             count.in_a_row = 0
 

@@ -202,8 +202,8 @@ class CloneQuality:
         )
         if self.agreement is not None:
             said += (
-                f"; in {self.held_out_rows:,} held-out rows it finds the drivers' action likeliest"
-                f" in {self.agreement:.0%} (repeating the last one: {self.repeating:.0%}"
+                f"; in {self.held_out_rows:,} held-out rows the drivers' action is its likeliest "
+                f"in {self.agreement:.0%} (repeating the last one: {self.repeating:.0%}"
             )
             if self.changed_agreement is not None:
                 said += f"; where they changed it: {self.changed_agreement:.0%}"

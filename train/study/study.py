@@ -51,7 +51,9 @@ class ArmConfig(Checked, frozen=True):
         if self.library is None and self.arguments:
             raise ValueError("arguments need a library")
         if self.library is not None and (self.mixture is not None or self.panel is not None):
-            raise ValueError("library: without logs here, so do not give mixture or panel")
+            raise ValueError(
+                "library: its arm learns without logs, so do not give mixture or panel"
+            )
 
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -307,7 +309,7 @@ def check_jobs(plan: StudyPlan) -> None:
         requested = json.loads(plan.fingerprint(job))
         if made != requested:
             raise RunError(
-                "was made otherwise than the study now asks: then "
+                "was trained with other settings than the study now gives: then "
                 f"{_only(made, requested)}, now {_only(requested, made)}",
                 where=str(job.path),
                 remedy="remove it, or give the study another --out",

@@ -117,7 +117,7 @@ def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) 
                 continue
             if isinstance(error, RestockError) and not all(one.done() for one in futures):
                 say(str(error).splitlines()[0])
-                say("nothing more is begun; waiting for what runs (Ctrl-C checkpoints it)")
+                say("no more runs begin; waiting for those under way (Ctrl-C checkpoints them)")
             raise error
     except BaseException as stop:
         pool.shutdown(wait=False, cancel_futures=True)

@@ -24,7 +24,7 @@ from restock.process import hidden, kill_as_interrupt, was_interrupted, when_imp
 VERBS = {
     "demo": "all of the below, on sample_logs/",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
-    "info": "what is in these recordings or stores; without one: does this machine do?",
+    "info": "what is in these recordings or stores; without a path: is this machine ready?",
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
     "sql": "query a store (or a run) in SQL",
@@ -344,7 +344,7 @@ def work_goes_on() -> Iterator[None]:
         sys.stdout = patient.stream
     if patient.failed is not None and not isinstance(patient.failed, BrokenPipeError):
         raise ConfigError(
-            f"cannot be written: {patient.failed.strerror}; all else is done",
+            f"cannot be written: {patient.failed.strerror}; everything else is done",
             where="what it prints (stdout)",
         ) from patient.failed
 

@@ -182,7 +182,7 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
     if not len(segments):
         why = ", ".join(f"{steps} {reason}" for reason, steps in segments.left_out.items())
         raise StoreError(
-            f"no stretch of {config.horizon_s:g} s, of {len(steps)} steps: {why}",
+            f"no segment of {config.horizon_s:g} s, of {len(steps)} steps: {why}",
             where=str(store.path),
             remedy="give a shorter horizon, or ingest more driving",
         )

@@ -539,9 +539,10 @@ def _not_done(
         )
     elif difference > AGREES:
         yield (
-            "What the lidar sees was not compared: the log was driven on another floor than the"
-            f" twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is the"
-            " most). Steps were driven on an empty floor: clearances in their rewards are the "
+            "Lidar readings were not compared: the log was driven on another floor than the "
+            "twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is "
+            "the limit). Steps were driven on an empty floor: clearances in their rewards are "
+            "the "
             "log's own, and there are no obstacles."
         )
     if steps.robot is None and steps.task.body != load_profile("warehouse_amr").task.body:
@@ -561,17 +562,17 @@ def _not_done(
         )
     for path in paths:
         if not len(path.episode_id):
-            yield f"No stretch of {path.horizon_s:g} s could be driven again."
+            yield f"No segment of {path.horizon_s:g} s could be driven again."
     last_steps = int((~steps.followed).sum())
     if last_steps:
         yield f"{last_steps} last steps of episodes have no step after them to compare with."
     if stepped.unexplained:
         yield (
-            f"The rewards of {stepped.unexplained} steps are not the sum of their terms by this"
-            " version's task: their gaps by term are of the terms as recomputed."
+            f"The rewards of {stepped.unexplained} steps are not the sum of their terms by this "
+            "version's task: their gaps by term use recomputed terms."
         )
     if not stepped.valid.all():
-        yield f"{int((~stepped.valid).sum())} steps were left out: the physics broke."
+        yield f"{int((~stepped.valid).sum())} steps were left out: the physics diverged."
     yield (
         "Pallets, people and slippery patches of the log are not in the replay: it drives on an "
         "empty, dry floor."

@@ -221,7 +221,7 @@ def _place_problems(model: mujoco.MjModel, wheels: list[int], steers: bool) -> l
     if abs(float(axle[:, 0].mean())) > PLACE_M:
         problems.append(
             f"its {'rear ' if steers else ''}wheels are {axle[:, 0].mean():.2f} m ahead of the"
-            " base: poses are the axle's, so the base must stand there"
+            " base: poses are the axle's, so the base must be there"
         )
     if not (places[0::2, 1] > 0).all() or not (places[1::2, 1] < 0).all():
         problems.append("its left wheels must be at y > 0, its right ones at y < 0")

@@ -577,8 +577,8 @@ def blocks_of(task: Task, timestep_s: float) -> tuple[int, float]:
             remedy="use .01, .005, .002 or .001",
         )
     raise ConfigError(
-        f"control_period_s = {period_s} is not some physics timesteps of {timestep_s} s"
-        + (f", in {blocks} equal parts" if blocks > 1 else ""),
+        f"control_period_s = {period_s} is not a whole number of physics timesteps of "
+        f"{timestep_s} s" + (f", in {blocks} equal parts" if blocks > 1 else ""),
         where="task",
         remedy="use a control period of some hundredths of a second, even above .1 s, as .05, .08"
         " or .12, or a smaller timestep_s",

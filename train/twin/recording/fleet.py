@@ -261,7 +261,7 @@ class ExternalPolicy:
             if (probability < 1).any():
                 raise ConfigError(
                     f"{self.name} is stochastic itself: the probability of an action that epsilon "
-                    "chooses is not known",
+                    "chooses is unknown",
                     where="--epsilon",
                     remedy="leave it out",
                 )

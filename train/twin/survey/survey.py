@@ -127,7 +127,7 @@ def survey(
     """
     if recording is not None and not is_store(path):
         raise ConfigError(
-            "a recording is chosen of a store, and this is none", where=str(path),
+            "a recording can only be chosen from a store, and this is not one", where=str(path),
             remedy="leave it out, or give the store",
         )  # fmt: skip
     choose_definitions(definitions)  # once, not for each recording of a folder
@@ -294,7 +294,7 @@ def _check_frames(
     on = grid.cells_at(poses.places_m)[1]
     off, walls = float((~on).mean()), float((on & (found > FREE)).mean())
     unknown = float((on & (found == UNKNOWN)).mean())
-    said = f"of {len(poses):,} {poses.source}, {off:.0%} lie off the map, {walls:.0%} in walls" + (
+    said = f"of {len(poses):,} {poses.source}, {off:.0%} are off the map, {walls:.0%} in walls" + (
         f" and {unknown:.0%} where it is unknown" if unknown >= 0.005 else ""
     )
     frames = ""
@@ -322,7 +322,7 @@ def _check_walls(
     """
     by_clock = [returns_on_walls(one, grid) for one in scans]
     agree = max((share for share in by_clock if share is not None), default=1.0)
-    said = f"{agree:.0%} of the lidar's returns lie on walls of the map"
+    said = f"{agree:.0%} of the lidar's returns are on walls of the map"
     if agree < MIN_ON_WALLS:
         raise ConfigError(
             f"only {said}: it is not a map of this place, or the poses are in another frame",

@@ -323,7 +323,7 @@ def _print(entry: dict[str, Any]) -> None:
         sys.stdout.write(f"{_packed(packed)}\n")
     output.print_table(rows, shown)
     if not clocked:
-        sys.stdout.write("not decoded, so damage may be unseen: --clocks reads every message\n")
+        sys.stdout.write("not decoded, so damage may be missed: --clocks reads every message\n")
     output.print_skipped({name: topic["skipped"] for name, topic in entry["topics"].items()})
     for what, names in (
         ("attachments", [item["name"] for item in entry["attachments"]]),

@@ -266,7 +266,7 @@ def show(outcome: IngestResult) -> None:
         for name, count in outcome.conditions.items()
     ]
     output.print_table(labels, output.reported(labels))
-    if outcome.exposures:  # whatever came of them
+    if outcome.exposures:  # whatever the outcome
         labels = [
             {"exposure": name, "transitions": count, **against_truth(name)}
             for name, count in outcome.exposures.items()

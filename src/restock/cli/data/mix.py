@@ -206,14 +206,14 @@ def _summary(document: dict[str, Any]) -> list[str]:
     ]
     if any(line["missing_hours"] is not None for line in strata):
         lines.append(
-            "hours: of driving as in these logs, with nothing chosen for a stratum, until its rows"
-            " are there: median (95 %); `restock coverage gaps` plans what to log"
+            "hours: driving like that in these logs, not chosen for a stratum, until its rows "
+            "are recorded: median (95 %); `restock coverage gaps` plans what to log"
         )
     if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
         lines.append(
             f"logged rows fill {document['logs_share']:.1%} of a batch, not"
-            f" {document['logs_share_wanted']:.1%} ([sources]): there are not enough; the shares"
-            " drawn are of those that fill it"
+            f" {document['logs_share_wanted']:.1%} ([sources]): there are not enough; shares "
+            "drawn are of the rows that fill it"
         )
     for fit in document["density_ratios"]:
         lines.append(
@@ -227,8 +227,8 @@ def _summary(document: dict[str, Any]) -> list[str]:
     )
     left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
     draws = [
-        f"these numbers are for {document['planned_draws']:,} logged rows drawn"
-        " (planned_draws: set it to what you train); a run plans with its own"
+        f"these numbers are for {document['planned_draws']:,} draws of logged rows (set "
+        "planned_draws to those of your training); a run plans with its own number"
     ]
     if (most := document["max_replays_per_row"]) is not None:
         draws += _in_training(document, most)

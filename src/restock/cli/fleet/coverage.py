@@ -117,8 +117,8 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
 
 
 _MEANING = {
-    "hours": "hours: of driving as logged so far, until one gap is closed: median (95 %); as in"
-    " `restock mix`",
+    "hours": "hours: driving like that logged so far, until one gap is closed: median (95 %);"
+    " as in `restock mix`",
     "missions": "missions: of the kind that is best, until one gap is closed: median (95 %)."
     " `restock mix` counts hours of driving as logged, nothing chosen: --unit hours",
 }
@@ -243,7 +243,7 @@ def _print_gaps(answer: dict[str, Any]) -> None:
             f" {figure(plan['total_high'])})"
             + (f", {figure(plan['hours'])} hours" if unit == "missions" else "")
             + f": each gap is then closed with a probability of {answer['confidence']:.0%} or more,"
-            " not with that of 50% as by the table above"
+            " not 50% as in the table above"
         )
     if "missions_file" in answer:
         output.print_text(f"-> {answer['missions_file']}")

@@ -76,8 +76,8 @@ class CompactCommand:
         if done.summaries:
             get = "would get" if self.dry_run else "got"
             output.say(
-                f"{counted(done.summaries, 'recording')} {get} a summary, having none of the rows"
-                " as they are"
+                f"{counted(done.summaries, 'recording')} {get} a summary, having none for their "
+                "present rows"
             )
         if done.changed_meanwhile:
             output.say(
@@ -107,7 +107,7 @@ class CompactCommand:
             )
         if done.unnamed_transitions:
             unnamed = counted(done.unnamed_transitions, "transition")
-            output.say(f"{unnamed} more were of recordings that no manifest names")
+            output.say(f"{unnamed} more belonged to recordings that no manifest names")
         return ExitCode.LOSSY if done.dropped else ExitCode.OK
 
 

@@ -145,8 +145,9 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
             for symptom in figures.symptoms
         ],
         key=("run", "condition") if several else ("condition",),
-        title="supply: share of replay / of what driving meets; agreement: logged rows that look"
-        " like it; unexplained: of their next observations; G: |TD| held out / in replay",
+        title="supply: share in replay / share met while driving; agreement: share of logged rows "
+        "that look like it; unexplained: variance of their next observations; "
+        "G: |TD| held out / in replay",
     )
     print_text(f"{diagnosis.cause}")
     for line in diagnosis.evidence:

@@ -221,8 +221,8 @@ def _progress_note(values: dict[str, Any]) -> str:
 
 def _silence_line(values: dict[str, Any]) -> str:
     return (
-        f"warning: the teacher answered none of the {values['asked']:,} states that it was asked"
-        " (-1: no opinion), so nothing was learnt from it in the twin"
+        f"warning: the teacher had no opinion (-1) in any of the {values['asked']:,} states in "
+        "which it was asked, so nothing was learnt from it in the twin"
     )
 
 
@@ -423,10 +423,7 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
     return (
         f"teacher {teacher.source}: the policy chooses by Q among the actions that it finds"
         " plausible; "
-        + (
-            (first if rows else "there are no logged rows to clone, so at first all actions are")
-            + mirrored
-        )
+        + ((first if rows else "no logged rows to clone: at first all actions are") + mirrored)
     )
 
 
@@ -439,7 +436,7 @@ def _not_evaluated(document: dict[str, Any]) -> list[str]:
         + (
             "no log contains it"
             if LIDAR_SIGNALS.issuperset(signals)
-            else "its stratum is of logs alone"
+            else "its stratum consists of logs alone"
         )
         for name, signals in document.get("not_evaluated", {}).items()
     ]

@@ -315,7 +315,7 @@ def robot_line(profile: Path | str | None) -> str:
 
     robot = None if profile is None else load_profile(str(profile)).robot
     if robot is None:
-        return "the twin's default robot, as nothing describes yours: give --urdf FILE"
+        return "the twin's default robot, because nothing describes yours: give --urdf FILE"
     reported = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
     guessed = []
     for key, name, unit in (

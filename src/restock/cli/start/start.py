@@ -100,7 +100,7 @@ class Way:
         recording = base or recording
         checked = self.work.do(stages.check(to, recording))
         if not checked.good:
-            known = "; if it is of another robot, give only the recordings of this one"
+            known = "; if it is from another robot, give only the recordings of this one"
             raise Stop(
                 f"the profile does not fit {recording}",
                 f"edit {to.profile}{known if len(readable) > 1 else ''}",
@@ -193,7 +193,8 @@ class Way:
             if unseen:
                 names = ", ".join(unseen).replace("_", " ")
                 self._warn(
-                    f"no missions of {names}: without a lidar, a robot finds it by driving into it"
+                    f"no missions of {names}: without a lidar, a robot finds a block only by "
+                    "driving into it"
                 )
                 to = replace(to, kinds=tuple(kinds))
         gap, fitted = self._fit()

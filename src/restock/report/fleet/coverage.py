@@ -86,7 +86,7 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
         "title": f"Coverage of {gaps['store']}",
         "headline": headline(found["shelves"], gaps),
         "lead": f"How much of each condition the logs hold, and what mixture {gaps['mixture']} "
-        "and the audits ask for and do not find.",
+        "and the audits require and do not find.",
         "cards": [
             *({"value": count(n), "label": plural(n, noun)} for noun, n in numbers.items()),
             to_log(gaps),

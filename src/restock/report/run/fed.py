@@ -133,8 +133,8 @@ def fed_table(facts: Facts) -> Table:
     }
     return Table(
         shown(facts.fed, columns),
-        caption="Shares are of all rows fed, over the whole run. Natural: what the same sources "
-        "would have given if drawn from uniformly.",
+        caption="Shares are of all rows fed, over the whole run. Natural: the share under uniform "
+        "draws from the same sources.",
     )
 
 

@@ -210,7 +210,9 @@ def _safety(facts: Facts, name: str) -> str:
         f"{measured(other, 'bumps_per_km', '.0f')}"
     )
     if name == "planner" and own.get("time_lost_s") is not None:
-        text += f"; where both arrived it took {measured(own, 'time_lost_s', '+.1f')} s"
+        text += (
+            f"; on missions that both completed it took {measured(own, 'time_lost_s', '+.1f')} s"
+        )
     return text.replace("-", "−") + "."
 
 

@@ -42,7 +42,7 @@ COLOURS = {
 _MEANING = {
     TRUSTED: "shown to be within the limits",
     UNTRUSTED: "shown to be beyond a limit",
-    UNDECIDED: "the interval holds a limit: more logs would decide",
+    UNDECIDED: "the interval contains a limit: more logs would decide",
     UNKNOWN: "too few segments or episodes",
 }
 
