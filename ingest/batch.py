@@ -1,11 +1,10 @@
 """Several recordings: one after the other, in several processes, or on a Ray cluster.
 
-A process that dies (killed, or out of memory) costs the recording it was reading, by name; the
-others go on, and another process takes its place. They write files; this process commits
-them, several at once, so that a fleet's recordings are not two commits each. Processes are forked
-from a server that has imported what they need once: forking this process, with its threads, would
-not be safe. It imports that while this process does, so nothing here is imported before it is
-needed.
+If a process dies (killed, or out of memory), the recording it was reading fails by name; another
+process replaces it. The processes write files. This process commits them, several at once, so that
+a fleet's recordings are not two commits each. Processes are forked from a server that has imported
+what they need once: forking this process, with its threads, would not be safe. The server imports
+in parallel with this process.
 
 On a Ray cluster (of RAY_ADDRESS, or one started on this machine) every machine must have Restock
 installed, and see recordings and store by the same paths: a shared file system, or a store on S3.
@@ -107,11 +106,10 @@ def ingest_all(
 ) -> Iterator[Result]:
     """Yield each recording's outcome or error, in the order of `paths`, after its commit.
 
-    Each recording is read, and its files are written, by one worker; this process commits them,
-    those of some seconds together, so the store is the same as after one worker. With Ray,
-    `workers` is how many it may start at once where it starts on this machine. `watch` is told how
-    far a recording is, where they are read one after the other. What is not committed when the
-    caller stops early is not kept.
+    One worker reads a recording and writes its files. This process commits the files of some
+    seconds together, so the store is the same as with one worker. With Ray, `workers` is the number
+    of processes if Ray is started on this machine. `watch` gets the progress of a recording if they
+    are read one after the other. If the caller stops early, uncommitted recordings are not kept.
 
     Raises:
         ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
@@ -194,10 +192,8 @@ def side_by_side(
     """Yield what `work` returns for each path, with its place, as it comes.
 
     A path whose process died gives `died(path, exit code)`. Yields None if nothing came for
-    `patience_s()` seconds, which is evaluated at each wait.
-
-    The largest recordings are begun first, so that no process is left alone with one at the end.
-    When the caller stops early, or Ctrl-C does, no work goes on.
+    `patience_s()` seconds, which is evaluated at each wait. The largest recordings begin first, so
+    that none of them runs alone at the end. If the caller or Ctrl-C stops early, all work ends.
     """
     ahead = deque(sorted(range(len(paths)), key=lambda place: -_size(paths[place])))
     pool: list[_Worker[T]] = []

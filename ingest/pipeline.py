@@ -65,13 +65,13 @@ def ingest(
 ) -> IngestResult:
     """Read one recording and write its transitions to the store (None: a dry run).
 
-    A recording that is in the store as this profile, these conditions and this software would
-    put it there is left alone, unless `force`. One whose rows are largely those of another
-    recording in the store (a part of it, a copy) is kept and said, refused, or takes the place of
-    a part of it, by `repeated`.
-    `tags` say whose drive it is, before what the recording says itself; "" takes a tag off. Where
-    only tags or the profile's [robot] are new, the rows that are there are written with them: the
-    status is "tagged". `watch` is told what is being done, how much of it is, and of how much.
+    A recording is skipped if this profile, these conditions and this software have already put it
+    into the store, unless `force`. `repeated` decides about a recording whose rows are largely
+    those of another one in the store (a part of it, a copy): it is kept and reported, refused, or
+    replaces a part of itself. `tags` say whose drive it is and override the recording's own; ""
+    removes a tag. If only tags or the profile's [robot] are new, the stored rows are written again
+    with them: the status is "tagged". `watch` gets the progress: what is being done, how much of it
+    is done, and of how much.
 
     Raises:
         RecordingError: no recording, damaged (unless `salvage`), not of this profile, it gives
@@ -122,8 +122,8 @@ def prepare(
 ) -> Prepared:
     """Read one recording and write its files, for a commit to come (`commit_all`).
 
-    `settle(recording_id)` is called before the store is asked for the recording: what waits for its
-    commit is not seen there.
+    `settle(recording_id)` is called before the recording is looked up in the store, which does not
+    show recordings that wait for their commit.
 
     Raises as `ingest`, which does both.
     """

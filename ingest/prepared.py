@@ -1,11 +1,10 @@
 """Recordings whose files are written, and their commit: several at once where many are read.
 
-Nothing of a recording shows before its commit, so a process that is killed loses what waited and no
-more: the same command reads those again. The first one is committed when it is there; after that
-those of GROUP_S seconds together, or as soon as MAX_WAITING wait.
-
-Recordings are also taken out in one commit. Neither their files nor their manifests are deleted
-then: versions before read them until the retention is over, as they do what was ingested again.
+A recording is visible only after its commit, so a killed process loses only those that waited: the
+same command reads them again. The first recording is committed at once; after that, those of
+GROUP_S seconds together, or as soon as MAX_WAITING wait. Recordings are also removed in one commit.
+Neither their files nor their manifests are deleted then: earlier versions need them until the
+retention is over, as they need replaced ones.
 """
 
 from __future__ import annotations
@@ -70,9 +69,9 @@ class Prepared:
 def commit_all(
     store: StoreWriter, prepared: Sequence[Prepared]
 ) -> list[IngestResult | StoreError | RecordingError]:
-    """Commit recordings, several in one; what became of each, in their order.
+    """Commit recordings, several in one; return the result of each, in their order.
 
-    One that cannot be committed costs itself alone.
+    If one cannot be committed, the others still are.
     """
     outcomes: dict[int, IngestResult | StoreError | RecordingError] = {}
     group: dict[int, Prepared] = {}

@@ -1,9 +1,8 @@
 """Relabel: run conditions again over the signals that are stored, without the recordings.
 
 Rows, observations and rewards stay as they were ingested; `condition`, `conditions` and
-`labels_version` become new, and so do the manifest's scores. Corrections that people made are laid
-over the new labels (`correct_store` takes those into the store). All recordings change in one
-commit.
+`labels_version` become new, and so do the manifest's scores. People's corrections override the new
+labels (`correct_store` puts them into the store). All recordings change in one commit.
 """
 
 from __future__ import annotations
@@ -256,7 +255,7 @@ class Corrected:
 def correct_store(
     store: StoreWriter, given: Mapping[str, RecordingCorrections], *, dry_run: bool = False
 ) -> tuple[list[Corrected], int | None]:
-    """Lay corrections over the labels of these recordings (by their ids), all in one commit.
+    """Apply corrections to the labels of these recordings (by their ids), all in one commit.
 
     Returns what became of each, and the version of `transitions` (None: nothing was written).
 
@@ -287,7 +286,7 @@ def correct_store(
 def remove_corrections(
     store: StoreWriter, *, dry_run: bool = False
 ) -> tuple[list[Corrected], int | None]:
-    """Take all corrections out of a store: its rules' own labels are there again.
+    """Remove all corrections from a store, which restores the labels by the rules.
 
     Raises:
         StoreError: rows were written before their episodes' ends were kept.

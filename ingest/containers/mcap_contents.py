@@ -1,8 +1,8 @@
 """Contents of an MCAP file: chunks, loose messages, channels and counts, from one walk.
 
-The summary at a file's end is used for counts and compared for schemas and channels, never used
-for where things are: the walk over the top-level records is cheap (a few records a chunk) and finds
-all there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
+The summary at a file's end is used for counts, and its schemas and channels are compared, but its
+places are never used: the walk over the top-level records is cheap (a few records per chunk) and
+finds everything in a file with a wrong summary, or none. See https://mcap.dev/spec.
 
 Beyond damage, chunks whose place can be proven are read again (`resume`). Where the summary at the
 file's end is whole, its chunk index gives the places of chunks; a chunk's record must agree.
@@ -255,10 +255,10 @@ _NAMES = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 
 
 def resume(file: FileBytes, contents: Contents) -> list[str]:
-    """Add what lies beyond the place where the walk ended; what is lost, in words.
+    """Add what lies after the place where the walk ended; return the losses in words.
 
-    Where nothing can be proven, the file is read up to the damage, and what there is of the
-    chunk that was cut.
+    If no later chunk can be proven, only the part before the damage is read, with the intact part
+    of the truncated chunk.
     """
     cut = contents.cut
     if cut is None:

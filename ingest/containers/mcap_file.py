@@ -294,7 +294,7 @@ GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's 
 class McapFile:
     """An MCAP file, chunked or not, with or without summary, statistics and message index.
 
-    `watch` is told how far it is opened: without statistics its messages must be counted.
+    `watch` gets the progress of opening: without statistics the messages must be counted.
 
     Raises:
         RecordingError: no MCAP file, or cut short and not to be salvaged.
@@ -411,7 +411,7 @@ class McapFile:
     def _compared(self, found: Definitions, checked: bool) -> Definitions:
         """Compare the data section's definitions with the summary's copies; differences are damage.
 
-        What no CRC checks gives way to copies that one confirms.
+        If no CRC covers the data section but one confirms the summary, the copies count.
         """
         copies = self._contents.copies
         trusted = "summary" if self._contents.summary_proven and not checked else "data"
@@ -478,7 +478,7 @@ class McapFile:
     def _ahead(self, wanted: set[int]) -> bool:
         """Return whether decompressing on other threads pays: enough work, and a free core.
 
-        Of chunks far larger than a group, several at once would take too much memory.
+        Several chunks far larger than a group would take too much memory at once.
         """
         sizes = [sum(chunk.size for chunk in group) for group in self._groups(wanted)]
         return (

@@ -45,9 +45,9 @@ crc32 = _fastest_crc32()  # (data, CRC of what came before = 0)
 
 
 class FileBytes:
-    """A file's bytes, read where they are asked for.
+    """A file's bytes, read on access.
 
-    It is not mapped into memory: where a file that is mapped shrinks, reading it kills the process.
+    It is not mapped into memory: if a mapped file shrinks, reading it kills the process.
     """
 
     WINDOW = 16 << 10  # bytes kept of the last small read: fields are read one by one
@@ -478,7 +478,7 @@ def indexed_messages(
 ) -> Messages | None:
     """Find a channel's messages by its index entries in some chunks, which lie in this order.
 
-    None where the index does not fit the chunks: then they are to be walked.
+    None if the index does not fit the chunks: then the chunks must be walked.
     """
     if any(len(part.entries) % _INDEX.itemsize for part in parts):
         return None

@@ -373,8 +373,8 @@ def open_recording(
             .idl definitions, which is used on top of Humble's; "jazzy+a/folder" names both.
         salvage: read what can still be read of a file that is cut short or damaged, instead of
             refusing it; what is missing is in the recording's `lost_messages`.
-        watch: is told how far a long opening, and later a long read, is: what is being done, how
-            much of it is done, and of how much.
+        watch: gets the progress of a long opening or read: what is being done, how much of it is
+        done, and of how much.
 
     Raises:
         RecordingError: no such file, empty, a Git LFS pointer, no recording, cut short (unless
@@ -386,10 +386,10 @@ def open_recording(
 
 
 def refuse_no_recording(path: Path) -> None:
-    """Refuse what is no recording by its files' names and first bytes, which are quick to read.
+    """Reject paths that are not recordings, by file name and magic bytes.
 
-    Raises:
-        RecordingError: it is none; one that is damaged further on is not refused.
+    Raises: RecordingError: it is not one. A recording that is damaged later in the file is not
+    refused.
     """
     opening = _Opening(path, DEFAULT_DISTRO, False, unwatched)
     for file in opening.files():

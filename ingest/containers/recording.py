@@ -290,9 +290,8 @@ class Recording:
     ) -> dict[str, TopicColumns]:
         """Read columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
 
-        A topic that cannot be decoded is left out; `accounts` has the reason. `reductions`
-        names, of some of these topics, fields that are made into others as they are read: for
-        fields that are wide, and of which little is needed.
+        A topic that cannot be decoded is left out; `accounts` has the reason. `reductions` replaces
+        wide fields of some topics by smaller ones while they are read.
 
         Raises:
             RecordingError: it has no such topic, or its messages no such field, or it is closed.
@@ -338,8 +337,8 @@ class Recording:
     def raw_between(self, low_ns: int, high_ns: int) -> list[RawMessage]:
         """Return messages logged in [low_ns, high_ns] and those in force before, by log time.
 
-        In force is each topic's last message before it, and of `/tf_static`, on which several
-        nodes publish, all of them.
+        In force are each topic's last message before `low_ns`, and all messages of `/tf_static`, on
+        which several nodes publish.
         """
         self._expect_open()
         before: dict[str, list[RawMessage]] = {}

@@ -364,7 +364,7 @@ def _add_rows(rows: list[_Row], pending: dict[int, PendingBatch]) -> int:
 
 
 def guard(connection: sqlite3.Connection, size: int) -> None:
-    """Bound what queries on a file of `size` bytes may take.
+    """Limit the time of queries on a file of `size` bytes.
 
     A query that runs for longer than the file can have rows is interrupted: that raises
     sqlite3.OperationalError, as damage does.

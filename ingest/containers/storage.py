@@ -1,9 +1,9 @@
 """Interface that every container of messages implements, between file formats and recordings.
 
 Also rosbag2's own zstd, around a whole storage file or around each message, and the reading of one
-topic: batches of payloads in, columns out, and an account of losses. Of a batch only the wanted
-fields stay, and of wide ones (a scan's ranges) only what a `Reduction` makes of them: what is in
-memory does not grow with a recording's bytes.
+topic: batches of payloads in, columns out, and an account of losses. Only the wanted fields of a
+batch are kept, and of wide fields (a scan's ranges) only the result of a `Reduction`: memory does
+not grow with a recording's bytes.
 """
 
 from __future__ import annotations
@@ -152,10 +152,10 @@ class Storage(Protocol):
     """An open file of messages.
 
     `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
-    last log time, or None when it holds no message. `damage` is final once everything wanted
-    has been read. `notes` are for the user to know and lose nothing. `extras` are listed, not read;
-    `metadata` is what of them says something of the whole recording. `packed` is empty where a file
-    has no chunks. `from_ros2` says whether a ROS 2 middleware serialised its messages.
+    last log time, or None when it holds no message. `damage` is final once everything wanted has
+    been read. `notes` inform the user about things that lose no data. `extras` are listed, not
+    read; `metadata` are the entries among them that describe the whole recording. `packed` is empty
+    if a file has no chunks. `from_ros2` says whether a ROS 2 middleware serialised its messages.
     """
 
     channels: dict[int, Channel]
@@ -477,8 +477,8 @@ class TopicReading:
 def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:
     """Yield the same messages in the same order, with small batches of a channel put together.
 
-    Decoding has a cost per batch, besides that per message: of a topic of few messages a second
-    there are only a handful in 8 MiB of a recording.
+    Decoding has a cost per batch besides the cost per message, and a slow topic has only a handful
+    of messages in 8 MiB of a recording.
     """
     pending: dict[int, PendingBatch] = {}
     for channel, batch in batches:

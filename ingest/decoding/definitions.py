@@ -89,8 +89,8 @@ def _idl_types(text: str) -> Typesdict:
 def _where(error: Exception) -> str:
     """Say where parsing ended.
 
-    rosbags' errors have a line of the whole text, one of the place in it, what is there, and
-    perhaps a set of what was expected.
+    The errors of rosbags hold the whole text on one line, then the place, what is there, and
+    perhaps what was expected.
     """
     lines = re.sub(r"\n\{['\"].*\Z", "", str(error) or type(error).__name__).splitlines()
     if len(lines) < 3:

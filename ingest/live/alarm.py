@@ -1,10 +1,11 @@
 """The alarm of a policy file: on where the robot is as it was before logged failures began.
 
-The score of an observation is linear: it tells the last second before bumps, takeovers and stops
-from drives without any (Fisher's discriminant). Its threshold is by split conformal prediction over
-episodes, as the warning regions of arXiv:2501.04823 are: a new episode that fails has no alarm in
-the window before with probability `miss_rate` at most, if it is exchangeable with those that set
-the threshold. It is not if another policy drives, on another site, or in another mix of missions.
+The score of an observation is linear: it separates the last second before bumps, takeovers and
+stops from drives without any (Fisher's discriminant). Its threshold is by split conformal
+prediction over episodes, as the warning regions of arXiv:2501.04823 are: a new episode that fails
+has no alarm in the window before with probability `miss_rate` at most, if it is exchangeable with
+those that set the threshold. It is not if another policy drives, on another site, or in another mix
+of missions.
 """
 
 from __future__ import annotations

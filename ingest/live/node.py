@@ -1,9 +1,10 @@
 """The ROS 2 node: a lifecycle node that drives by an exported policy, or says what it would drive.
 
-Unconfigured it knows nothing. Configured (inactive) it listens, decides and reports on
-/diagnostics, and commands nothing. Active it publishes commands; in shadow mode only what they
-would have been. It publishes a stop if an input cannot be relied on, its timer stalls (a steady
-clock watches it), or it is deactivated or shut down; while a person drives, nothing.
+Unconfigured, it has no policy. Configured (inactive), it listens, decides and reports on
+/diagnostics, but publishes no commands. Active, it publishes commands; in shadow mode it only
+publishes what they would have been. It publishes a stop if an input cannot be relied on, its timer
+stalls (a steady clock watches it), or it is deactivated or shut down; while a person drives,
+nothing.
 
 A recording of its topics has the limiter's rule, the proposed action and what would have been
 driven as columns (`limiter_rule`, `shadow_action`, `shadow_speed_mps`, `shadow_yaw_rate_radps`),

@@ -1,11 +1,10 @@
 """The observation on a running robot: messages as they come, by the same code as a recording's.
 
-A recording is read in columns, and its steps are made of all of them at once. On a robot there are
-the last few messages of each topic and the tick that is now. Both go through the same holds, fills
-and `restock.ingest.task.task.observe`; all that is different is who hands over the columns.
-
-`LiveClock` works out from the messages so far what `align` works out of a whole recording: the
-median offset, or where the clocks drift, a line through the delays of the last seconds.
+A recording is read in columns, and all its steps are made at once. On a robot there are only the
+last few messages of each topic and the current tick. Both use the same holds, fills and
+`restock.ingest.task.task.observe`; only the source of the columns differs. `LiveClock` computes
+from the messages so far what `align` computes from a whole recording: the median offset or, if the
+clocks drift, a line through the delays of the last seconds.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class LiveClock:
     def agrees(self, log_time_ns: int, stamp_ns: int) -> bool:
         """Return whether a stamp is near the clock; any is before the first message.
 
-        For that the clock of a moment ago will do: a fit to every message takes longer.
+        A recent clock is accurate enough for that: fitting it to every message would take longer.
         """
         if not self._topics:
             return True
@@ -199,13 +198,13 @@ class _Message:
 class LiveObserver:
     """Takes messages as they are received, and makes the observation of a tick.
 
-    A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags').
-    Messages are held back to what the tick before held: memory does not grow.
+    A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags'). Older
+    messages than the last tick needed are dropped, so memory does not grow.
 
     Args:
-        profile: what to take, and how.
-        max_ahead_s: refuse a message whose stamp is ahead of its log time by more. None: take it,
-            as of a recording, whose log time may be another computer's.
+        profile: what to take, and how. max_ahead_s: refuse a message whose stamp is ahead of its
+        log time by more. None: accept it, as in a recording, whose log time may be another
+        computer's.
 
     Raises:
         ConfigError: the profile takes what is `not_live`.

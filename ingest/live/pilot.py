@@ -1,8 +1,8 @@
 """Decisions of an exported policy, message by message: observation, proposal, limiter, takeovers.
 
-`restock export RUN --to onnx` writes the policy. All that the robot needs stands in it: the
-profile as TOML, which says what to subscribe to and what observation, actions and limits are.
-Neither ROS nor PyTorch is needed: the node, a played recording and the tests all drive by it.
+`restock export RUN --to onnx` writes the policy. The file holds all that the robot needs: the
+profile as TOML, with the topics to subscribe to, the observation, actions and limits. Neither ROS
+nor PyTorch is needed: the node, a played recording and the tests all use this module.
 
 The decision is to stop, with a reason, if an input is silent, stale or unreadable, a clock went
 back, no beam of a scan says anything, or the policy's output is not a number.
@@ -53,9 +53,9 @@ class Pilot:
     """Takes messages as they are received, and decides when it is asked.
 
     Args:
-        policy: with its profile.
-        limits: of the limiter; None: no limiter, but what is not known is still a stop.
-        takeover_topic: a Bool that is true while a person drives; "": none. The profile's
+        policy: with its profile. limits: of the limiter; None: no limiter, but an unknown input
+        still stops the robot. takeover_topic: a Bool that is true while a person drives; "": none.
+        The profile's
             `command_sources` of OPERATORS count as well: a button that is pressed, or commands of
             the last ACTIVE_S.
         alarm_speed_mps: the fastest that the limiter allows while the alarm is on; None: as fast as

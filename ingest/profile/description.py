@@ -4,11 +4,10 @@ Of a URDF it reads the links, where their joints put them, and how large their s
 text is read once and carried in the profile; the twin that builds it checks what it must contain
 (docs/robot.md).
 
-The text may be anyone's: entities, documents that are too long and numbers that are none are
-refused or read as unknown, and no other file is opened, so a mesh has no size.
-
-The base is the link of a usual name, else the one that no joint places. Whether that is the body or
-a footprint below it makes no difference: heights are over the floor.
+The text is untrusted: entities and documents that are too long are refused, invalid numbers are
+read as unknown, and no other file is opened, so a mesh has no size. The base is the link with a
+usual name, else the root link. Whether that is the body or a footprint below it makes no
+difference: heights are over the floor.
 """
 
 from __future__ import annotations

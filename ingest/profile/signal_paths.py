@@ -11,11 +11,10 @@ A signal path names one value of a message, or a list of them:
 A path with a slice or `[]` gives a list a message; every other gives one value or, where the
 element is not there, none.
 
-`CONVENTIONS` is the one place that knows what messages say in place of a value that was not
-measured: a driver that measures no yaw rate still publishes one, and says in a field beside it that
-it means nothing. Inputs, custom signals and proposed profiles ask it. A value that a message gives
-up is NaN, which rows have as null. The fields that name frames, and those of transforms, are here
-too.
+`CONVENTIONS` is the one place that knows how messages mark a value that was not measured: a driver
+that measures no yaw rate still publishes one, and marks it as invalid in another field. Inputs,
+custom signals and proposed profiles use it. Such a value is NaN, which is null in rows. The fields
+that name frames, and those of transforms, are here too.
 """
 
 from __future__ import annotations

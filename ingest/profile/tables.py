@@ -1,6 +1,6 @@
 """The tables of a profile: inputs, clock, episodes, frames, motion, zones, cameras, signals.
 
-An input says which topic fills what, what it must say, and what stands in for it.
+An input says which topic fills it, which fields it needs, and what replaces it if it is missing.
 
 A custom signal is a value of any topic that becomes a column of the transitions:
 `[signals.battery_v]` of a profile names the column `battery_v` and says where it comes from. At
@@ -211,7 +211,7 @@ def name_problem(name: str) -> str | None:
 
 
 def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str) -> None:
-    """See that a store's columns of custom signals mean what rows of this schema mean by them.
+    """Check that a store's columns of custom signals have the types and units of this schema.
 
     `have` are the fields of the store's table, as deltalake gives them.
 

@@ -3,9 +3,8 @@
 A tag is text by name, one of each per recording. `robot`, `site`, `firmware`, `map` and `shift` are
 columns of the views; all, with any other names, are in their column `tags`.
 
-They come from the command line, the recording itself and the path it lies at. The command line
-decides. The recording's own metadata and its path must not contradict each other; if both say the
-same, or one of them nothing, there is no question.
+They come from the command line, the recording itself and its path. The command line overrides the
+others. The recording's own metadata and its path must not contradict each other.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What of a recording might be kept besides: fields as custom signals, and cameras.
+"""Optional parts of a proposed profile: fields as custom signals, and cameras.
 
-The tables stand in comments, as a person decides what a store should hold: frames are most of a
-recording, and the units of fields are guessed.
+The tables are written as comments, because a person must decide what a store should hold: frames
+are most of a recording, and the units of fields are guessed.
 """
 
 from __future__ import annotations

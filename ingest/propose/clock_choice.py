@@ -1,9 +1,9 @@
 """The clock of a proposed profile: which time, which ticks, and how long a command holds.
 
-All of it is taken from the recording: the gaps between commands say how often there is a tick,
-how long a command may hold and which gap ends an episode. Where header stamps run at another pace
-than log time the gaps are put in the robot's own (stamped) time, if messages without a stamp can
-be placed in it within half a control period; else log time is proposed, and why is said.
+All of it is taken from the recording: the gaps between commands say how often there is a tick, how
+long a command may hold and which gap ends an episode. If header stamps run at another pace than log
+time, gaps are measured in the robot's own (stamped) time, provided that messages without a stamp
+can be placed in it within half a control period. Otherwise log time is proposed, with the reason.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
 """What the commands of a recording say: who drives, how fast, how long each holds.
 
-A multiplexer's output repeats its inputs: where a topic changes to what another one has just said,
-and not the other way about, it comes after it.
-
-Some drivers stop a robot that hears nothing for half a second; others drive on until the
-next command. If commands are rare that decides the row count, so it is read from the poses: in each
-gap after a command to move, the robot still moved when the gap ended, or it stood from some moment
-on. A command to stop holds until the next one whatever the driver does.
-
-And how fast the robot really went where it was commanded to go fastest: a driver scales down or
-cuts off what its wheels cannot do. Commands beyond that are no actions of the robot: a twin that
-obeyed them would not move as the robot did.
+A multiplexer's output repeats its inputs: if a topic changes to what another one has just
+commanded, and not the other way round, it comes after it. Some drivers stop a robot that receives
+nothing for half a second; others continue until the next command. If commands are rare, this
+decides the number of rows. So it is read from the poses: in each gap after a command to move, the
+robot still moved when the gap ended, or it stood still from some moment on. A command to stop holds
+until the next one whatever the driver does. The speed that the robot reached under its fastest
+commands is measured too: a driver scales down or cuts off what its wheels cannot do. Commands
+beyond that speed are not actions of the robot: a twin that obeyed them would not move as the robot
+did.
 """
 
 from __future__ import annotations
@@ -280,10 +278,10 @@ def settled_speeds(command_s: F64, reported: F64, at_s: F64, measured: F64, fast
 
 
 def limit_of(settled: F64, fastest: float) -> float | None:
-    """Return the limit that settled speeds (K,) show; None if the robot does about what it is told.
+    """Return the limit that settled speeds (K,) show; None if the robot follows its commands.
 
-    Ahead and about share the wheels, so that the quickest tenth is taken, where the other motion
-    asked least of them.
+    Driving and turning share the wheels, so the fastest tenth is used, in which the other motion
+    needed least.
     """
     if len(settled) < MIN_SAMPLES:
         return None

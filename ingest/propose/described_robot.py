@@ -1,8 +1,8 @@
 """The robot that a description (URDF) has: its drive, wheels, mass, casters and lidar.
 
-A wheel is a link on a joint that turns without end about an axis across the robot. What the
-description does not have stays unknown, and what cannot be used is named: meshes (no other file is
-read), arms, steering, wheels that the twin has no drive for, values that are none.
+A wheel is a link on a joint that turns without end about an axis across the robot. Missing values
+stay unknown. Parts that cannot be used are named: meshes (no other file is read), arms, steering,
+wheels of a drive that the twin does not have, invalid values.
 """
 
 from __future__ import annotations

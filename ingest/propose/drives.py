@@ -1,16 +1,15 @@
 """One profile for several drives of one kind of robot.
 
 Drives show different things: one its description, another the fastest command, a third the longest
-gap through which the robot drove on. What is the robot's is put together from all of them, and of
-the clocks that the drives propose the one is taken that makes rows of most of their time, all
-together. Drives of another kind of robot are left out, and named. The kind of every recording is
-looked at, in a few of its topics; of many drives of one kind, the proposal reads the largest.
-
-Recordings tell themselves which are of one kind, never their file or folder. Two that both have a
-lidar, or both a robot's description, or both odometry, are of one kind only if these agree. And
-something must tell one robot from the next: lidar or description. Recordings with neither are of
-one kind if they have the same command, pose and odometry, and at least half of their topics in
-common. What fits two kinds that differ is of neither.
+gap through which the robot drove on. The robot's properties are combined from all drives. Of the
+clocks that the drives propose, the one that turns most of their total time into rows is used.
+Drives of another kind of robot are left out, and named. The kind of every recording is read from a
+few of its topics; if there are many drives of one kind, the proposal reads the largest. Kinds are
+judged by the contents of recordings, never by their file or folder. Two recordings that both have a
+lidar, a description or odometry are of one kind only if these agree. A lidar or a description is
+needed to distinguish robots: recordings with neither are of one kind if they have the same command,
+pose and odometry, and at least half of their topics in common. A recording that fits two different
+kinds belongs to neither.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
 """How large a robot is, and where its lidar is: by its description, its transforms and its scans.
 
 A description (URDF, on `/robot_description`) has the boxes, cylinders and spheres of its links:
-those that move with the base as one body, and its wheels, are put where their joints say. Meshes
-have no size that is in the recording.
-
-Nothing stands where the robot is, so no return comes from within its outline: the nearest that any
-did is a bound. A robot also keeps its distance: a guess that reached that far would make a near
-collision of every such pass, so it leaves the room that is no near collision. Parts of the robot
-that its lidar sees stay at one range whichever way it faces, which nothing around it does: they
-belong to the outline, and are no obstacles.
+those that move with the base as one body, and its wheels, are put where their joints say. The size
+of a mesh is not in the recording. No return comes from inside the robot's outline, so the nearest
+return is a bound. A robot also keeps its distance: with an outline up to that bound every such pass
+would be a near collision, so the guess is smaller by the room that a near collision allows. Parts
+of the robot that its lidar sees stay at one range whichever way it faces, unlike anything around
+it: they belong to the outline, and are not obstacles.
 """
 
 from __future__ import annotations
@@ -495,8 +493,8 @@ def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPla
 def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
     """Add the lidar's place by transforms to the footprint, with the base frame as its middle.
 
-    An outline that is guessed is made as large as to hold it. Of one that is measured, a lidar
-    outside says that the base frame is not its middle: then only how it is turned is known.
+    A guessed outline is enlarged to contain the lidar. If the lidar is outside a measured outline,
+    the base frame is not its middle: then only the lidar's yaw is known.
     """
     if place is None:
         return footprint

@@ -1,7 +1,7 @@
 """Where poses come from, and how speeds follow from them where there is no odometry.
 
-Transforms give poses where they join a fixed frame with the robot's, by the frames' names. Speeds
-are the slope of the last poses. How far a pose scatters is found from third differences, which no
+Transforms give poses if they join a fixed frame with the robot's, by the frames' names. Speeds are
+the slope of the last poses. How far a pose scatters is found from third differences, which no
 smooth motion has: of white noise of size s they are s times the root of 20. A slope over a window
 of n poses then scatters by s / period x sqrt(12 / (n (n² - 1))); the shortest window in which it is
 small enough is proposed.

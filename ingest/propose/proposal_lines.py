@@ -479,8 +479,8 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
     """Let a bumper stop the robot, unless it is pressed too often to be one.
 
-    Without one nothing changes in logs; in the twin, which knows every contact, a robot would else
-    press on against a wall to the end of its time.
+    Without a bumper nothing changes in logs. In the twin, which knows every contact, a robot would
+    otherwise push against a wall until its time is up.
     """
     if not roles["bumper"]:
         return ["bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"]

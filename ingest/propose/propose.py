@@ -1,9 +1,9 @@
 """A first profile for an unknown robot: from the topics and types of one of its recordings.
 
 What each topic is for is guessed from its type and name; the clock, the speeds of the actions,
-maximum ages, the lidar's range, the outline and the frames come from the messages. The proposal
-is then tried on the recording, so that it says what its choices cost. It is TOML with a comment at
-each guess, and with all that might become custom signals, commented out.
+maximum ages, the lidar's range, the outline and the frames come from the messages. The proposal is
+then tried on the recording, so that it can say what its choices cost. It is TOML with a comment at
+each guess. Possible custom signals are commented out.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ def _without_odd(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Tri
 def _by_rate(
     recording: Recording, seen: Evidence, name: str, trial: Trial
 ) -> tuple[Evidence, Trial]:
-    """Take a tick every period instead of one a command, if that pays.
+    """Use a tick every period instead of one per command, if that pays.
 
     It does if it makes rows of much more time, or if commands come too unevenly for the twin to
     follow.
@@ -267,7 +267,7 @@ ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its ve
 def no_wheeled_robot(
     recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
 ) -> str | None:
-    """Say what a recording is taken for that is not of a robot on wheels, and what to do.
+    """Say what a recording seems to be if it is not of a wheeled robot, and what to do.
 
     Else None.
 

@@ -4,17 +4,15 @@ Three clocks may be in a recording: when a message was received (`log_time`), se
 (`header.stamp`). The profile names one, the alignment clock; every sample of every topic is put
 on it, and nothing is ever taken from a time after the tick that asks.
 
-A topic without a header is put on a `header.stamp` clock by subtracting the recording's offset:
-the smallest, over the stamped topics, of the median of (log time - stamp). Topics whose stamps are
-of another clock have no say in it, and count from their reception: commands (they take effect when
-they arrive) whose delay is another one, and what is stamped later than it was received while others
-are not. The offset is one constant a clock segment, unless it drifts by more than the tolerance, as
-it does where a simulation runs slower than real time: then log time is mapped piece by piece
-(`ClockMap`). Either is measured over the whole segment, so it uses later messages' clocks, but
-never their values.
-
-Where the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and no
-hold reaches across but that of latched topics.
+A topic without a header is put on a `header.stamp` clock by subtracting the recording's offset: the
+smallest, over the stamped topics, of the median of (log time - stamp). Topics whose stamps are of
+another clock are left out of it, and count from their reception: commands (they take effect when
+they arrive) with another delay, and topics that alone are stamped later than they were received.
+The offset is one constant per clock segment, unless it drifts by more than the tolerance, as in a
+simulation that runs slower than real time: then log time is mapped piece by piece (`ClockMap`).
+Either is measured over the whole segment, so it uses later messages' clocks, but never their
+values. If the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and
+only latched topics are held across.
 """
 
 from __future__ import annotations

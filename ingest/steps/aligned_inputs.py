@@ -1,6 +1,6 @@
 """A profile's inputs in a recording on one clock: the latest message of each at every tick.
 
-Ingest, the observer on a robot and a trace all ask here which message an input has at a tick.
+Ingest, the observer on a robot and a trace use this to find the message of an input at a tick.
 """
 
 from __future__ import annotations
@@ -125,9 +125,10 @@ class AlignedInputs:
     def commanded_by(self) -> list[str | None]:
         """Return the source whose command is the one in force at each tick, or None.
 
-        It is looked for at the command itself, among what had come up to then: of the sources
-        whose last command is the same the one that said so last, else one that is pressed. A
-        smoothed command is no source's: it is looked for at the last one of what it follows.
+        The search is at the time of the command, among the messages up to then: of the sources
+        whose last command is the same, the one with the latest, else one whose button is pressed. A
+        smoothed command equals no source's: the search is then at the last command of the topic
+        that it follows.
         """
         topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
         through = self.profile.command_through

@@ -1,12 +1,12 @@
 """The clocks of a recording: log time against header stamps, their faults, and a map between.
 
 A recorder stamps a message when it receives it (log time), its sender may say when it sent it
-(publish time) and the message when it was measured (`header.stamp`). They can be different
-clocks: a constant apart (simulation time), zero, jumping, going back, repeating, or of another
-pace. A simulation runs at the pace that its computer allows: at 97 % of real time a constant offset
-is .9 s wrong after half a minute. What carries both times (`/clock` where it was recorded, else the
-stamped topic with most messages) says at which pace; between two of its messages the map is a
-line, so a message without a stamp is placed between the stamps that were received around it.
+(publish time) and the message when it was measured (`header.stamp`). They can be different clocks:
+a constant apart (simulation time), zero, jumping, going back, repeating, or of another pace. A
+simulation runs at the pace that its computer allows: at 97 % of real time a constant offset is .9 s
+wrong after half a minute. What carries both times (`/clock` where it was recorded, else the stamped
+topic with most messages) says at which pace; between two of its messages the map is a line, so a
+message without a stamp is placed between the stamps that were received around it.
 """
 
 from __future__ import annotations

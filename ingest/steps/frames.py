@@ -1,16 +1,16 @@
 """Poses from transforms (`/tf` and `/tf_static`), and speeds from poses.
 
-Every frame has one parent at a time. At a time each frame's transform is the latest at or before
-it (a causal hold, nothing is interpolated): from `/tf` at most `max_age_s` old, from `/tf_static`
-however old. A lookup goes up from both frames to where their ways meet. A transform may be stamped
+Every frame has one parent at a time. At a time each frame's transform is the latest at or before it
+(a causal hold, nothing is interpolated): from `/tf` at most `max_age_s` old, from `/tf_static`
+however old. A lookup goes up from both frames to their common ancestor. A transform may be stamped
 ahead of when it was sent (localisation does so, to keep it usable until the next one): it counts
 from when it was received.
 
 A robot without odometry gets its speed from its poses. A straight line is fitted to the poses of
 the last `window_s` up to the latest one at the tick, none later. Its slope is the motion in the
-middle of that window: a longer window takes off more of the localiser's noise, and lags more. Poses
-that arrive together span too little time for a speed: the one before the window then belongs to
-it. A tick has no speed if its poses are too close in time, or if a jump is in its window: the robot
+middle of that window: a longer window removes more of the localiser's noise, and lags more. Poses
+that arrive together span too little time for a speed: the one before the window then belongs to it.
+A tick has no speed if its poses are too close in time, or if a jump is in its window: the robot
 cannot have driven so far, so the localiser found it elsewhere.
 """
 

@@ -10,9 +10,9 @@ from there to the plane that touches it at the origin, x to the east and y to th
 NIMA TR8350.2). Distances within 10 km of the origin are right to 5 mm at that height, and too
 short by height / 6,371 km above it: 8 cm per km at 500 m.
 
-A fix does not say where the robot faces. That is the heading of an IMU, if the profile names one,
-else the direction of the last `track_m` that were driven: of what came before alone, held while the
-robot stands, and turned about when it backs up.
+A fix has no heading. The heading is that of an IMU, if the profile names one, else the direction of
+the last `track_m` driven: computed from the past alone, held while the robot stands, and reversed
+when it backs up.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
 
 
 class _Track:
-    """Positions (N,), of which the latest far one is found without a look at each before.
+    """Positions (N,) with a fast search for the latest one that is far enough away.
 
     A robot that stands for an hour leaves an hour of positions that are all near. So they lie in
     blocks, of twice as many at each level, each within an outline of a few sides: where none of

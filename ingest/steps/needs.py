@@ -1,6 +1,6 @@
 """Needs of a profile: the fields that it reads, and why a recording does not fit.
 
-Of a laser scan not the ranges are kept, but the clearance per sector that they make.
+For a laser scan the clearance per sector is kept, not the ranges.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Damaged files: how they are found, and how a store goes on without them and says what it lost.
 
 Every page of a store's Parquet files has a checksum, which DuckDB does not verify. So files are
-read whole once before rows are taken from them, and which were is remembered in the store.
-
-A file that others were joined into is joined again from them, while they are kept. Where they are
-gone it is taken out of its table, and the recordings whose rows or manifests were in it are named:
-no view shows them until they are ingested again. A file that can be read is never taken out. Other
-writers may go on meanwhile.
+read whole once before rows are taken from them, and the store remembers which were. A damaged
+joined file is joined again from its source files while they are kept. If they are gone, it is
+removed from its table, and the recordings whose rows or manifests were in it are named: no view
+shows them until they are ingested again. A file that can be read is never removed. Other writers
+may continue meanwhile.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ class Location:
             return bool(DeltaTable.is_deltatable(self.table(name), self.options))
 
     def expect_both_tables(self) -> None:
-        """See that not one of the two tables is gone while the other is there.
+        """Check that neither of the two tables is missing while the other exists.
 
         A writer makes `recordings` first, and adds manifests when it has made both: a first ingest
         that was killed leaves at most a `recordings` without files.

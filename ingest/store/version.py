@@ -88,10 +88,9 @@ def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
 
 
 def expect_whole(log: Path, version: int, *, where: str) -> None:
-    """See that the commits that a version is read from say what they changed.
+    """Check that the commits that a version is read from are complete.
 
-    Of one that is empty, or cut after what it says of itself, Delta's library says nothing: rows
-    would be missing.
+    Delta's library silently accepts an empty or truncated commit: rows would be missing.
 
     Raises:
         StoreError: one of them does not.
@@ -234,7 +233,7 @@ def expect_format(table: DeltaTable, *, where: str) -> None:
 
 
 def expect_readable(table: DeltaTable, *, where: str) -> None:
-    """See that the rows of a store's table are those of its files.
+    """Check that Restock knows every feature of a table that changes what its files mean.
 
     Raises:
         StoreError: the table uses a feature that Restock cannot read.
@@ -247,7 +246,7 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
 
 
 def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) -> None:
-    """See that commits may be made to a store's table; `removing`: that take files out.
+    """Check that commits may be made to a store's table; `removing`: commits that remove files.
 
     Raises:
         StoreError: the table uses a feature that Restock cannot write.
@@ -267,7 +266,7 @@ def _asked(
     by_version: Mapping[int, tuple[str, ...]],
     key: str,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what the protocol of a table asks of a program: features in use, and each in words.
+    """Yield what the protocol of a table requires of a program: features in use, and each in words.
 
     They are "" for a `version` newer than the `newest` known, which lists its features.
     """

@@ -9,8 +9,8 @@ the writer that replaced it. A manifest that joins nothing yet is removed by its
 writer may be about to commit its transitions. Files outlive their removal by the same window, so
 that who opened a version before can read it: its manifests too, by the names of its rows' files.
 
-Frames of cameras are plain Parquet, a file an ingest, in `frames`: written before both commits, and
-there for whom a manifest names them to. A file lives for as long as a manifest that names it.
+Frames of cameras are plain Parquet in `frames`, one file per ingest, written before both commits. A
+file is kept as long as a manifest names it.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ class StoreWriter(TableCommits):
         return versions
 
     def fit(self, staged: Sequence[Staged]) -> None:
-        """See that the tables are there, and have the columns of these recordings.
+        """Ensure that the tables exist and have the columns of these recordings.
 
         Raises:
             StoreError: they cannot be written, or have other columns by these names.

@@ -19,11 +19,11 @@ Its limits may follow the robot: its SQL may name the profile's [noise], and `Ta
 (how near is near, how much is slip, the control period); a number of steps may be written as a
 time, `{1.6 s}`, or as a distance that the robot drives at its highest speed, `{0.2 m}`.
 
-A condition is of one of two kinds. An **outcome** (the default) names what came of it, and gives a
-row its one `condition`. An **exposure** names the situation, whatever came of it: someone close by,
-a blocked plan. It is `pre`, has no probability, is listed beside the outcomes (`exposures`), and
-never takes a row's condition from them. Strata and comparisons of success are chosen on exposures
-where an outcome would choose the failures.
+A condition is of one of two kinds. An **outcome** (the default) names a result, and gives a row its
+one `condition`. An **exposure** names the situation, whatever the outcome: someone close by, a
+blocked plan. It is `pre`, has no probability, is listed beside the outcomes (`exposures`), and
+never takes a row's condition from them. Use exposures for strata and comparisons of success if an
+outcome would select the failures.
 
 A condition can be a `.sql` file: one that comes with Restock, or one beside a profile. The file has
 the rule, in parts, and in comments the settings:

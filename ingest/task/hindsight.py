@@ -1,4 +1,4 @@
-"""Goals in hindsight: where a drive got to is the goal of what led there (arXiv:1707.01495).
+"""Goals in hindsight: the place that a drive reached is its goal (arXiv:1707.01495).
 
 For recordings without a goal topic. A drive is cut into missions, and each one's goal is the place
 where it ended: where the robot stood still, where it turned back, a place that it visited often, or
