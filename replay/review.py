@@ -2,7 +2,7 @@
 
 A review file is CSV, an event a line, with a verdict to fill in; lines can be written by hand too.
 Each line speaks of one condition on some steps of one episode. Everything is checked against the
-rows of the store before anything is taken.
+rows of the store before anything is accepted.
 """
 
 from __future__ import annotations
@@ -63,11 +63,12 @@ _COLUMNS += ["open", VERDICT]  # of a review file
 
 
 def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
-    """Return the events whose label is most doubtful, first the one that is most so.
+    """Return the events with the most doubtful labels, the most doubtful first.
 
-    Of a condition with a probability: those whose mean log odds speak least for the label, and
-    stretches without the label that are likely enough to be a missed event. Of others: the
-    shortest, and gaps of a step or two in one. What a correction speaks of already is left out.
+    For a condition with a probability, these are events whose mean log odds support the label
+    least, and steps without the label that are likely enough to be a missed event. For other
+    conditions, they are the shortest events, and gaps of a step or two in one. Corrected events are
+    left out.
 
     Raises:
         StoreError: the store holds no labels to review.

@@ -1,4 +1,4 @@
-"""Does the reward want what is measured? What drivers earn, beside how often they succeed.
+"""Reward against success: what drivers earn, and how often they succeed.
 
 A reward that pays for haste gives an agent that touches something in a quarter of its missions more
 than a driver that touches nothing; an agent trained on it learns to touch. That shows before any

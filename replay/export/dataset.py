@@ -3,8 +3,8 @@
 Each format is a function `write_FORMAT(selection, trajectories, out, counts)`, which returns notes
 for the user; what it needs from elsewhere is imported there, so that only the format asked for must
 be installed. A data set that is a directory has a card (`README.md`), with the metadata that a hub
-of data sets asks for. It is counted, not claimed: what is in it, who drove and in which conditions,
-what was left out, and what its labels are worth. Paths of this machine are only in the provenance.
+of data sets asks for. The card gives counts: the contents, who drove and in which conditions, what
+was left out, and how good the labels are. Paths of this machine are only in the provenance.
 """
 
 from __future__ import annotations
@@ -138,12 +138,10 @@ def export_dataset(
     """Write a data set; all or nothing.
 
     Args:
-        source: a store or a panel.
-        to: one of FORMATS.
-        out: a file or directory that must not exist yet.
-        query, panel, continuous: see `open_selection`.
-        cameras: whose frames go with the steps, of a store to lerobot; None: all that it has.
-        advance: called with the number of steps written, as it goes on.
+        source: a store or a panel. to: one of FORMATS. out: a file or directory that must not exist
+        yet. query, panel, continuous: see `open_selection`. cameras: whose frames go with the
+        steps, of a store to lerobot; None: all that it has. advance: called with the number of
+        steps written so far.
 
     Returns what was written: the counts of `Counts`, `notes`, and the provenance that the data
     set carries.

@@ -50,7 +50,7 @@ class ImageFeature:
         return f"{self.name}: {self.as_recorded:,} pictures as they were recorded{packed}"
 
     def picture(self, frame: CameraFrame) -> tuple[bytes, NDArray[np.uint8] | None]:
-        """Return a frame as a file, and its pixels where they were decoded for that.
+        """Return a frame as a file, and its pixels if they were decoded for that.
 
         Raises:
             StoreError: it has another size than those before, or more than 8 bits a channel.

@@ -1,7 +1,7 @@
-"""What a store lacks: what a mixture, the audits or a least number of rows ask for, and it has not.
+"""Gaps of a store: rows that a mixture, the audits or a least number require, and that it lacks.
 
-Every gap is so many rows (or episodes) of a cell of condition x zone x action x robot, with what
-each episode of the store has of it: the sample that a forecast is made from.
+A gap is a number of rows (or episodes) of a cell of condition x zone x action x robot, with the
+contribution of each episode of the store: the sample for a forecast.
 """
 
 from __future__ import annotations
@@ -213,9 +213,9 @@ def _refuse_unknown(kinds: Sequence[str], known: Sequence[str]) -> None:
 
 
 def uncorrected(mixture: Mixture) -> Mixture:
-    """Return the mixture without weights, which take long to estimate and ask for no rows.
+    """Return the mixture without weights, which take long to estimate and require no rows.
 
-    A shortfall is what is looked for: it is no reason to refuse.
+    The search is for shortfalls, so they are not refused.
     """
     strata = tuple(msgspec.structs.replace(rule, correction=None) for rule in mixture.strata)
     each = mixture.each_condition

@@ -1,7 +1,7 @@
 """The shopping list: which missions, and how many of each, fill the gaps of a store.
 
 Each gap is forecast for each kind of mission; the least number of missions that fills all of them
-is an integer linear programme. Planned is what is enough with a stated probability, gap by gap.
+is an integer linear programme. The planned amount is enough with a stated probability, gap by gap.
 """
 
 from __future__ import annotations
@@ -215,8 +215,8 @@ def _forecasts(
 ) -> list[Forecast]:
     """Return what is known of a supply for a gap; the worst of it counts.
 
-    Of many zones the one that was luckiest looks best: where the gap is of any zone, missions
-    through one are worth no more than those through all.
+    Of many zones the luckiest one looks best. So if the gap is in any zone, missions through one
+    zone count no more than missions through all.
     """
     ways = (supply, Supply(supply.kind, None, supply.robot), Supply(supply.kind))
     return [one for way in dict.fromkeys(ways) if (one := table.get((index, way))) is not None]

@@ -1,4 +1,4 @@
-"""Two stores, or two versions of one: what came, what went, and what changed on the way.
+"""Differences of two stores, or two versions of one: what was added, removed and changed.
 
 Episodes are matched by recording and first stamp, whatever ingest wrote them; rows by id. Shares
 and signals are compared as samples of episodes, with intervals.
@@ -98,11 +98,10 @@ def share_differences(
 ) -> list[ConfidenceInterval]:  # fmt: skip
     """share in `second` less share in `first` of each value, with intervals over episodes.
 
-    An episode that both have is one draw for both: what they share varies in neither. Resamples
-    are Poisson's (each episode so many times, 1 in the mean), which shares cannot tell from
-    drawing with replacement. One in which a sample has no rows has no shares, and does not count.
-    With fewer than two episodes in a sample there is no interval: NaN. Nor is there a difference
-    where a sample has no rows.
+    An episode that both have is one draw for both: what they share varies in neither. Resamples are
+    Poisson's (each episode counts Poisson(1) times), which for shares equals drawing with
+    replacement. A resample in which a sample has no rows is left out. With fewer than two episodes
+    in a sample there is no interval: NaN. If a sample has no rows, there is no difference either.
 
     Args:
         first, second: scipy sparse (E, V) rows of each episode of either, by value.

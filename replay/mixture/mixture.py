@@ -210,8 +210,8 @@ def _check_within(name: str) -> None:
 class EvaluationSplit(Checked, frozen=True):
     """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`.
 
-    A store of one episode has none to spare, nor has one of few, where a whole one is more than
-    twice the share: then, as by "within_episode", the end of the longest.
+    A store of one episode has none to spare. Nor has a store of few episodes, if a whole one is
+    more than twice the share. Then the end of the longest is held out, as by "within_episode".
     """
 
     by: Literal["episode", "recording", "robot", "site", "time", "within_episode", "none"] = (

@@ -306,7 +306,7 @@ class ShareController(Stateful):
     def boosted(self) -> Bools:
         """Return whether fresh rows of a stratum (S,) are drawn by quota.
 
-        Not those of a stratum whose boost weights are to take away: fresh rows have no weights.
+        They are not if importance weights offset the stratum's boost: fresh rows have no weights.
         """
         corrected = np.array([stratum.corrected for stratum in self.strata[: len(self.wanted)]])
         known = np.zeros(len(corrected), np.bool_) if self.fresh is None else self.fresh
@@ -337,7 +337,7 @@ class ShareController(Stateful):
         return np.minimum(left / max(ahead, 1.0), 1.0)
 
     def forecast(self) -> list[dict[str, Any]]:
-        """Return what a run will be fed, as far as can be known before it: a row a stratum, (S,).
+        """Forecast what a run will be fed: one row per stratum, (S,).
 
         Shares of all rows of its batches: natural, wanted, from logs, from the ring, and short,
         with the reason. It counts on the ring for every stratum that fresh rows can be in.

@@ -1,11 +1,11 @@
 """Shares of strata: what the mixture wants, within floors, caps and what the rows allow.
 
-And what a source's rows stand for. An archive of incident bags is no natural sample: a near
-collision in every other mission says what was kept, not how the floor is. `represents` in the
-mixture's sources says what the rows stand for. Natural shares (of rows, by stratum) are then the
+Also the rates that a source's rows stand for. An archive of incident bags is not a natural sample:
+a near collision in every other mission shows what was kept, not how the floor is. `represents` in
+the mixture's sources states the rates. Natural shares (of rows, by stratum) are then the
 represented ones, `share = "natural"` means those, and corrections weigh the rows back to them. A
-cap on an episode's or a recording's rows chooses what is packed, too: what is left stands for all
-the rows that the mixture admits.
+cap on an episode's or a recording's rows is a selection, too: the remaining rows stand for all rows
+that the mixture admits.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def plan_shares(
 def within_limits(
     wanted: F64, limit: F64, caps: F64, shortfall: Shortfall, complaints: Callable[[], str]
 ) -> SharePlan:
-    """Return what becomes of wanted shares (S,) where rows allow no more than `limit` (S,).
+    """Limit wanted shares (S,) to what the rows allow, `limit` (S,).
 
     `caps` (S,) bound what a stratum takes of the others' surplus; `complaints` says who is short.
 

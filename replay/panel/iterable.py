@@ -4,11 +4,11 @@
     for batch in DataLoader(dataset, batch_size=None, num_workers=2): ...
 
 Batches are those that `sampler_for` draws. Every worker draws the same sequence of row numbers,
-which is cheap, and gathers only its own batches of it, which is not. So however many workers there
+which is cheap, and gathers only its own batches, which is expensive. So however many workers there
 are, the loader gives the same batches in the same order, exact in their quotas, and no row comes
-twice because of them. Ranks of `torch.distributed` share one sequence in the same way. What a loop
-with a DataLoader cannot tell its dataset, TD errors and environment steps, is refused where the
-mixture asks for it.
+twice because of them. Ranks of `torch.distributed` share one sequence in the same way. A loop with
+a DataLoader cannot pass TD errors and environment steps to its dataset: mixtures that depend on
+them are refused.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a panel is drawn from: by the mixture's shares, rules and limits, whoever trains on it.
+"""Draws from a panel by the mixture's shares, rules and limits, for any learner.
 
     sampler = sampler_for(panel, 256, seed=0)
     batch = sampler.draw()                           # row numbers, strata, weights

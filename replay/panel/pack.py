@@ -1,10 +1,10 @@
 """Packing: a plan's rows into one file of float32 rows, with metadata beside, in bounded memory.
 
 Whatever the size of the store, memory holds the plan, a batch and some blocks of packed rows.
-Observations are read in the order in which the files have them and put where they belong, because
-sorting rows this wide would spill all of them to disk first: a recording's rows lie together in
-both, so what is written together lies together, and a block is full soon after it was begun.
-A block that is full is hashed and written by other threads, while the next ones are filled.
+Observations are read in the order of the files and put at their places, because sorting rows this
+wide would first spill all of them to disk. A recording's rows are together in both orders, so a
+block is full soon after it was begun. A block that is full is hashed and written by other threads,
+while the next ones are filled.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What packing must know of every row of a plan: what each is to the next, and its returns.
+"""Per-row facts that packing needs: how each row of a plan continues in the next, and its returns.
 
-What is worked out of it lies on disk beside the panel while it is built, a few bytes a row, and is
-gone when the panel is there. All functions take the rows of a store in order (recording, episode,
-step), or a stretch of them.
+The results are on disk beside the panel while it is built, a few bytes per row, and are deleted
+when it is complete. All functions take the rows of a store in order (recording, episode, step), or
+a stretch of them.
 
 An n-step return of step t uses the rewards of [t, t + n) and bootstraps from the state at t + n. It
 is cut where the episode ends, where a step is missing, and, if asked, before an off-policy action:

@@ -308,8 +308,6 @@ def _ends_of_episodes(
     """Hold out the last `share` of each episode, with a gap before it that no n-step return spans.
 
     With `only`, hold out the end of that episode alone, about `share` of all rows.
-
-    Of `only` one episode, about as much as `share` of all.
     """
     episode, stamp_ns = codes(table, "episode_id"), table["stamp_ns"].to_numpy()
     step = table["step_index"].to_numpy()

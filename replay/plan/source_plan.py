@@ -1,4 +1,4 @@
-"""One source of a panel worked out: shares, importance weights, and what is missing on a shelf.
+"""The plan of one source of a panel: shares, importance weights, and missing rows.
 
 Strata with a wanted share and nearly no rows are named, with the reason and what to change. Most
 often that is nominal: with `unit = "episode"` it has the episodes that met nothing, and a condition
@@ -213,8 +213,8 @@ def _needed(
 def missions_to_see_one(without: int) -> int:
     """Return the missions that would show, with 95 %, what `without` missions did not, at best.
 
-    At best: at the highest rate that such a silence leaves likely, the exact (Clopper-Pearson)
-    bound at which `without` missions show none with 5 %. As many again then show one with 95 %.
+    At best means at the highest rate that is still plausible: the exact (Clopper-Pearson) bound at
+    which `without` missions show none with 5 %. As many again then show one with 95 %.
     """
     return max(without, 1)
 
@@ -250,7 +250,8 @@ def probability_to_close(
 def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator[F64]:
     """Yield the weights of E episodes and one more, (E + 1,), in each replicate.
 
-    One more, of half a weight, yields nothing: what every one of a few episodes did is not certain.
+    The additional one, of half a weight, yields nothing: even if each of a few episodes did, the
+    next may not.
     """
     prior = np.append(np.ones(episodes), 0.5)
     return (rng.dirichlet(prior) for _ in range(count))
@@ -420,9 +421,8 @@ def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> N
 def below_natural(line: Stratum) -> bool:
     """Return whether weights took a stratum's share of the gradient below its share of the rows.
 
-    What its quota or the lack of its rows gives it below that already is not the weights' doing:
-    then only a correction of its own counts, and what it takes of the share that is drawn. `line`
-    has shares of its source's part.
+    If its quota or a lack of rows already puts it below that, only what its own correction takes
+    from the drawn share counts. `line` has shares of its source's part.
     """
     least = (1.0 - TOLERANCE) * min(line.natural_share, line.share)
     weighted = line.correction != "none" or line.share >= (1.0 - TOLERANCE) * line.natural_share

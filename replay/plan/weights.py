@@ -6,9 +6,10 @@ whose outcome was another, which keeps P(s'|s, a) what it was; a row chosen on i
 is asked for, to its natural density. So a weight depends on two strata of a row alone: its own, and
 the one its state would put it in. A density ratio adds a factor of the state and action.
 
-A stratum chosen on the outcome (slip) is boosted b times. Full correction takes the boost away: of
-the states too in which the outcome is likely. But a state and action may be drawn as often as one
-likes; only what comes of them may not change. So its rows, whatever their outcome, are weighted to
+A stratum chosen on the outcome (slip) is boosted b times. Full correction removes the boost, also
+of the states in which the outcome is likely. But states and actions may be drawn as often as one
+likes; only the distribution of their outcomes must not change. So its rows, whatever their outcome,
+are weighted to
 
     r(s, a) = q(s, a) / p(s, a) = sum over outcomes k of P(k | s, a) b_k
 

@@ -1,17 +1,17 @@
-"""Packed rows: what stands where in one, and how those of a file are read by number.
+"""Packed rows: their layout, and how rows of a file are read by number.
 
 A row is one float32 vector, the same for the panel of logs and the fresh ring:
 
     [ observation | next_observation | action | reward | discount ]
 
 One gather of packed rows costs about two thirds of gathering five columns. `reward` is the n-step
-return sum(gamma^k r_k), `next_observation` the one n steps later, and `discount` is
-gamma^n * (not terminated), so the target is `reward + discount * max Q(next_observation)` whatever
-n a row has. Truncation is no termination: such a row bootstraps, with the n it got to.
+return sum(gamma^k r_k), `next_observation` the one n steps later, and `discount` is gamma^n * (not
+terminated), so the target is `reward + discount * max Q(next_observation)` whatever n a row has.
+Truncation is not termination: such a row bootstraps, with the n that it reached.
 
 Memory does not grow with the file: a memory map counts every page it touched as the process's own,
-and reads at random when cold. So rows are read in ascending runs with `pread`, and what was read
-once is given back to the system.
+and reads at random when cold. So rows are read in ascending runs with `pread`, and their pages are
+released.
 """
 
 from __future__ import annotations

@@ -5,9 +5,8 @@ of an episode (a truncated one bootstraps with the shortened n). Labels arrive o
 has ended, because some conditions look ahead: until then its rows can be drawn uniformly, and
 belong to no stratum.
 
-A condition that is seldom met would be washed out by those that are met all the time. Rows may be
-reserved for it: then the next row overwrites the oldest of those conditions that hold more than
-what is reserved for them.
+Frequent conditions would push out rare ones. Rows may be reserved for it: then the next row
+overwrites the oldest of those conditions that hold more than what is reserved for them.
 
 Labelled rows also have a stratum, of the mixture that the logs are drawn by, so that a quota can be
 filled with fresh rows where the logs have too few.
@@ -160,9 +159,6 @@ class Reserve(Stateful):
 
         If those do not suffice, for example before the first episode ends, add the oldest
         unlabelled ones. If all that the ring holds is reserved, add the oldest of all.
-
-        Where those do not suffice, as while no episode has ended, also the oldest without a label,
-        and where all that the ring holds is reserved, the oldest of all.
         """
         surplus = np.maximum(self._strata.counts - self.rows, 0)
         oldest = [np.empty(0, np.int64)]

@@ -1,7 +1,7 @@
 """The rules by which rows are drawn within a stratum, and the table of them.
 
 `within` of a mixture names a row of `RULES`. The check of a mixture, the samplers, the buffers of
-other libraries, `restock mix` and the report ask this table; a rule of your own is one file with a
+other libraries, `restock mix` and the report use this table; a rule of your own is one file with a
 subclass of `StratumDraws`, and a row here. Rules work with places, 0 to n - 1 within their stratum;
 the sampler knows which row of the panel each is.
 

@@ -1,7 +1,7 @@
 """Which rows make a batch: exact quotas per stratum, by one vectorised draw.
 
-A multinomial draw gives a stratum of quota 12 between 2 and 27 rows of a batch; here it gets 12
-of 12, and a share of 0.003 of a batch is met over time, because the rounding is carried on.
+A multinomial draw gives a stratum of quota 12 between 2 and 27 rows of a batch; here it gets 12 of
+12, and a share of 0.003 of a batch is met over time, because the rounding error is carried over.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Sampler(Protocol):
 class Quotas(Stateful):
     """Shares to whole rows per batch by largest remainder, the rounding carried to the next.
 
-    Shares and batch size may change between batches; what a stratum is owed stays owed.
+    Shares and batch size may change between batches; the carried rounding error is kept.
 
     Args:
         sizes: rows of each stratum (S,), where a share on an empty one is to be refused.

@@ -1,8 +1,8 @@
 """The views and macros of a store: their SQL, and which of them a query needs.
 
-DuckDB binds a macro when it is made, with all that it is made of, and lists what is there: to make
-all of them takes longer than most queries over a small store. So a store's connection gets those
-that a text names, and those that they name in turn; its views are bound where a query uses them.
+DuckDB binds a macro with all its parts when it is created, so creating all of them takes longer
+than most queries over a small store. So a store's connection gets only those that a text names, and
+those that they name in turn; its views are bound when a query uses them.
 """
 
 from __future__ import annotations

@@ -310,8 +310,8 @@ def register(
 def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
     """Return the files of the manifests of these rows, those of an older version included.
 
-    A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
-    were before, by version or because the writer was between two commits, finds it by its name.
+    A manifest is removed from `recordings` when its rows are replaced. A reader of the earlier rows
+    (of a version, or between the writer's two commits) finds it by its name.
     """
     wanted = {one.ingest_id: one for file in held for one in file.ingests}
     active = [

@@ -109,8 +109,8 @@ def _pivots(statement: duckdb.Statement) -> bool:
 def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
     """Return whether the query joins tables by commas.
 
-    In the order in which they are written some would be cross joined, so DuckDB has to find the
-    order, from here on in this connection.
+    In their written order some tables would be cross joined, so DuckDB must choose the order, from
+    here on in this connection.
     """
     tree = connection.execute("SELECT json_serialize_sql($1::VARCHAR)", [text]).fetchall()[0][0]
     return '"ref_type":"CROSS"' in tree

@@ -1,6 +1,6 @@
 """Where a sampled row came from: audit row, panel, store, recording, messages.
 
-A run, a panel and a store each name the next one down, so a trace can begin at any of them.
+A run names its panel and a panel its store, so a trace can begin at any of them.
 """
 
 from __future__ import annotations
