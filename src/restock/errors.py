@@ -25,8 +25,8 @@ def reported(text: str, keep: str = "") -> str:
 def visible(text: str, keep: str = "") -> str:
     """Write out control characters of a text (but those in `keep`), as in `\\x1b[2J`.
 
-    A terminal obeys them: a topic's name could clear the screen, or pass for another line. So
-    are those that reorder text.
+    A terminal obeys them: a topic's name could clear the screen, or pass for another line.
+    Characters that reorder text are written out, too.
     """
     if text.isprintable():
         return text
@@ -76,7 +76,7 @@ class RestockError(Exception):
 
 
 def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str) -> None:
-    """Refuse an argument of another kind, such as the name of what is to be given itself.
+    """Refuse an argument of another kind, such as a path in place of the opened object.
 
     Raises:
         ArgumentError: it is not of `kind`.

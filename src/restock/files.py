@@ -1,7 +1,8 @@
 """Files that are replaced in one step, and read with an error that names them.
 
-A reader sees the old file or the new one, never a part. What cannot be read (missing, cut, of other
-bytes) is a `RestockError` of the caller's kind that says which file it is and what to do.
+A reader sees the old file or the new one, never a part. A file that cannot be read (missing,
+truncated, damaged) is a `RestockError` of the caller's kind that names the file and says what to
+do.
 """
 
 from __future__ import annotations

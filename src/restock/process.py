@@ -1,7 +1,7 @@
-"""This process: its interrupts and those that it started, its cores, and what it imports when.
+"""This process: its interrupts and child processes, its cores, and late imports.
 
-A kill does what Ctrl-C does, and a process that was started here does not go on. Libraries that are
-optional or slow are imported when they are used.
+A kill does what Ctrl-C does, and child processes end with it. Libraries that are optional or slow
+are imported when they are used.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _interrupted = False
 def kill_as_interrupt() -> Iterator[None]:
     """Let a kill (SIGTERM) and the end of the terminal (SIGHUP) do what Ctrl-C does.
 
-    By default that is a KeyboardInterrupt, in a training a checkpoint. What is ignored (`nohup`)
-    stays ignored. Each interrupt is noted, because a library that calls into Python may turn it
-    into an error of its own (see `was_interrupted`).
+    By default that is a KeyboardInterrupt, in a training a checkpoint. Ignored signals (`nohup`)
+    stay ignored. Each interrupt is noted, because a library that calls into Python may turn it into
+    an error of its own (see `was_interrupted`).
     """
     handlers = {"SIGTERM": _interrupt, "SIGHUP": _interrupt, "SIGINT": _note_interrupt}
     usual = {

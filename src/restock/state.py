@@ -1,4 +1,4 @@
-"""State that a checkpoint keeps, declared by name: what is saved is what is restored.
+"""State that a checkpoint keeps, declared by name, so that exactly what is saved is restored.
 
 A class names its attributes in `STATE`; each is an array, a number, a string, None, a list or dict
 of those, a generator, a tensor, a torch module, a dataclass or msgspec struct, or another object
@@ -20,8 +20,8 @@ from restock.errors import RunError
 class Stateful:
     """Saves and restores what `STATE` names.
 
-    `restored` is for what follows from the state and is not part of it. What `SAME` names is saved
-    too, and a state in which it is not as it is here is refused.
+    `restored` recomputes what follows from the state. Attributes in `SAME` are saved, too, and a
+    state in which they differ is refused.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()

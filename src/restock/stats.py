@@ -1,9 +1,9 @@
 """Statistics of evaluations and logs: intervals that say how much a number can be trusted.
 
-Over episodes, of which there are many, it is a percentile bootstrap (Efron and Tibshirani 1993) of
-what varies on its own: values within a stratum, or whole clusters, because segments of one episode
+Over episodes, of which there are many, they are percentile bootstraps (Efron and Tibshirani 1993)
+of independent units: values within a stratum, or whole clusters, because segments of one episode
 are not independent. All draws come from the generator that is given. Over training seeds, of which
-there are few, it is Student's t.
+there are few, they are Student's t.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def improvement_of_arms(
     """Return P(a run of `better` beats one of `worse` on an episode), ties counting half.
 
     The mean over episodes and all pairs of runs (arXiv:2108.13264), with a percentile bootstrap in
-    which the runs of each arm and the episodes, common to both, are drawn whole: it holds what
+    which the runs of each arm and the episodes, common to both, are drawn whole: it covers what
     other seeds and other episodes would have changed. The ends are NaN from one run of an arm.
 
     Args:

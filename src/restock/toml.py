@@ -1,9 +1,9 @@
 """TOML in and out: typed structs with ranges, and errors that name the key and its value.
 
-A range stands in the type (`Annotated[float, Meta(ge=0, lt=1)]`): it is checked when a file is
-read, when a `Checked` struct is made in Python, and it goes into a JSON Schema. What concerns
-several fields stays in a struct's own `check`. A number is finite whether it has a range or not:
-comparisons with `nan` are silently false, and JSON has neither it nor `inf`.
+A range is part of the type (`Annotated[float, Meta(ge=0, lt=1)]`): it is checked when a file is
+read, when a `Checked` struct is made in Python, and it goes into a JSON Schema. Rules about several
+fields are in a struct's own `check`. Every number must be finite, with a range or without:
+comparisons with `nan` are silently false, and JSON has neither `nan` nor `inf`.
 """
 
 from __future__ import annotations
@@ -377,7 +377,7 @@ def json_schema(kind: type, title: str) -> str:
     """Return the JSON Schema of a struct's TOML, for editors: `#:schema FILE` names it.
 
     Types, ranges and defaults are those of the struct, descriptions the comments beside its fields.
-    What concerns several keys at once is not in it: only reading the file says.
+    Rules about several keys at once are not in it: they are checked when the file is read.
     """
     schema = msgspec.json.schema(kind)
     structs = {struct.__name__: struct for struct in _structs(kinds.type_info(kind), set())}

@@ -1,9 +1,9 @@
 """The front door: `restock VERB …`. One module a verb; each is imported only when it is called.
 
-A verb or job is a dataclass, `IngestCommand` for `restock ingest`: its docstring is the
-help, its fields are the flags, and `run()` does the work and returns an exit code. stdout is data,
-stderr is progress and messages. Both are written as they are: not UTF-8, on a full disk, or read by
-nobody any more.
+A verb or job is a dataclass, `IngestCommand` for `restock ingest`: its docstring is the help, its
+fields are the flags, and `run()` does the work and returns an exit code. stdout is data, stderr is
+progress and messages. Both also work if they are not UTF-8, on a full disk, or closed by their
+reader.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Unforeseen errors as a message and exit code 2, without a traceback.
 
-Files are damaged, disks are full and folders are missing in more ways than any reader names. One
-place turns what libraries raise into what, where and what to do. `RESTOCK_TRACEBACK=1` prints the
-traceback as well, for those who develop Restock.
+Files are damaged, disks are full and folders are missing in more ways than the readers can check.
+This module turns errors of libraries into messages that say what, where and what to do.
+`RESTOCK_TRACEBACK=1` prints the traceback as well, for those who develop Restock.
 """
 
 from __future__ import annotations

@@ -368,9 +368,9 @@ class Advance:
 
 @contextmanager
 def progress(description: str, total: float | None) -> Iterator[Advance]:
-    """Show a progress bar on a terminal, nothing elsewhere; yield what moves it.
+    """Show a progress bar on a terminal, nothing elsewhere; yield the function that advances it.
 
-    Without a total it shows that something moves, and for how long.
+    Without a total it shows activity and the elapsed time.
     """
     if not sys.stderr.isatty():
         yield Advance()

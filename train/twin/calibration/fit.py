@@ -3,7 +3,7 @@
 Commands of the log are driven open loop and the motion is compared
 (`restock.train.twin.calibration.open_loop`, `restock.train.twin.calibration.fit_solver`). The
 search is coarse in one batch over the whole ranges, then least squares. A parameter that the log
-does not identify stays as it was, with the reason. Values are effective: they hold for the timestep
+does not identify keeps its value, with the reason. Values are effective: they hold for the timestep
 at which they were fitted, which is the one training uses.
 """
 

@@ -1,15 +1,15 @@
 """The parameters that can be fitted, and the search for them: coarse, then by least squares.
 
-Residuals are what separates replays from their log, by channel. Position and heading are compared
-after each predicted path was laid onto the logged one as a rigid piece (by the mean heading and the
-mean position of the segment's fresh poses): a localiser's error at a segment's first pose would
+Residuals are the differences between replays and their log, by channel. Position and heading are
+compared after each predicted path was moved rigidly onto the logged one (by the mean heading and
+the mean position of the segment's fresh poses): a localiser's error at a segment's first pose would
 otherwise turn and shift the whole path. The twin's commands take effect at a physics step, so a
 replay knows latencies only in multiples of the timestep; between two of them residuals are
 interpolated, which makes the fit smooth.
 
 The search is coarse in one batch, then `mujoco.minimize.least_squares`. Residuals are counted in
-units of their channel's noise and beyond some of them by their size, not its square (soft L1), so
-that a wheel over a cable does not move the fit.
+units of their channel's noise. Large ones count linearly, not by their square (soft L1), so that a
+wheel over a cable does not move the fit.
 """
 
 from __future__ import annotations
@@ -422,9 +422,9 @@ class FitProblem:
     def jacobian(self, z: F64, residual: F64) -> F64:
         """Return difference quotients (R, n) at z (n, 1), with latency in whole physics steps.
 
-        A wheel that breaks loose does so at a physics step, so wheel speeds jump as friction or
-        payload change. A jump is no slope: of these two, quotients are taken to both sides, and the
-        smaller one counts, or none where they disagree in sign.
+        A wheel starts to slide at a physics step, so wheel speeds jump as friction or payload
+        change. A jump is not a slope: for these two, quotients are taken to both sides. The smaller
+        one counts, or none if their signs differ.
         """
         del residual  # it is between two latencies; this is at one
         size, steps = len(self.coordinates), self.coordinates.steps
@@ -502,8 +502,8 @@ class _GoodEnough(Exception):
 def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:
     """Return each channel's noise, from residuals (1, S, R) at a solution.
 
-    The median deviation, times what the correlation of neighbouring steps takes away: n residuals
-    with correlation c say as much as n (1 - c) / (1 + c) without.
+    It is the median deviation, scaled for the correlation of neighbouring steps: n residuals with
+    correlation c count as much as n (1 - c) / (1 + c) independent ones.
     """
     scale = {}
     for name, residual in residuals.items():

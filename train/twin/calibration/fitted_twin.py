@@ -1,8 +1,8 @@
 """The result of a fit: parameters, how well a log identifies them, and TOML for training.
 
-Intervals come from a bootstrap over episodes and from profiles of the cost. Of each parameter its
-value is reported with its interval, or why it stays as in the base. One fit makes a perturbation;
-several, of recordings of robots that differ, a schedule over them.
+Intervals come from a bootstrap over episodes and from profiles of the cost. For each parameter, the
+value is reported with its interval, or the reason why it keeps the base's value. One fit makes a
+perturbation; several, of recordings of robots that differ, a schedule over them.
 """
 
 from __future__ import annotations
@@ -234,8 +234,8 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
 def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tuple[float, float]:
     """Return the range of z (low, high) in which a parameter explains the log within 95 %.
 
-    The parameter is put to values over its whole range; at each the others make one Gauss-Newton
-    step, and twice the rise of the cost is compared with chi-square.
+    The parameter is set to values over its whole range. At each value the others make one
+    Gauss-Newton step, and twice the rise of the cost is compared with chi-square.
     """
     grid = np.sort(np.append(np.linspace(0.0, 1.0, PROFILE_POINTS), solution.z[index]))
     points = np.tile(solution.z[:, None], (1, len(grid)))

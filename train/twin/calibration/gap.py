@@ -1,9 +1,9 @@
 """The gap between the twin and a store's logs, per condition, before and after calibration.
 
 Paths: logged commands driven again open loop (`path_gap`). Steps: one control period from each
-logged state, through the task's own observation and reward. Each statistic is a row
-with its interval over episodes; verdicts are made of them (`twin_gap`). What a store's signals do
-not allow is listed in `TwinGap.not_done`.
+logged state, through the task's own observation and reward. Each statistic is a row with its
+interval over episodes; verdicts are computed from them (`twin_gap`). What a store's signals do not
+allow is listed in `TwinGap.not_done`.
 
 For a step the twin is put into the logged state (pose, motion, and what its base controller made of
 the commands before) and drives the logged action for one control period. There is no sensor noise,
@@ -11,9 +11,9 @@ and pallets, people and patches of the log are unknown to it.
 
 A store keeps no plans, but every row keeps two points of its plan (the look-ahead points) and how
 much of it remained. In the map frame those points lie on the plan, each with a known length to its
-end, so the rows that were driven under one plan give back most of it: from 1 m ahead of where it
-was first seen to 2.2 m ahead of where it was last seen. That is what another pose, a little beside
-the logged one, sees of the plan.
+end, so the rows that were driven under one plan restore most of it: from 1 m ahead of where it was
+first seen to 2.2 m ahead of where it was last seen. This is enough for another pose near the logged
+one.
 """
 
 from __future__ import annotations
@@ -448,8 +448,8 @@ def _reward_rows(
 ) -> tuple[Rows, dict[tuple[str, str], ConfidenceInterval]]:
     """Return gaps by term, and the whole gap over the reward's spread by condition and source.
 
-    The spread is the distance of a step's reward from the median, taken to be a step's cost at
-    least: standing still earns the same at every step, and next to that any gap is large.
+    The spread is the distance of a step's reward from the median, and at least a step's cost:
+    standing still earns the same at every step, and compared with that any gap would be large.
     """
     rows_by_term, ratios = [], {}
     least = abs(steps.task.rewards.step)

@@ -3,13 +3,12 @@
 `drive_open_loop` puts robots into logged states and drives logged commands from there, one control
 period or many. `replay_segments` drives segments of a log with it: the W steps before a segment
 begin with the logged motion, and are driven only so that ramps and late commands are under way when
-the K steps begin. Then the twin's pose is put on the logged pose, and the two go their ways.
-
-Without a floor map the floor is empty. Obstacles of a log are not known, racks of another floor are
-not there, and a pose that localisation has 3 cm wrong must not become a collision: the question is
-how the robot moves, and steps with contact are marked by the signal `bumped`. Nor are slippery
-patches known. Without obstacles the motion does not depend on where it begins, so robots are driven
-in the middle of an empty hall, and their paths laid onto the map.
+the K steps begin. Then the twin's pose is set to the logged pose, and the twin drives on its own.
+Without a floor map the floor is empty. Obstacles of a log are unknown, racks of another floor do
+not apply, and a localisation error of 3 cm must not become a collision: the question is how the
+robot moves, and steps with contact are marked by the signal `bumped`. Slippery patches are unknown,
+too. Without obstacles the motion does not depend on where it begins, so robots are driven in the
+middle of an empty hall, and their paths laid onto the map.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The gap between open-loop replays and their log: pose and signals at each horizon's end.
 
-Beside the twins stand two yardsticks. `odometry` is the logged wheel odometry, dead-reckoned from
-the same first pose: a twin that is no better predicts no better than the wheels already tell.
-`floor` is what a perfect twin would show: the twin's own paths, seen through localisation and
-sensor noise, and begun from a first pose that is as wrong as a localised one.
+There are two references beside the twins. `odometry` is the logged wheel odometry, dead-reckoned
+from the same first pose: a twin should be better than that. `floor` is the gap of a perfect twin:
+the twin's own paths with localisation and sensor noise, from a first pose with the error of a
+localised one.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 The folder is `gap.json`, and the rows as Parquet for any tool that reads it.
 
-A condition is `untrusted` where the twin is shown to be off, `trusted` where it is shown to be
-near, both by the end of a 95 % interval; `undecided` where the interval holds the limit, and
-`unknown` where too little was driven to say.
+A condition is `untrusted` if the twin is shown to be beyond a limit, and `trusted` if it is shown
+to be within, both by the end of a 95 % interval. It is `undecided` if the interval contains the
+limit, and `unknown` if too little was driven.
 """
 
 from __future__ import annotations

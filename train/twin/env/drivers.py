@@ -8,10 +8,10 @@ over. Policies draw from their own seeded generator.
 The operator is privileged: it knows where pallets, people and wet floor are. At every step each
 action is simulated for the next 1.2 s: where the robot would be, how near to racks, pallets and
 people that comes (who are assumed to keep walking as they do), and how far along a plan that knows
-the pallets. Near pallets it is pairs of actions, and what counts is the time that is left to the
-goal by a state lattice, which knows how the robot must turn to fit through a gap; so it is where
-the robot was stuck. On and before slippery floor only gentle actions count. A few percent of the
-actions are mistakes.
+the pallets. Near pallets, and where the robot was stuck, it simulates pairs of actions and chooses
+by the remaining time to the goal in a state lattice, which knows how the robot must turn to fit
+through a gap. On and before slippery floor only gentle actions are allowed. A few percent of the
+actions are random.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class HandoverEvent:
 class Handover:
     """A pair of drivers: the operator takes over from the planner in trouble, then hands back.
 
-    Trouble is what the robot itself notices: no way made for 3 s, the bumper, or wheels that
+    Trouble is what the robot itself can detect: no movement for 3 s, the bumper, or wheels that
     disagree with the localisation. `events` keeps every handover, oldest first.
     """
 

@@ -4,8 +4,8 @@ Fixed episodes come in their order, then drawn ones. These may be of ordered mis
 floor and a zone), or of arms, the kinds of missions that practice chooses among: a kind of episode,
 and on request one block of a blocked aisle, one floor, or one part of a perturbation's range.
 
-An episode is determined by its kind and its seed. One that must come through a zone, or be of an
-arm, gets the first of its seeds for which that is so: nothing about the episode itself is changed.
+An episode is determined by its kind and its seed. An episode that must come through a zone, or
+belong to an arm, gets the first of its seeds that does: the episode itself is not changed.
 """
 
 from __future__ import annotations

@@ -5,10 +5,8 @@ blocked, which is remembered for the rest of the episode.
 
 `BlockFinder` is what the lidar adds: it finds the aisles that are wholly blocked.
 
-`Truth` knows the true conditions of every step, from the simulator: kept apart from labels to score
-them.
-
-A step's conditions are what was physically so over [t, t + 1), by the contract's names:
+`Truth` computes the true conditions of every step from the simulator, separately from labels, to
+score them. A step's conditions are the physical truth over [t, t + 1), by the contract's names:
 
 - wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than the task's
   `slip_limit_mps`;

@@ -1,10 +1,10 @@
 """Pictures of the twin: maps drawn from above, and frames by a camera.
 
 A camera is MuJoCo's renderer off screen, over EGL, with or without a GPU. OpenGL is loaded when the
-first camera is made, never before; drawn maps need none. What stands on the floor (boxes,
-cylinders, spheres and capsules) is made from what an environment says of itself (its floor,
-pallets, patches, traffic, plan, goal and pose), not from the physics' own model: so racks have
-shelves and people have heads, and nothing that is drawn can touch the physics.
+first camera is made, never before; drawn maps need none. Objects (boxes, cylinders, spheres and
+capsules) are drawn from the environment's state (its floor, pallets, patches, traffic, plan, goal
+and pose), not from the physics model: so racks have shelves and people have heads, and drawing
+cannot affect the physics.
 
     env = gym.make("restock/Warehouse-v0", render_mode="rgb_array", camera="chase")
 """

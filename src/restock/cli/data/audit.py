@@ -409,7 +409,7 @@ def of_gate(document: Mapping[str, Any]) -> list[Finding]:
 
 
 def refused(name: str, error: RestockError, *, option: str) -> list[Finding]:
-    """Return a failure for what could not be compared, which a pipeline must not pass over.
+    """Return a failure for a comparison that was not possible, so that a pipeline does not skip it.
 
     `option` is the option that asked for it, with its value.
     """

@@ -331,7 +331,7 @@ def describe_run(prepared: Prepared) -> str:
 
 
 def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
-    """Say what a run's batches are to be made of, and what they will be short of.
+    """Describe what will fill a run's batches, and what will be short.
 
     `fed` is the panel's part of config.json.
     """

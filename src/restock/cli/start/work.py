@@ -1,4 +1,4 @@
-"""Running stages, each once: what is done and whose inputs are the same is not done again.
+"""Running stages, each once: a finished stage with unchanged inputs is skipped.
 
 `OUT/start/NAME.json` is what the stage's verb printed; `OUT/start/stages.json` says of each stage
 which command it ran, from which inputs, and how it ended.

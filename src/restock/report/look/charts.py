@@ -2,9 +2,9 @@
 
 A chart is drawn once for each width that a page may have for it, always at its own size: type is
 then equally large in every figure and on every screen. A figure is thus a `Drawing`, its SVG by
-width in CSS pixels; the page shows the widest that fits, and `live` has it answer the pointer. One
-colour per condition, per source and per policy, the same in every chart; `theme.DARK` says what
-each is on a dark ground.
+width in CSS pixels; the page shows the widest that fits, and `live` has it answer the pointer. Each
+condition, source and policy has one colour in every chart; `theme.DARK` has the colours for a dark
+background.
 """
 
 from __future__ import annotations

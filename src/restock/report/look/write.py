@@ -1,11 +1,11 @@
 """Write a page: the template and style filled in, live charts, and each figure as files.
 
 Figures are drawn in the colours of the light page. The style sheet exchanges them on a screen that
-prefers dark; what is printed, and figures written as files, stay light. A chart's SVG is
-what is printed and what stands without script. A script shows it drawn by Vega in its place, from
-the same specification, to which `live` adds what only a pointer can ask: the values of a mark, and
-one series of a legend alone. Specifications and rows travel once, as JSON; the runtime too, packed,
-and it is unpacked when the first chart is in view.
+prefers dark; what is printed, and figures written as files, stay light. A chart's SVG is what is
+printed and what is shown without scripts. A script replaces it by Vega's drawing of the same
+specification, to which `live` adds interaction: the values of a mark, and one series of a legend
+alone. Specifications and rows are in the page once, as JSON. The runtime is in it, too, compressed,
+and is unpacked when the first chart is in view.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The first sentences of a run's page: what changed against the baseline, and how surely.
+"""The first sentences of a run's page: what changed against the baseline, and how certain that is.
 
 There is no bare average: differences are paired by episode, by condition, with their intervals.
 A run without a twin is judged by logs that it did not learn from.
