@@ -72,7 +72,7 @@ def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, capsys):
 
     floor = document["stages"][-1]
     assert floor["name"] == "floor"
-    assert "100% lie off the map" in floor["errors"][0]
+    assert "100% are off the map" in floor["errors"][0]
     assert "cannot be the floor" in document["stopped"]["why"]
     assert not (out / "floor.toml").exists()
 

@@ -107,7 +107,7 @@ def test_a_stratum_behind_another_one_is_advised_a_priority(tmp_path, mix):
     strata, warnings = mix(store, before + each)
     (slips,) = (text for text in warnings if text.startswith("wheel_slip has "))
     had = int(re.findall(r"wheel_slip has (\d+) of \d+ rows, since moving is met in \d+", slips)[0])
-    assert slips.endswith(": give wheel_slip priority = 4, which is before moving")
+    assert slips.endswith(": give wheel_slip priority = 4, to come before moving")
     own = '[[strata]]\nname = "wheel_slip"\nshare = "equal"\npriority = 4\n'
     filled, warnings = mix(store, before + own + each)
     assert filled["wheel_slip"]["rows"] > 5 * max(had, strata["wheel_slip"]["rows"])

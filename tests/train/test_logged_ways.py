@@ -166,7 +166,7 @@ def test_a_runs_evaluations_drive_logged_ways_on_request(panel: Panel, tmp_path:
     ways = {spec.seed for spec in made.specs["nominal"][:2]}
     assert {row["episode_seed"] for row in driven} == ways
     (_, said) = plan_evaluation(tmp_path / "run", missions="logged").warnings
-    assert "chosen on such routes" in said
+    assert "selected on such routes" in said
 
 
 def test_a_run_on_another_floor_cannot_evaluate_on_them(panel, tmp_path, capsys):

@@ -53,7 +53,7 @@ def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
     said = r"offline phase draws 30,000 rows of logs.*400 rows"
     with pytest.raises(MixtureError, match=said) as raised:
         controller(text, [300, 100], PlannedDraws(30_000, 100_000, 0, 1000))
-    assert "lower schedule.offline_updates to 66.6% of what it is" in str(raised.value)
+    assert "lower schedule.offline_updates to 66.6% of its value" in str(raised.value)
     controller(text, [300, 100], PlannedDraws(19_980, 100_000, 0, 1000))
     with pytest.raises(MixtureError, match=r"rare wants 50\.0% of 50,000 draws, its 100 rows"):
         controller(

@@ -67,7 +67,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     # The same directory, another question.
     (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))
     assert main(argv) == 2
-    assert "was made otherwise" in capsys.readouterr().err
+    assert "was trained with other settings" in capsys.readouterr().err
 
 
 @pytest.mark.long
@@ -233,7 +233,7 @@ def test_after_a_failed_run_none_is_begun(tmp_path, capsys, monkeypatch, interru
             raise RunError("ran out of disk", where="here")
         running.set()
         for _ in range(3000):  # until the failure is said
-            if "waiting for what runs" in "".join(said):
+            if "waiting for those under way" in "".join(said):
                 break
             sleep(0.01)
         if interrupted:

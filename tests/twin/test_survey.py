@@ -188,7 +188,7 @@ def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path)
     away = lap((40.0, 0.0, 0.0))
     bag = write_bag(tmp_path / "bag", poses=away, frame="odom", grid=OccupancyGrid(hall(), CELL_M))
     with pytest.raises(
-        ConfigError, match=r"100% lie off the map.*0 on its.*4\d\.\d m from.*'map'.*'odom'"
+        ConfigError, match=r"100% are off the map.*0 on its.*4\d\.\d m from.*'map'.*'odom'"
     ):
         survey(bag)
 
