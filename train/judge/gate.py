@@ -505,7 +505,7 @@ def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
     yield (
         f"A policy that is worse by a margin or more in any condition passes with a probability of"
         f" at most {ERROR:.0%}, whenever one looks; this holds for missions as the twin draws"
-        " them, not of the robot's own day."
+        " them, not for the robot's real missions."
     )
     if plan.gap is None:
         yield (
