@@ -6,10 +6,11 @@ import contextlib
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from pathlib import Path
 from threading import Event
 
@@ -19,7 +20,7 @@ import pyarrow as pa
 
 from restock import __version__
 from restock.errors import ArgumentError, PanelError, RestockError, StoreError, expect
-from restock.files import building, expect_place
+from restock.files import building, expect_place, read_table
 from restock.ingest.store.location import Location
 from restock.ingest.task.conditions import (
     NOMINAL,
@@ -57,6 +58,29 @@ _NEEDED = (
     *("primary_condition", "conditions", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "stamp_ns", "pose_x_m", "pose_y_m", "task_hash"),
 )
+# The same of a table of any task, which has no episode_id; and what its rows may not be.
+_OF_ANY_TASK = (
+    "observation",
+    "action",
+    "reward",
+    "terminated",
+    "truncated",
+    "episode",
+    "condition",
+)
+_FAULTS = {
+    "row {row} lacks its observation, reward, end or episode": (
+        "NOT coalesce(len(observation) > 0, false) OR reward IS NULL OR episode IS NULL"
+        " OR (terminated OR truncated) IS NULL"
+    ),
+    "the action of row {row} is no whole number from 0 to 32,767": "NOT discrete",
+    "the observation of row {row} has {width} entries, that of row 0 {size}": (
+        "len(observation) <> size"
+    ),
+    "the next observation of row {row} has not {size} entries": "len(next_observation) <> size",
+    "row {row} follows the end of its episode": "after_end",
+    "no row ends an episode": "NOT (SELECT max(terminated OR truncated) FROM filled)",
+}
 
 
 @dataclass(frozen=True)
@@ -72,25 +96,44 @@ class TransitionSource:
     # task hash -> the profiles that read its rows, newest ingest first
     profiles: Callable[[str], list[StoredProfile]] = lambda task_hash: []
     corrected: tuple[str, ...] = ()  # versions of labels that people corrected
+    # Rows that are not in the view, by reason.
+    left_out: Mapping[str, int] = field(default_factory=dict)
+
+    def plan(self, mixture: Mixture) -> PanelPlan:
+        """Plan a mixture over it, see `plan_panel`."""
+        plan = plan_panel(self.connection, mixture, self.conditions, self.others)
+        return replace(plan, left_out={**self.left_out, **plan.left_out})
 
 
 @contextmanager
 def open_source(
-    transitions: pa.Table | Store,
+    transitions: pa.Table | Store | str | Path,
     mixture: Mixture | None = None,
     *,
     task: Task | None = None,
     conditions: Sequence[Condition] | None = None,
     folder: Path | None = None,
 ) -> Iterator[TransitionSource]:
-    """Yield a store, or a table with the columns of `ingest.task.schema`, as a source of a panel.
+    """Yield transitions as a source of a panel; see `build_panel` for what they may be.
 
     A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
 
     Raises:
-        StoreError: a file of a store is damaged: its page checksums are verified first.
+        StoreError: a file of a store is damaged: its page checksums are verified first; or a table
+            of any task is not what `build_panel` asks for.
     """
+    where = "the table of transitions"
+    if isinstance(transitions, str | Path):
+        if Path(transitions).suffix != ".parquet":
+            with (
+                Store(transitions) as store,
+                open_source(store, mixture, conditions=conditions, folder=folder) as source,
+            ):
+                yield source
+            return
+        where = str(transitions)
+        transitions = read_table(Path(transitions), error=StoreError)
     if isinstance(transitions, Store):
         transitions.verify()
         named = (
@@ -114,7 +157,7 @@ def open_source(
             )
         return
     with duckdb.connect() as connection:
-        _register(connection, transitions)
+        left_out = _register(connection, transitions, where)
         # A store's Parquet and `transition_schema` say `condition`, its view `primary_condition`.
         has = [*map(str.casefold, connection.table("given").columns)]
         renamed = "" if "primary_condition" in has else "RENAME (condition AS primary_condition)"
@@ -133,28 +176,68 @@ def open_source(
                 raise StoreError(f"its rows are of task {task_hash}, the task given is {task.hash}")
             return msgspec.json.encode(task).decode()
 
-        yield TransitionSource(connection, "table in memory", -1, task_json, tuple(conditions))
+        ((content,),) = connection.sql("SELECT sum(hash(given)) FROM given").fetchall()
+        name = f"table in memory, {int(content or 0) % 2**64:016x}"
+        yield TransitionSource(
+            connection, name, -1, task_json, tuple(conditions), left_out=left_out
+        )
 
 
-def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table) -> None:
-    """Give a connection a table as `given`. Raises ArgumentError, StoreError: it is not fit."""
-    where, remedy = "the table of transitions", "give rows as Store(…).sql('FROM transitions') has"
+def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str) -> dict[str, int]:
+    """Give a connection a table as `given`; return the rows that it leaves out, by reason.
+
+    Raises ArgumentError, StoreError: it is not fit.
+    """
+    remedy = "give rows as Store(…).sql('FROM transitions') has"
     try:
         connection.register("given", given)
     except duckdb.InvalidInputException as error:
         what = f"transitions must be a Store or a table, got {repr(given)[:80]}"
         raise ArgumentError(what, remedy=remedy) from error
     kinds = {name.casefold(): kind for name, kind in _kinds(connection.table("given")).items()}
-    if "condition" in kinds:
+    needed = _NEEDED
+    if "episode_id" not in kinds:
+        needed, remedy = _OF_ANY_TASK, f"give {', '.join(_OF_ANY_TASK)}: docs/panel.md"
+    elif "condition" in kinds:
         kinds.setdefault("primary_condition", kinds["condition"])
-    if lacking := [name for name in _NEEDED if name not in kinds]:
+    if lacking := [name for name in needed if name not in kinds]:
         raise StoreError(f"it has no {', '.join(lacking)}", where=where, remedy=remedy)
     fit = _kinds(connection.from_arrow(transition_schema(1).empty_table()))
-    fit["primary_condition"] = fit["condition"]
-    for name in _NEEDED:
+    fit |= {"primary_condition": fit["condition"], "episode": kinds.get("episode", "")}
+    for name in needed:
         if kinds[name] != fit[name] and not kinds[name].endswith("null"):
             what = f"{name} must be {fit[name]}, not {kinds[name]}"
             raise StoreError(what, where=where, remedy=remedy)
+    return {} if needed == _NEEDED else _fill(connection, given, where, remedy)
+
+
+def _fill(
+    connection: duckdb.DuckDBPyConnection, table: pa.Table, where: str, remedy: str
+) -> dict[str, int]:
+    """Put rows as a store has them in place of `given`; return those left out, by reason."""
+    if not isinstance(table, pa.Table):  # a frame of pandas or Polars
+        table = pa.table(table)
+    connection.register("given", table.append_column("place", pa.array(range(len(table)))))
+    try:
+        connection.execute((files("restock.replay.panel") / "any_table.sql").read_text("utf-8"))
+    except duckdb.Error as error:
+        what = f"it cannot be read as transitions: {str(error).splitlines()[0]}"
+        raise StoreError(what, where=where, remedy=remedy) from error
+    for what, test in _FAULTS.items():
+        first = f"FROM filled WHERE {test} ORDER BY place LIMIT 1"
+        for row, width, size in connection.sql(
+            f"SELECT place, len(observation), size {first}"
+        ).fetchall():
+            said = what.format(row=row, width=width, size=size)
+            raise StoreError(said, where=where, remedy=remedy)
+    unknown = "next_observation IS NULL"
+    ((lost,),) = connection.sql(f"SELECT count(*) FROM filled WHERE {unknown}").fetchall()
+    connection.unregister("given")
+    connection.execute(
+        "CREATE VIEW given AS SELECT * EXCLUDE (place, size, after_end, discrete)"
+        f" FROM filled WHERE NOT ({unknown})"
+    )
+    return {"an episode's last, without a next observation": lost} if lost else {}
 
 
 def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
@@ -187,7 +270,7 @@ def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:
 
 @interrupts_raised
 def build_panel(
-    transitions: pa.Table | Store,
+    transitions: pa.Table | Store | str | Path,
     mixture: Mixture,
     out: str | Path,
     *,
@@ -199,7 +282,9 @@ def build_panel(
     """Plan, pack and open a panel; its `warnings` are those of `restock mix`.
 
     Args:
-        transitions: a store, or a table with the columns of `ingest.task.schema.transition_schema`.
+        transitions: a store or its path; a table with the columns of a store's `transitions`; or a
+            table of any task, or its `.parquet` file: of each row its observation (a list), action
+            (from 0 on), reward, terminated, truncated, episode and condition ("nominal": none).
         mixture: what to take, in which shares.
         out: the panel's directory, which must not exist yet.
         task: for a table, the task its rows were made by.
@@ -212,15 +297,14 @@ def build_panel(
         PanelError: `out` already exists.
     """
     expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
-    if isinstance(transitions, str | Path | duckdb.DuckDBPyRelation):
+    if isinstance(transitions, duckdb.DuckDBPyRelation):
         raise ArgumentError(
             f"transitions must be a Store or a table, got {repr(transitions)[:80]}",
-            remedy='open a store as Store("store"); of a relation take `.to_arrow_table()`',
+            remedy="take its `.to_arrow_table()`",
         )
     check_free(Path(out), force)
     with open_source(transitions, mixture, task=task, conditions=conditions) as source:
-        plan = plan_panel(source.connection, mixture, source.conditions, source.others)
-        return write_panel(source, plan, out, force=force, advance=advance)
+        return write_panel(source, source.plan(mixture), out, force=force, advance=advance)
 
 
 def plan_only(store: str, name: str) -> PanelPlan:
@@ -233,7 +317,7 @@ def plan_only(store: str, name: str) -> PanelPlan:
     with Store(store) as opened:
         try:
             with open_source(opened, mixture, folder=Path(name).parent) as source:
-                return plan_panel(source.connection, mixture, source.conditions, source.others)
+                return source.plan(mixture)
         except RestockError as error:
             where = name if error.where is None else f"{name}: {error.where}"
             raise type(error)(error.what, where=where, remedy=error.remedy) from error
@@ -373,7 +457,8 @@ def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
 
     `digest` stands for the rows.
     """
-    versions = [source.version, *(store.version for store in source.others)]
+    own = source.name if source.version < 0 else source.version  # a table's names its content
+    versions = [own, *(store.version for store in source.others)]
     named = [PACKING_VERSION, versions, plan.mixture, plan.task_hash, digest]
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()
 

@@ -73,11 +73,10 @@ def install_mixtures(store: Store) -> None:
 def _plan(own: Store, name: str) -> PanelPlan:
     from restock.replay.mixture.mixture import load_mixture
     from restock.replay.panel.build import open_source
-    from restock.replay.plan.plan import plan_panel
 
     mixture = load_mixture(name)
     with open_source(own, mixture, folder=Path(name).parent) as source:
-        return plan_panel(source.connection, mixture, source.conditions, source.others)
+        return source.plan(mixture)
 
 
 def install_planned(

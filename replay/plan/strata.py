@@ -144,7 +144,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         priority, timing = condition.priority, condition.timing
     else:
         raise ConfigError(
-            f"stratum {rule.name!r} is not a condition or exposure of this store, and has no "
+            f"stratum {rule.name!r} is not a condition or exposure of these rows, and has no "
             "`where`",
             where="mixture",
             remedy=f"name one of {', '.join([NOMINAL, NOVEL, *sorted(known)])}; or give it a"

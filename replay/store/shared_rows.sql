@@ -7,7 +7,7 @@ WITH places AS (
     -- Few rows pass this, and only theirs are read whole.
     SELECT hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) AS place
     FROM transitions
-    GROUP BY place
+    GROUP BY ALL
     HAVING min(hash(recording_id)) < max(hash(recording_id))
 ), distinctive AS MATERIALIZED (
     SELECT recording_id, content, any_value(transition_id) AS transition_id

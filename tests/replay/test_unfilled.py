@@ -139,7 +139,7 @@ def test_a_quota_for_what_the_logs_lack_is_named(braking, mix):
         for text in mix(store, own + EACH)[1]
     )
     unknown = mix.refused(store, own.replace("where = \"zone = 'nowhere'\"\n", "") + EACH)
-    assert "stratum 'wet_floor' is not a condition or exposure of this store" in unknown
+    assert "stratum 'wet_floor' is not a condition or exposure of these rows" in unknown
     assert "name one of nominal, " in unknown
     assert "or give it a `where`; or add it to the profile and run `restock store label`" in unknown
 

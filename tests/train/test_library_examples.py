@@ -20,6 +20,7 @@ NEEDS = {
     "sb3_mixture": "stable_baselines3",
     "tianshou_dqn": "tianshou",
     "cleanrl_dqn": "torch",
+    "any_task": "stable_baselines3",
 }
 
 
@@ -76,6 +77,12 @@ def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
     assert done["env_steps"] == 200
     assert done["updates"] == 20 + (200 - 48) / 4
     assert (tmp_path / "run" / "strata.parquet").is_file()
+
+
+def test_a_task_of_ones_own_learns_what_is_rare() -> None:
+    done = example("any_task").main(updates=200, episodes=200)
+    assert done["success"] == {"nominal": True, "rare": True}
+    assert done["rows fed"] == {"nominal": 200 * 64, "rare": 200 * 64}
 
 
 @pytest.mark.long  # its import alone takes seconds; test_tianshou_buffer has the shorter ones

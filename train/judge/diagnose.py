@@ -92,8 +92,14 @@ def diagnose(
 
 
 def target_rule(run: Run) -> TargetRule:
-    """Return the rule that the run's target followed."""
-    rule: TargetRule = msgspec.convert(run.document["config"]["target"], TargetRule)
+    """Return the rule that the run's target followed; raise RunError if it does not say."""
+    if (given := run.document["config"].get("target")) is None:
+        raise RunError(
+            "does not say how its target follows",
+            where=str(run.path),
+            remedy='give its buffer settings={"target": {"rule": "polyak", "tau": 0.005}, …}',
+        )
+    rule: TargetRule = msgspec.convert(given, TargetRule)
     return rule
 
 

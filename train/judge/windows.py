@@ -300,7 +300,7 @@ def windows_of(run: Run) -> list[Window]:
         rows = connection.sql(query).to_arrow_table().to_pylist()
     if not rows:
         remedy = "continue the run past its first evaluation (evaluation.every_env_steps)"
-        if not run.document["config"]["env"].get("twin", True):
+        if not run.document["config"].get("env", {}).get("twin", True):
             remedy = (
                 "it learned from the logs alone, without evaluations: use `restock eval "
                 f"{run.path} --on-logs own`"
@@ -353,5 +353,6 @@ def _value_bound(run: Run) -> float:
     """Return r_max / (1 - gamma), with the largest reward in the audited batches."""
     rewards = run.table("audit")["reward"].to_numpy()
     largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
-    discount = run.document["config"]["loss"]["discount"]
+    known = (run.document.get("panel") or {}) | run.document["config"].get("loss", {})
+    discount = known["discount"]
     return largest / (1 - discount) if largest > 0 else float("inf")

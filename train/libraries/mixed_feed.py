@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypedDict
 
 import numpy as np
@@ -40,7 +41,7 @@ from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.fresh_log import EpisodeLabels, values_entries
 from restock.train.feed.logs import Logs
-from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
+from restock.train.run.run import Rows, Run, check_free, now_ns, panel_document, software_versions
 from restock.train.run.run_profile import profile_document, profile_of_panel
 from restock.train.run.run_tables import TABLES
 
@@ -66,6 +67,8 @@ class FeedOptions(TypedDict, total=False):
     seed: int  # of the draws and of which batches are audited; default 0
     audit_share: float  # of all batches, each row of which is written down; default 0.01
     log_every: int  # batches summed into one row of each table; default 500
+    # What else makes the run what it is, by the keys of `restock train`: target, loss, optimizer, …
+    settings: Mapping[str, Any]
 
 
 class MixedFeed:
@@ -76,7 +79,10 @@ class MixedFeed:
         num_envs: N.
         observation_size: D, of the library's environment.
         panel: None for fresh rows alone.
-        run, logs_share, profile, seed, audit_share, log_every: see `FeedOptions`.
+        run, logs_share, profile, seed, audit_share, log_every, settings: see `FeedOptions`.
+
+    A panel of a table of any task has no profile: of fresh rows, the environment then names the
+    condition of each step in `info["condition"]`.
 
     Raises:
         ConfigError: a share outside [0, 1].
@@ -97,6 +103,7 @@ class MixedFeed:
         seed: int = 0,
         audit_share: float = 0.01,
         log_every: int = 500,
+        settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         definition, self.panel = environment_profile(profile, panel), panel
         if logs_share is not None and not 0 <= logs_share <= 1:
@@ -108,14 +115,9 @@ class MixedFeed:
         self.logs = Logs.of_panel(panel, as_of_ns=began_ns) if panel is not None else None
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
         self.rng = np.random.default_rng([seed, 1])
-        self.labels = InfoLabels(
-            conditions_in_twin(
-                definition.conditions, definition.signals, lidar=definition.task.lidar
-            )[0],
-            num_envs,
-        )
+        self.labels = labels_of(definition, panel, num_envs)
         self.num_envs, self.library = num_envs, library
-        self.action_names = definition.task.action_names
+        self.action_names = definition.task.action_names if definition is not None else None
         self.env_steps = self.batches = self.invalid_steps = 0
         self.episode_labels = EpisodeLabels()
         self._sampler: LoggedSampler | None = None
@@ -127,14 +129,15 @@ class MixedFeed:
         self.run: Run | None = None
         if run is not None:
             check_free(Path(run), _GO_ON)
-            settings = {
+            config = {
                 "logs_share": logs_share,
                 "seed": seed,
                 "audit_share": audit_share,
                 "num_envs": num_envs,
+                **settings,
             }
             self.run = create_run(
-                Path(run), {"name": library}, definition, self.panel, settings, seeds={"run": seed}
+                Path(run), {"name": library}, definition, self.panel, config, seeds={"run": seed}
             )
         self.record: FeedRecord | None = None
         self.fresh: Any = None
@@ -281,6 +284,22 @@ class MixedFeed:
         if self._open >= self.log_every:
             self._close_interval()
 
+    def evaluated(self, episodes: Rows = (), steps: Rows = ()) -> None:
+        """Record an evaluation: rows of the run's tables `evaluations` and `evaluation_buffer`.
+
+        `compare` needs each episode's condition, episode_seed, success and return; `diagnose` needs
+        rows, td_abs_mean, td_online_abs_mean and q_lag of each condition's steps.
+        """
+        if self.run is None:
+            return
+        self._close_interval()
+        now = {"env_steps": self.env_steps, "gradient_steps": self.batches}
+        usual = {**now, "perturbation": "none", "block": "none"}
+        tables = PartialTables(self.run)
+        tables.append("evaluations", [{**usual, **row} for row in episodes])
+        tables.append("evaluation_buffer", [{**now, **row} for row in steps])
+        self.run.flush()
+
     def _row_ids(self, drawing: BatchDraw, slots: Ints) -> list[dict[str, Any]]:
         meta = self.fresh.meta
         return row_ids(self.logs, drawing.rows, meta["episode"][slots], meta["episode_step"][slots])
@@ -338,14 +357,36 @@ class MixedFeed:
         )
 
 
-def environment_profile(name: str | None, panel: Panel | None) -> Profile:
-    """Return the profile of this name; without one the panel's, without a panel warehouse_amr."""
+def environment_profile(name: str | None, panel: Panel | None) -> Profile | None:
+    """Return the profile of this name; without one the panel's, without a panel warehouse_amr.
+
+    None for a panel of a table of any task.
+    """
     if name is None and panel is not None:
-        return profile_of_panel(panel)
+        return None if panel.task_hash.startswith("table-") else profile_of_panel(panel)
     return load_profile(name or PROFILE)
 
 
-def _check(panel: Panel, profile: Profile, observation_size: int) -> None:
+def labels_of(
+    profile: Profile | None, panel: Panel | None, num_envs: int
+) -> InfoLabels | NamedLabels:
+    """Return what labels fresh episodes: the profile's conditions, else the environment itself."""
+    if profile is None:
+        return NamedLabels(panel.header.conditions if panel is not None else [NOMINAL], num_envs)
+    signals, lidar = profile.signals, profile.task.lidar
+    return InfoLabels(conditions_in_twin(profile.conditions, signals, lidar=lidar)[0], num_envs)
+
+
+def _check(panel: Panel, profile: Profile | None, observation_size: int) -> None:
+    if profile is None:
+        if panel.observation_size != observation_size:
+            raise PanelError(
+                f"its observations have {panel.observation_size} entries, the environment's have"
+                f" {observation_size}",
+                where=str(panel.path),
+                remedy="log and train with the same wrappers around the environment",
+            )
+        return
     task_hash = profile.task.hash
     if panel.task_hash != task_hash or panel.observation_size != observation_size:
         raise PanelError(
@@ -364,7 +405,7 @@ _INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
 def create_run(
     path: Path,
     library: Mapping[str, Any],
-    profile: Profile,
+    profile: Profile | None,
     panel: Panel | None,
     config: Any,
     *,
@@ -380,6 +421,14 @@ def create_run(
     if panel is not None:
         strata = {stratum.name: stratum.share for stratum in panel.strata}
         mixed = {**panel_document(panel), "strata": strata}
+    if profile is not None:
+        signals, lidar = profile.signals, profile.task.lidar
+        about = profile_document(profile) | {
+            "not_evaluated": conditions_in_twin(profile.conditions, signals, lidar=lidar)[1]
+        }
+    else:  # a table of any task
+        task_hash = None if panel is None else panel.task_hash
+        about = {"task_hash": task_hash, "actions": [], "labels_version": None}
     return Run.create(
         path,
         {
@@ -388,10 +437,7 @@ def create_run(
             "config": config,
             "panel": mixed,
             **more,
-            **profile_document(profile),
-            "not_evaluated": conditions_in_twin(
-                profile.conditions, profile.signals, lidar=profile.task.lidar
-            )[1],
+            **about,
             "seeds": seeds,
             "versions": software_versions() | {name: version(name)},
         },
@@ -545,6 +591,42 @@ class Labelled:
     key: int
     codes: Ints  # (T,)
     conditions: list[str]  # that held at some step
+
+
+class NamedLabels:
+    """Labels of N environments' episodes whose infos name the `condition` of each step.
+
+    An episode with a step of no known condition is not labelled, and counted.
+    """
+
+    def __init__(self, names: Sequence[str], num_envs: int) -> None:
+        self.names = tuple(names)
+        self._running: list[list[str | None]] = [[] for _ in range(num_envs)]
+        self._ended: list[Labelled] = []
+        self.unlabelled_episodes = 0
+
+    def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> bool:
+        """Take one environment's step, as `InfoLabels.step` does."""
+        self._running[env].append(info.get("condition"))
+        if not ended:
+            return True
+        steps, self._running[env] = self._running[env], []
+        codes = [self.names.index(name) for name in steps if name in self.names]
+        if whole := len(codes) == len(steps):
+            held = sorted({name for name in steps if name is not None} - {NOMINAL})
+            self._ended.append(Labelled(key, np.array(codes, np.int64), held))
+        self.unlabelled_episodes += not whole
+        return whole
+
+    def forget(self) -> None:
+        """Forget the episodes under way: they stay unlabelled."""
+        self.unlabelled_episodes += sum(bool(steps) for steps in self._running)
+        self._running = [[] for _ in self._running]
+
+    def label(self, *, all_of_them: bool = False) -> list[Labelled]:
+        """Return the labels of the episodes that ended since the last call."""
+        ended, self._ended = self._ended, []
+        return ended
 
 
 class InfoLabels:

@@ -68,8 +68,11 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         parts = [ReplayBuffer(size) for _ in range(buffer_num)]
         logs = [ReplayBuffer(len(panel))] if panel is not None else []
         super().__init__([*parts, *logs])
-        task = environment_profile(options.get("profile"), panel).task
-        observation_size = task.observation_size
+        profile = environment_profile(options.get("profile"), panel)
+        if profile is not None:
+            observation_size = profile.task.observation_size
+        else:
+            observation_size = panel.observation_size if panel is not None else 0
         self.feed = MixedFeed(TIANSHOU, buffer_num, observation_size, panel=panel, **options)
         self.fresh = self.feed.fresh_meta(size * buffer_num)
         self.feed.keep_record(self.fresh)

@@ -40,9 +40,11 @@ def profile_of_run(run: Run) -> Profile:
         RunError: that text cannot be read.
         ConfigError: the run keeps none, as one of an older Restock, and its profile is not at hand.
     """
-    text = run.document.get("profile_toml", "")
+    text, config = run.document.get("profile_toml", ""), run.document["config"]
+    if not text and "profile" not in config:
+        raise RunError("its rows are a table of another task: no profile", where=str(run.path))
     if not text:
-        return load_profile(run.document["config"]["profile"])
+        return load_profile(config["profile"])
     try:
         return read_profile_toml(text, where="profile_toml")
     except ConfigError as error:

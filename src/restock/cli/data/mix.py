@@ -38,7 +38,7 @@ class MixCommand:
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
-    """The store to take transitions from."""
+    """The store to take transitions from, or a Parquet file of any task's (docs/panel.md)."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """A TOML file, or one of coverage and uniform. See docs/mixture.md."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
@@ -55,8 +55,6 @@ class MixCommand:
         from restock.cli import output
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import check_free, open_source, write_panel
-        from restock.replay.plan.plan import plan_panel
-        from restock.replay.store.store import Store
 
         if self.out is None and not self.dry_run:
             raise MixtureError("no --out given", remedy="give --out PANEL, or --dry-run")
@@ -64,13 +62,10 @@ class MixCommand:
             check_free(self.out, self.force)
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
-        with (
-            Store(self.store) as store,
-            open_source(store, mixture, folder=folder) as source,
-        ):
+        with open_source(self.store, mixture, folder=folder) as source:
             with output.progress("planning", None):
-                plan = plan_panel(source.connection, mixture, source.conditions, source.others)
-            document = describe(plan) | {"store_version": store.version, "mixture": self.mixture}
+                plan = source.plan(mixture)
+            document = describe(plan) | {"store_version": source.version, "mixture": self.mixture}
             read_by = source.profiles(plan.task_hash)
             document["profiles"] = [{"name": p.name, "hash": p.hash} for p in read_by]
             if self.out is not None and not self.dry_run:
@@ -232,11 +227,12 @@ def _summary(document: dict[str, Any]) -> list[str]:
     ]
     if (most := document["max_replays_per_row"]) is not None:
         draws += _in_training(document, most)
+    version = document["store_version"]
+    source = "the table" if version < 0 else f"store version {version}"
     moving = " on average" if document["schedules"] else ""
     lines += [
         *draws,
-        f"{document['rows']:,} rows of store version {document['store_version']}{others};"
-        f" not in the panel: {left_out or 'none'}",
+        f"{document['rows']:,} rows of {source}{others}; not in the panel: {left_out or 'none'}",
         f"{document['logs_share']:.1%} of a batch{moving} from the logs, worth"
         f" {document['effective_rows']:,.0f} equally weighted rows; largest weight"
         f" {document['largest_weight']:.3g}",

@@ -1,0 +1,147 @@
+"""Panels of a table of any task: no robot, no store, only its transitions."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.panels import NO_SPLIT, panel_of
+
+from restock.cli import main
+from restock.errors import RestockError
+from restock.replay import Panel, sampler_for
+
+Rows = list[dict[str, Any]]
+UNCORRECTED = 'correction = {pre = "none", post = "none"}\n'
+QUOTAS = f"{UNCORRECTED}{NO_SPLIT}[[strata]]\nname = 'rare'\nshare = 0.3\n[each_condition]\n"
+
+
+def logged(episodes: int = 40, limit: int = 30) -> Rows:
+    """Log CartPole under random actions; an episode that begins tilted is rare."""
+    env, rng, rows = gym.make("CartPole-v1", max_episode_steps=limit), np.random.default_rng(0), []
+    for episode in range(episodes):
+        seen, _ = env.reset(seed=episode)
+        over, condition = False, "nominal" if abs(seen[2]) < 0.04 else "rare"
+        while not over:
+            action = int(rng.integers(2))
+            after, reward, terminated, truncated, _ = env.step(action)
+            row = {"observation": seen, "action": action, "reward": reward, "episode": episode}
+            row |= {"terminated": terminated, "truncated": truncated, "condition": condition}
+            rows.append(row | {"after": after, "speed": float(seen[1])})
+            seen, over = after, terminated or truncated
+    return rows
+
+
+ROWS = logged()
+
+
+def table(rows: Rows = ROWS, *without: str, after: str = "after") -> pa.Table:
+    named = pa.Table.from_pylist(rows).drop_columns(list(without))
+    return named.rename_columns([after if name == "after" else name for name in named.column_names])
+
+
+def test_a_panel_has_the_rows_of_the_table(tmp_path: Path) -> None:
+    panel = panel_of(table(after="next_observation"), f"n_step = 1\n{QUOTAS}", tmp_path / "p")
+    part, order = panel.columns, panel.meta["transition_id"].to_numpy()
+    for name, of in (("observation", "observation"), ("next_observation", "after")):
+        expected = np.stack([ROWS[row][of] for row in order])
+        np.testing.assert_array_equal(panel.rows[:, part[name]], expected)
+    ended = np.array([ROWS[row]["terminated"] for row in order])
+    np.testing.assert_array_equal(panel.rows[:, part["discount"]][:, 0] == 0, ended)
+    assert panel.meta["condition"].to_pylist() == [ROWS[row]["condition"] for row in order]
+    assert len(panel) == len(ROWS)
+
+
+def test_next_observations_come_from_the_next_row(tmp_path: Path) -> None:
+    """The last row of an episode that did not terminate has none: it is counted."""
+    panel = panel_of(table(ROWS, "after"), QUOTAS, tmp_path / "p")
+    given = panel_of(table(after="next_observation"), QUOTAS, tmp_path / "given")
+    lost = sum(row["truncated"] and not row["terminated"] for row in ROWS)
+    assert lost > 0
+    assert panel.header.left_out == {"an episode's last, without a next observation": lost}
+    kept = np.isin(given.meta["transition_id"].to_numpy(), panel.meta["transition_id"].to_numpy())
+    bootstraps = panel.rows[:, panel.columns["discount"]][:, 0] > 0
+    np.testing.assert_array_equal(panel.rows[bootstraps], given.rows[kept][bootstraps])
+
+
+def test_rows_in_another_order_are_the_same_episodes(tmp_path: Path) -> None:
+    places: dict[int, int] = {}
+    steps = []
+    for number, row in enumerate(ROWS):
+        first = places.setdefault(row["episode"], number)
+        steps.append({**row, "step_index": number - first, "transition_id": number})
+    mixed = [steps[row] for row in np.random.default_rng(0).permutation(len(steps))]
+    for n_step in (1, 3):
+        text = f"n_step = {n_step}\n{QUOTAS}"
+        in_order = panel_of(table(steps, "after"), text, tmp_path / f"a{n_step}")
+        shuffled = panel_of(table(mixed, "after"), text, tmp_path / f"b{n_step}")
+        np.testing.assert_array_equal(in_order.rows, shuffled.rows)
+
+
+def test_a_file_is_mixed_as_a_table_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pq.write_table(table(ROWS, "after"), tmp_path / "log.parquet")
+    (tmp_path / "mixture.toml").write_text(QUOTAS)
+    options = ["--mixture", str(tmp_path / "mixture.toml"), "--out", str(tmp_path / "cli")]
+    assert main(["mix", str(tmp_path / "log.parquet"), *options]) == 0
+    assert "rows of the table" in capsys.readouterr().out
+    panel = panel_of(table(ROWS, "after"), QUOTAS, tmp_path / "p")
+    assert Panel.open(tmp_path / "cli").id == panel.id
+    other = [{**row, "reward": 2.0} for row in ROWS]  # a table's content is in the id
+    assert panel_of(table(other, "after"), QUOTAS, tmp_path / "o").id != panel.id
+
+
+def test_every_batch_has_its_quotas(tmp_path: Path) -> None:
+    """By the condition, or by SQL over any column of the table."""
+    fast = QUOTAS.replace("name = 'rare'", "name = 'fast'\nwhere = \"speed > 0.5\"")
+    for name, text in (("rare", QUOTAS), ("fast", fast)):
+        panel = panel_of(table(ROWS, "after"), text, tmp_path / name)
+        code = [stratum.name for stratum in panel.strata].index(name)
+        sampler = sampler_for(panel, 20, seed=0)
+        for _ in range(50):
+            draw = sampler.draw()
+            assert (panel.stratum_code[draw.rows] == draw.strata).all()
+            assert (draw.strata == code).sum() == 6
+        drawn = panel.rows[panel.stratum_code == code][:, panel.columns["observation"]]
+        assert name == "rare" or (drawn[:, 1] > 0.5).all()
+
+
+def changed(number: int, **values: Any) -> Callable[[], pa.Table]:
+    rows = [*ROWS]
+    rows[number] = {**rows[number], **values}
+    return lambda: table(rows, "after")
+
+
+OPEN = [{**row, "terminated": False, "truncated": False} for row in ROWS]
+HALVES = [{**row, "action": row["action"] / 2} for row in ROWS]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (lambda: table(ROWS, "terminated", "truncated"), "it has no terminated, truncated"),
+        (lambda: table(ROWS, "condition"), "it has no condition"),
+        (lambda: table(OPEN, "after"), "no row ends an episode"),
+        (changed(7, observation=[1.0, 2.0]), "row 7 has 2 entries, that of row 0 4"),
+        (changed(0, next_observation=[1.0]), "next observation of row 0 has not 4 entries"),
+        (changed(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
+        (lambda: table(HALVES, "after"), "is no whole number from 0 to 32,767"),
+        (changed(5, action=-1), "the action of row 5 is no whole number"),
+        (changed(4, truncated=True), "row 5 follows the end of its episode"),
+        (changed(6, condition=None), "1 rows have no coverage label"),
+        (lambda: table([{**row, "condition": 1} for row in ROWS]), "condition must be text"),
+        (
+            lambda: table([{**row, "condition": "nominal"} for row in ROWS]),
+            "stratum 'rare' is not a condition or exposure of these rows",
+        ),
+    ],
+)
+def test_tables_that_contradict_themselves_are_refused(
+    tmp_path: Path, given: Callable[[], pa.Table], said: str
+) -> None:
+    with pytest.raises(RestockError, match=said):
+        panel_of(given(), QUOTAS, tmp_path / "panel")
+    assert not list(tmp_path.iterdir())
