@@ -25,8 +25,7 @@ from harness import finish, markdown, option_parser
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 from restock.stats import interval_text, wilson
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.twin.env.drivers import (

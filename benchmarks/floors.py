@@ -22,7 +22,7 @@ from harness import finish, markdown, option_parser
 
 from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.survey.survey import Surveyed, survey
 from restock.twin import EpisodeSpec, PlannerFollower, WarehouseVectorEnv
 

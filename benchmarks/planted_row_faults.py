@@ -39,7 +39,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps import episodes as steps_module
 from restock.ingest.steps.filling import Filling
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.signals import Signals
+from restock.ingest.task.task import Signals
 from restock.train.judge.before_training import diagnose_rows, drive_twin, open_rows
 from restock.train.judge.causes import Finding
 from restock.train.judge.fed_rows import FedRows

@@ -163,8 +163,7 @@ def panel_build(count: int) -> dict[str, float]:
     import pyarrow as pa
     from support.stores import CONDITIONS, recording_transitions
 
-    from restock.ingest.task.scan import Body
-    from restock.ingest.task.task import Task
+    from restock.ingest.task.task import Body, Task
     from restock.replay.mixture.mixture import load_mixture
     from restock.replay.panel.build import build_panel
 

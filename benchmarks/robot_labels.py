@@ -24,7 +24,7 @@ from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.store.transitions import label_table
 from restock.ingest.task.conditions import label, shipped
 from restock.ingest.task.schema import true_names
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import STORED_SIGNALS
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.missions import KINDS

@@ -36,7 +36,7 @@ import restock  # noqa: F401 - registers the environment
 from restock import native
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import label
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import STORED_SIGNALS
 from restock.train.twin.env import vector_env
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Rect, Warehouse

@@ -36,7 +36,7 @@ from restock.process import import_extra
 if TYPE_CHECKING:
     from restock.errors import RestockError
     from restock.ingest.containers.storage import Watch
-    from restock.ingest.prepared import CommitGroup, IngestResult, OnRepeat, Prepared
+    from restock.ingest.pipeline import CommitGroup, IngestResult, OnRepeat, Prepared
     from restock.ingest.profile.profile import Profile
 
 Result = tuple[Path, Union["IngestResult", RestockError]]
@@ -66,13 +66,23 @@ class IngestJob:
         settle: Callable[[str], None] = lambda recording_id: None,
     ) -> Prepared | RestockError:
         """Read one recording and write its files; an error is returned: the others go on."""
-        from restock.ingest.pipeline import Reading, prepare
+        from restock.ingest.pipeline import prepare
         from restock.ingest.store.writer import StoreWriter
 
         try:
-            how = Reading(self.force, self.salvage, self.definitions, self.repeated, self.tags)
             store = StoreWriter(self.store) if self.store is not None else None
-            return prepare(path, self.profile, how, store=store, watch=watch, settle=settle)
+            return prepare(
+                path,
+                self.profile,
+                store=store,
+                force=self.force,
+                salvage=self.salvage,
+                definitions=self.definitions,
+                repeated=self.repeated,
+                tags=self.tags,
+                watch=watch,
+                settle=settle,
+            )
         except RestockError as error:
             return error
         except MemoryError:
@@ -114,7 +124,7 @@ def ingest_all(
     Raises:
         ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
     """
-    from restock.ingest.prepared import CommitGroup
+    from restock.ingest.pipeline import CommitGroup
     from restock.ingest.store.writer import StoreWriter
 
     taken = [Path(path) for path in paths]

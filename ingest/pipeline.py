@@ -1,37 +1,53 @@
-"""Ingest of one recording, end to end: columns, steps, episodes, labels, rows, and the commit.
+"""Ingest of a recording, end to end: columns, steps, episodes, labels, rows, and the commit.
 
-profile = load_profile("warehouse_amr")
-outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
+    profile = load_profile("warehouse_amr")
+    outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
+
+A recording is visible only after its commit, so a killed process loses only those that waited: the
+same command reads them again. The first recording is committed at once; after that, those of
+GROUP_S seconds together, or as soon as MAX_WAITING wait.
 """
 
 from __future__ import annotations
 
+import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import ConfigError, RecordingError, counted, expect, visible
+from restock.errors import (
+    ConfigError,
+    RecordingError,
+    RestockError,
+    StoreError,
+    counted,
+    quoted,
+    visible,
+)
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
-from restock.ingest.decoding.columns import Ragged
-from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
-from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
-from restock.ingest.profile.signal_paths import FIELDS, frame_id_path, plain, transform_fields
-from restock.ingest.profile.tag_rules import RecordingTags, resolve_tags
+from restock.ingest.profile.tag_rules import RecordingTags, in_words, resolve_tags
 from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
 from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
-from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
-from restock.ingest.store.lineage import own_path
+from restock.ingest.steps.needs import (
+    as_recorded,
+    read_topics,
+    renamed_inputs,
+    unknown_directions,
+)
+from restock.ingest.store.lineage import Ingest, own_path
 from restock.ingest.store.manifest import (
+    LabelScore,
     correction_rows,
     corrections_in,
     definitions,
@@ -43,11 +59,53 @@ from restock.ingest.store.manifest import (
     software_version,
     uncertain_conditions,
 )
+from restock.ingest.store.removal import remove_recordings
+from restock.ingest.store.summary import RepeatedDrive
 from restock.ingest.store.transitions import Provenance, recording_table, replaced
 from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.schema import recording_schema
 from restock.process import interrupts_raised
+
+GROUP_S = 5.0
+MAX_WAITING = 64
+Status = Literal["written", "tagged", "unchanged", "dry run"]
+OnRepeat = Literal["keep", "refuse", "replace"]
+
+
+@dataclass(frozen=True)
+class IngestResult:
+    """Outcome of one recording: the counts of its manifest, and its notes."""
+
+    path: str
+    status: Status
+    manifest: dict[str, Any]  # the row of `recordings`, as plain values
+    messages: dict[str, int] = field(default_factory=dict)  # of used topics; and of unused ones
+    conditions: dict[str, int] = field(default_factory=dict)  # transitions a label holds on
+    named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
+    exposures: dict[str, int] = field(default_factory=dict)  # transitions an exposure holds on
+    scores: list[LabelScore] = field(default_factory=list)
+    endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
+    lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
+    contradictions: list[str] = field(default_factory=list)  # of topics; kept in the rows
+    notes: list[str] = field(default_factory=list)
+    version: int | None = None  # of the store's transitions, where they were written
+    repeats: RepeatedDrive | None = None  # one in the store with largely the same rows
+
+    @property
+    def lossy(self) -> bool:
+        """Return whether data of the topics used was lost, or contradicts itself."""
+        return bool(self.lost_messages or self.contradictions)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A recording that was read, and what is left to do: its commit, unless there is none."""
+
+    result: IngestResult  # as it is once it is committed
+    staged: Staged | None = None
+    repeated: OnRepeat | None = None  # None: not looked for
+    period_s: float = 0.0  # its control period
 
 
 @interrupts_raised
@@ -78,10 +136,18 @@ def ingest(
             no transition, its sources contradict each other about a tag, or it is repeated and to
             be refused. The store is as it was.
         StoreError: the store cannot be written.
-        ConfigError: an argument that is of another kind, or no rule for `repeated`.
     """
-    how = Reading(force, salvage, definitions, repeated, tags or {})
-    prepared = prepare(path, profile, how, store=store, watch=watch)
+    prepared = prepare(
+        path,
+        profile,
+        store=store,
+        force=force,
+        salvage=salvage,
+        definitions=definitions,
+        repeated=repeated,
+        tags=tags or {},
+        watch=watch,
+    )
     if store is None:
         return prepared.result
     (outcome,) = commit_all(store, [prepared])
@@ -90,33 +156,16 @@ def ingest(
     return outcome
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Options for reading a recording: the arguments of `ingest` by these names."""
-
-    force: bool = False
-    salvage: bool = False
-    definitions: str | None = None
-    repeated: OnRepeat = "keep"
-    tags: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Raise ConfigError for values that the command line does not allow."""
-        if self.repeated not in get_args(OnRepeat):
-            has = ", ".join(get_args(OnRepeat))
-            raise ConfigError(f"no rule for repeated: {self.repeated!r}", remedy=f"give {has}")
-        expect("tags", self.tags, Mapping, 'give them by name, as {"robot": "amr-07"}')
-        for name, value in self.tags.items():
-            expect("the name of a tag", name, str, "write it as text")
-            expect(f"the tag {name}", value, str, "write it as text")
-
-
 def prepare(
     path: Path | str,
     profile: Profile,
-    how: Reading,
     *,
     store: StoreWriter | None,
+    force: bool = False,
+    salvage: bool = False,
+    definitions: str | None = None,
+    repeated: OnRepeat = "keep",
+    tags: Mapping[str, str] = MappingProxyType({}),
     watch: Watch | None = None,
     settle: Callable[[str], None] = lambda recording_id: None,
 ) -> Prepared:
@@ -127,24 +176,14 @@ def prepare(
 
     Raises as `ingest`, which does both.
     """
-    expect("profile", profile, Profile, "`load_profile(NAME_OR_FILE)` gives one")
-    if store is not None:
-        expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
-    with open_recording(
-        path, definitions=how.definitions, salvage=how.salvage, watch=watch
-    ) as recording:
+    with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
         renamed = renamed_inputs(profile, recording.topics)
         profile = as_recorded(profile, recording.topics)
         settle(recording.recording_id)
         before = _before(store, recording)
         tagged = (before or {}).get("tags") or {}
-        reported = resolve_tags(profile.tags, Path(path), recording.metadata, how.tags, tagged)
-        if (
-            store is not None
-            and before is not None
-            and not how.force
-            and _unchanged(before, profile)
-        ):
+        reported = resolve_tags(profile.tags, Path(path), recording.metadata, tags, tagged)
+        if store is not None and before is not None and not force and _unchanged(before, profile):
             new: dict[str, Any] = {"tags": reported.tags}
             if _other_robot(before, profile):
                 new["profile_toml"] = profile_toml(profile)
@@ -156,7 +195,7 @@ def prepare(
             return Prepared(result, staged)
         try:
             reported = replace(reported, notes=[*reported.notes, *renamed])
-            return _Ingest(str(path), recording, profile, reported, how.repeated, before).run(store)
+            return _Ingest(str(path), recording, profile, reported, repeated, before).run(store)
         except RecordingError as error:
             if error.where:
                 raise
@@ -395,66 +434,209 @@ class _Ingest:
         return notes
 
 
-MAX_TRANSFORMS = 20_000  # messages of a topic; what places a lidar is published all the time
-_ENDS = ("tf", "tf_static", "robot_description")
+def commit_all(
+    store: StoreWriter, prepared: Sequence[Prepared]
+) -> list[IngestResult | StoreError | RecordingError]:
+    """Commit recordings, several in one; return the result of each, in their order.
 
-
-def unknown_directions(recording: Recording, profile: Profile) -> list[str]:
-    """Return a note for each lidar whose zero is taken to point ahead though nothing says so.
-
-    A profile says so by an angle other than 0, or by any angle in the lidar's own input. Transforms
-    say so if one places the frame of the scans; a recorded description may say it.
+    If one cannot be committed, the others still are.
     """
-    unsaid = {
-        name: source
-        for name, source in profile.inputs.scans.items()
-        if source.lidar_yaw_rad is None
-        and (source.lidar_at_m is not None or profile.task.body.lidar_yaw_rad == 0)
-        and source.topic in recording.topics
-    }
-    if not unsaid or any(name.endswith("/robot_description") for name in recording.topics):
-        return []
-    frames = {name: _first_frame(recording, source.topic) for name, source in unsaid.items()}
-    frames = {
-        name: frame
-        for name, frame in frames.items()
-        if frame and frame.split("/")[-1] not in BASE_FRAMES
-    }
-    left = set(frames.values())
-    for topic in recording.topics if left else ():
-        for child in _children(recording, topic):
-            left.discard(child)
-            if not left:
-                return []
-    return [
-        f"{name}: no transform places {frame}, the frame of {unsaid[name].topic}: its zero is "
-        "assumed to point straight ahead; if it does, set lidar_at_m and lidar_yaw_rad = 0 in "
-        f"[inputs.{name}]"
-        for name, frame in frames.items()
-        if frame in left
-    ]
+    outcomes: dict[int, IngestResult | StoreError | RecordingError] = {}
+    group: dict[int, Prepared] = {}
+    for place, one in enumerate(prepared):
+        # Of one recording the later ingest replaces the earlier, in a commit of its own.
+        if one.staged and one.staged.recording_id in {_id(other) for other in group.values()}:
+            outcomes |= _commit(store, group)
+            group = {}
+        if one.staged is None:
+            outcomes[place] = one.result
+        elif refused := _refusal(store, one, list(group.values())):
+            store.discard([one.staged])
+            outcomes[place] = refused
+        else:
+            group[place] = one
+    outcomes |= _commit(store, group)
+    return [outcomes[place] for place in range(len(prepared))]
 
 
-def _first_frame(recording: Recording, topic: str) -> str:
-    path = frame_id_path(recording.leaves(topic))
-    if path is not None:
-        for _, fields in recording.batches(topic, [path]):
-            for frame in np.asarray(fields[path], object)[:1]:
-                return plain(str(frame))
-    return ""
+def _id(one: Prepared) -> str | None:
+    return one.staged.recording_id if one.staged else None
 
 
-def _children(recording: Recording, topic: str) -> Iterator[str]:
-    """Yield the frames that a topic of transforms places, again and again."""
-    layout = transform_fields(recording.leaves(topic))
-    if layout is None or recording.topics[topic].skipped:
-        return
-    path, count = layout[FIELDS.index("transforms[].child_frame_id")], 0
-    for times, fields in recording.batches(topic, [path]):
-        column = fields[path]
-        values = column.values if isinstance(column, Ragged) else column
-        children = set(map(str, np.asarray(values, object).ravel()))
-        yield from {plain(child) for child in children}
-        count += len(times)
-        if count > MAX_TRANSFORMS:
+def _refusal(
+    store: StoreWriter, one: Prepared, before: Sequence[Prepared]
+) -> RecordingError | StoreError | None:
+    """Return why a recording is not to be committed: it is in the store or earlier in its group."""
+    if one.staged is None or one.repeated in (None, "keep"):
+        return None
+    ahead = [other.staged for other in before if other.staged]
+    try:
+        found = store.repeated(one.staged, one.period_s, ahead=ahead)
+    except StoreError as error:
+        return error
+    if found is None or (one.repeated == "replace" and found.the_less):
+        return None
+    remedy = "leave it out, or use --repeated keep to ingest it anyway"
+    if found.the_less:  # as of a recording that was still being written, or salvaged
+        remedy = (
+            f"this one holds more of the drive: {_removal(store, found.recording_id)} removes "
+            "that one; then ingest this one again (--repeated replace does both), or keep both "
+            "with --repeated keep"
+        )
+    return RecordingError(str(found), where=one.result.path, remedy=remedy)
+
+
+def _removal(store: StoreWriter, recording_id: str) -> str:
+    return f"`restock store remove {quoted(store.path)} {recording_id}`"
+
+
+def _commit(
+    store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
+) -> dict[int, IngestResult | StoreError | RecordingError]:
+    """Commit all in one, or if that fails, each alone; `begun` if a commit of several had begun."""
+    staged = {place: one.staged for place, one in group.items() if one.staged}
+    several = list(staged.values())
+    if not several:
+        return {}
+    try:
+        store.fit(several)
+        begun = True
+        version = store.commit_staged(several)
+    except StoreError as error:
+        if len(group) > 1:
+            outcomes = [_commit(store, {place: one}, begun=begun) for place, one in group.items()]
+            return {place: outcome for one in outcomes for place, outcome in one.items()}
+        (store.take_back if begun else store.discard)(several)
+        return dict.fromkeys(group, error)
+    except BaseException:
+        (store.take_back if begun else store.discard)(several)
+        raise
+    later = [Ingest(one.recording_id, one.ingest_id, 0) for one in staged.values()]
+    found: dict[int, IngestResult | StoreError | RecordingError] = {}
+    for place, one in group.items():
+        later = later[1:]
+        found[place] = _finished(store, one, staged[place], version, later)
+    return found
+
+
+def _finished(
+    store: StoreWriter, one: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
+) -> IngestResult | StoreError:
+    """Build the result of a committed recording, ignoring the `later` ones of its group."""
+    repeats = None
+    if one.repeated is not None:
+        # Looked for after the commit: another process may have written the same drive meanwhile.
+        try:
+            repeats = store.repeated(staged, one.period_s, aside={i.ingest_id for i in later})
+        except StoreError as error:
+            return error
+    notes = list(one.result.notes)
+    if repeats is not None and one.repeated == "replace":
+        try:
+            replaced_by, note = _replaced(store, repeats)
+        except StoreError as error:
+            replaced_by, note = None, f"a part of it stays in the store: {error}"
+        version = replaced_by or version
+        notes.append(note)
+    elif repeats is not None:
+        until = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
+        if repeats.the_less:
+            how = f"{_removal(store, repeats.recording_id)} removes that one, which holds less"
+        else:
+            how = f"{_removal(store, staged.recording_id)} removes this one"
+        notes.append(f"{until} {how}")
+    return replace(one.result, version=version, repeats=repeats, notes=notes)
+
+
+def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
+    """Remove a recording that is only a part of what was just ingested.
+
+    Returns the store's version (None if the part stays) and a note for the user.
+    """
+    why = "it has steps that this one lacks"
+    if part.is_part:
+        (reported,) = remove_recordings(store, [part.recording_id], dry_run=True).recordings
+        if not reported.corrections:
+            removed = remove_recordings(store, [part.recording_id])
+            return removed.version, (
+                f"in place of {part.source_file} (recording {part.recording_id}), a part of it, "
+                "which was removed"
+            )
+        why = f"people corrected {counted(reported.corrections, 'label')} of it"
+    return None, f"{part}. It stays, as {why}: {_removal(store, part.recording_id)} removes it"
+
+
+class CommitGroup:
+    """Recordings that wait for their commit, and `results`, what became of those before, by place.
+
+    `store` None is a dry run; `clock` gives seconds.
+    """
+
+    def __init__(
+        self, store: StoreWriter | None, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.store, self.clock = store, clock
+        self.results: dict[int, IngestResult | RestockError] = {}
+        self.waiting: dict[int, Prepared] = {}
+        self._first: dict[str, IngestResult] = {}  # of each recording, by id, in this ingest
+        self._last_s: float | None = None  # when the last commit was done
+
+    def add(self, place: int, one: Prepared | RestockError) -> None:
+        """Take in what was made of a recording; commit where it is time."""
+        if isinstance(one, RestockError):
+            self.results[place] = one
+        elif self.store is not None and (copy := self._copy(one.result)) is not None:
+            self.store.discard([one.staged] if one.staged else [])
+            self.results[place] = copy
+        elif one.staged is None:
+            self.results[place] = one.result
+        else:
+            self.waiting[place] = one
+        self.commit_if_due()
+
+    def _copy(self, result: IngestResult) -> IngestResult | None:
+        """Return the result of a recording that came before under another path with other tags.
+
+        The first path's tags stay. Otherwise each ingest of the two paths would change them.
+        """
+        first = self._first.setdefault(result.manifest.get("recording_id", ""), result)
+        tags = first.manifest.get("tags") or {}
+        if (result.manifest.get("tags") or {}) == tags:
+            return None
+        note = f"the same recording as {first.path}, whose tags it keeps: {in_words(tags)}"
+        return IngestResult(result.path, "unchanged", first.manifest, notes=[note])
+
+    def due_in_s(self) -> float | None:
+        """Return the seconds until waiting recordings must be committed; None if none waits."""
+        if not self.waiting:
+            return None
+        if self._last_s is None or len(self.waiting) >= MAX_WAITING:
+            return 0.0
+        return max(0.0, self._last_s + GROUP_S - self.clock())
+
+    def commit_if_due(self) -> None:
+        """Commit what waits, where it is time."""
+        if self.due_in_s() == 0.0:
+            self.commit()
+
+    def settle(self, recording_id: str) -> None:
+        """Commit what waits, where this recording does: it is about to be looked up."""
+        if recording_id in {_id(one) for one in self.waiting.values()}:
+            self.commit()
+
+    def commit(self) -> None:
+        """Commit what waits."""
+        if not self.waiting or self.store is None:
             return
+        # Once a commit has begun, what it is about is not discarded.
+        waiting, self.waiting = self.waiting, {}
+        outcomes = commit_all(self.store, list(waiting.values()))
+        self.results |= dict(zip(waiting, outcomes, strict=True))
+        self._last_s = self.clock()
+
+    def discard(self) -> None:
+        """Delete the files of what still waits."""
+        staged = [one.staged for one in self.waiting.values() if one.staged]
+        self.waiting = {}
+        if self.store is not None:
+            self.store.discard(staged)

@@ -29,8 +29,7 @@ from restock.ingest.steps.clocks import JUMP_S, WINDOW_NS, ClockMap, median
 from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import nearest_action, observe
+from restock.ingest.task.task import Signals, nearest_action, observe
 
 _DELAYS = 200  # of each topic, of which the median counts
 _MINUTES = 10  # over which drift is looked for

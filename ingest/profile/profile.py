@@ -73,8 +73,7 @@ from restock.ingest.task.conditions import (
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.robot import Limiter, Robot, beyond_limits, refuse_beyond_steering
 from restock.ingest.task.schema import steps_schema
-from restock.ingest.task.signals import Noise
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Noise, Task
 from restock.renamed import PROFILE_KEYS
 from restock.toml import Checked, changed, parse_toml, read_toml, toml_value, typed
 

@@ -397,7 +397,7 @@ CONVENTIONS = (
         "NaN",
     ),
     # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". Of
-    # the scans that fill an input, `restock.ingest.task.scan` makes clearance.
+    # the scans that fill an input, `restock.ingest.task.surroundings` makes clearance.
     Convention(
         "Range",
         ("range",),

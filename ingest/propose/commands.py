@@ -31,7 +31,7 @@ from restock.ingest.propose.robot_choice import (
 )
 from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.frames import PoseSeries
-from restock.ingest.task.signals import wrap_angle
+from restock.ingest.task.task import wrap_angle
 
 PASSED_WITHIN_S = 0.5
 MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5  # changes that one topic took over from another

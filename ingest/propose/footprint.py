@@ -39,7 +39,7 @@ from restock.ingest.propose.roles import Kind, shared, sort_own_first
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Edges, PoseSeries, Tree, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
-from restock.ingest.task.signals import yaw_of
+from restock.ingest.task.task import yaw_of
 
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms
 SIZES_M = (0.02, 30.0)  # of a robot that this can be

@@ -23,7 +23,7 @@ from restock.ingest.propose.roles import Roles, robots_in
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Edges, PoseSeries, Tree, poses_along, upward
 from restock.ingest.steps.input_columns import MAX_STD_M, TRACK_M, Fixes, fixes_of
-from restock.ingest.task.signals import wrap_angle, yaw_of
+from restock.ingest.task.task import wrap_angle, yaw_of
 
 FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")
 FIXED_FRAMES = ("map", "odom", "world")  # best first

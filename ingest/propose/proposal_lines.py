@@ -42,8 +42,7 @@ from restock.ingest.propose.trial import Trial
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.signals import Noise
-from restock.ingest.task.task import Rewards, Task
+from restock.ingest.task.task import Noise, Rewards, Task
 
 
 def _takeover_lines(recording: Recording, lines: Sequence[str]) -> list[str]:

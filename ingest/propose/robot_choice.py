@@ -33,7 +33,7 @@ from restock.ingest.propose.footprint import (
 from restock.ingest.propose.roles import shared
 from restock.ingest.steps.frames import PoseSeries, motion_at
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
-from restock.ingest.task.signals import wrap_angle
+from restock.ingest.task.task import wrap_angle
 from restock.toml import toml_value
 
 TICK_NS = 100_000_000  # between two looks at the motion

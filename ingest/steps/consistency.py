@@ -18,7 +18,7 @@ from restock.errors import counted
 from restock.ingest.steps.align import NS, ClockReport
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.input_columns import InputColumns
-from restock.ingest.task.signals import Signals, wrap_angle
+from restock.ingest.task.task import Signals, wrap_angle
 
 WINDOW_S = 3.0  # in which two sources of a speed are compared
 MIN_WINDOWS = 5  # in which the robot moves; fewer say nothing

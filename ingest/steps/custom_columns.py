@@ -25,7 +25,7 @@ from restock.ingest.profile.signal_paths import (
 from restock.ingest.profile.tables import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
 from restock.ingest.steps.align import LatestMessages
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.task.signals import yaw_of
+from restock.ingest.task.task import yaw_of
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ from restock.ingest.steps.consistency import Finding, findings_of
 from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.filling import TOO_LARGE, Filling, Routing
 from restock.ingest.task.schema import Perturbed
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task, nearest_action, terminated
+from restock.ingest.task.task import Signals, Task, nearest_action, terminated
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,7 @@ from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.frames import motion_at
 from restock.ingest.steps.needs import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.hindsight import missions
-from restock.ingest.task.scan import with_unseen
 from restock.ingest.task.schema import Perturbed
-from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.surroundings import (
     PLAN_PARTS,
     SCANNED,
@@ -38,8 +36,9 @@ from restock.ingest.task.surroundings import (
     returns_on_plan,
     steps_remembered,
     view_route,
+    with_unseen,
 )
-from restock.ingest.task.task import Task, clearance_ahead
+from restock.ingest.task.task import Signals, Task, clearance_ahead, localised_velocity
 
 # A number beyond this, in any unit that a signal has, is a fault: of a position, a store's float32
 # could not tell centimetres apart.

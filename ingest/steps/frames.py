@@ -30,7 +30,7 @@ from restock.ingest.profile.signal_paths import AXES, TURN, plain, transform_fie
 from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.align import ClockSegment, LatestMessages
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.task.signals import wrap_angle
+from restock.ingest.task.task import wrap_angle
 
 PARENT = "parent"
 

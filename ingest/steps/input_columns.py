@@ -43,7 +43,7 @@ from restock.ingest.profile.signal_paths import (
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.frames import Placement
-from restock.ingest.task.signals import yaw_of
+from restock.ingest.task.task import yaw_of
 
 EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS84
 COVARIANCES = 9  # of a fix

@@ -6,7 +6,7 @@ For a laser scan the clearance per sector is kept, not the ranges.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,15 @@ from restock.errors import RecordingError, counted
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, cut, take
+from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import (
     FIELDS,
     element_of,
+    frame_id_path,
     frame_path,
     offer,
+    plain,
     pressed_paths,
     transform_fields,
 )
@@ -35,7 +38,7 @@ from restock.ingest.steps.cameras import TYPES, frame_reduction, other_field
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
 from restock.ingest.steps.input_columns import estimate_reduction
-from restock.ingest.task.scan import MovedMap, SectorMap
+from restock.ingest.task.surroundings import MovedMap, SectorMap
 from restock.ingest.task.task import Task
 
 if TYPE_CHECKING:
@@ -325,6 +328,71 @@ def _skipped(topic: str, available: Mapping[str, Any]) -> str:
     """Say that a topic is there, and why its messages cannot be decoded."""
     info = available[topic]
     return f"{topic} is skipped, with {counted(info.expected, 'message')}: {info.skipped}"
+
+
+MAX_TRANSFORMS = 20_000  # messages of a topic; what places a lidar is published all the time
+_ENDS = ("tf", "tf_static", "robot_description")
+
+
+def unknown_directions(recording: Recording, profile: Profile) -> list[str]:
+    """Return a note for each lidar whose zero is taken to point ahead though nothing says so.
+
+    A profile says so by an angle other than 0, or by any angle in the lidar's own input. Transforms
+    say so if one places the frame of the scans; a recorded description may say it.
+    """
+    unsaid = {
+        name: source
+        for name, source in profile.inputs.scans.items()
+        if source.lidar_yaw_rad is None
+        and (source.lidar_at_m is not None or profile.task.body.lidar_yaw_rad == 0)
+        and source.topic in recording.topics
+    }
+    if not unsaid or any(name.endswith("/robot_description") for name in recording.topics):
+        return []
+    frames = {name: _first_frame(recording, source.topic) for name, source in unsaid.items()}
+    frames = {
+        name: frame
+        for name, frame in frames.items()
+        if frame and frame.split("/")[-1] not in BASE_FRAMES
+    }
+    left = set(frames.values())
+    for topic in recording.topics if left else ():
+        for child in _children(recording, topic):
+            left.discard(child)
+            if not left:
+                return []
+    return [
+        f"{name}: no transform places {frame}, the frame of {unsaid[name].topic}: its zero is "
+        "assumed to point straight ahead; if it does, set lidar_at_m and lidar_yaw_rad = 0 in "
+        f"[inputs.{name}]"
+        for name, frame in frames.items()
+        if frame in left
+    ]
+
+
+def _first_frame(recording: Recording, topic: str) -> str:
+    path = frame_id_path(recording.leaves(topic))
+    if path is not None:
+        for _, fields in recording.batches(topic, [path]):
+            for frame in np.asarray(fields[path], object)[:1]:
+                return plain(str(frame))
+    return ""
+
+
+def _children(recording: Recording, topic: str) -> Iterator[str]:
+    """Yield the frames that a topic of transforms places, again and again."""
+    layout = transform_fields(recording.leaves(topic))
+    if layout is None or recording.topics[topic].skipped:
+        return
+    path, count = layout[FIELDS.index("transforms[].child_frame_id")], 0
+    for times, fields in recording.batches(topic, [path]):
+        column = fields[path]
+        values = column.values if isinstance(column, Ragged) else column
+        children = set(map(str, np.asarray(values, object).ravel()))
+        yield from {plain(child) for child in children}
+        count += len(times)
+        if count > MAX_TRANSFORMS:
+            return
 
 
 # What is made of a scan, beside the message's own fields (whose names hold no space).

@@ -43,7 +43,7 @@ from restock.ingest.task.conditions import (
     unseen,
 )
 from restock.ingest.task.schema import true_names
-from restock.ingest.task.signals import OUTLINE_SIGNALS
+from restock.ingest.task.task import OUTLINE_SIGNALS
 
 UNUSED = "not used by the profile"
 

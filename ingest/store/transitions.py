@@ -33,8 +33,7 @@ from restock.ingest.task.schema import (
     true_names,
     truth_text,
 )
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import observe, reward
+from restock.ingest.task.task import Signals, observe, reward
 
 GROUP_ROWS = 8192  # of whole episodes that are worked out together: bounds memory
 

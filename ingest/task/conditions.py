@@ -70,8 +70,7 @@ from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.files import first_line
 from restock.ingest.task.condition_sql import SANDBOX, SELECT, WINDOW, refusal, sandbox
-from restock.ingest.task.signals import LIDAR_SIGNALS, PLAN_SIGNALS, Noise
-from restock.ingest.task.task import STAND_IN_LIMITS
+from restock.ingest.task.task import LIDAR_SIGNALS, PLAN_SIGNALS, STAND_IN_LIMITS, Noise
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]

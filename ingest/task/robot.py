@@ -33,8 +33,8 @@ from msgspec import Meta
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
-from restock.ingest.task.scan import Body, outline_reach
-from restock.ingest.task.task import Task
+from restock.ingest.task.surroundings import outline_reach
+from restock.ingest.task.task import Body, Task
 from restock.toml import Checked
 
 Drive = Literal["differential", "skid_steer", "omnidirectional", "ackermann"]

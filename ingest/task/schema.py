@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.ingest.task.conditions import NOMINAL
-from restock.ingest.task.signals import OPTIONAL_SIGNALS, STORED_SIGNALS, Signals
+from restock.ingest.task.task import OPTIONAL_SIGNALS, STORED_SIGNALS, Signals
 
 # transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
 STEP_BITS = 25

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 from restock.errors import StoreError, expect
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import STORED_SIGNALS
 from restock.process import interrupts_raised
 from restock.replay.store.query import values
 from restock.replay.store.store import Store

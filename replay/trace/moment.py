@@ -19,8 +19,8 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.needs import angle_keys, beam_angles, read_topics
-from restock.ingest.task.scan import Body, outline_reach
-from restock.ingest.task.task import Task
+from restock.ingest.task.surroundings import outline_reach
+from restock.ingest.task.task import Body, Task
 from restock.replay.store.store import Store
 from restock.replay.trace.origin import Origin, profile_of, rows_of, sql_file
 

@@ -28,8 +28,7 @@ from support.cameras import (
 from support.long import one_in
 
 from restock.errors import ConfigError, RecordingError, StoreError
-from restock.ingest.pipeline import ingest
-from restock.ingest.prepared import IngestResult
+from restock.ingest.pipeline import IngestResult, ingest
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.cameras import (
     COMPRESSED,

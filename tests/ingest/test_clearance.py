@@ -12,7 +12,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps import needs
 from restock.ingest.steps.needs import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
-from restock.ingest.task.scan import SectorMap
+from restock.ingest.task.surroundings import SectorMap
 
 TASK = load_profile("warehouse_amr").task
 FIELDS = {

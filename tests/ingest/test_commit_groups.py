@@ -18,9 +18,9 @@ from support.paths import ROOT
 from support.stores import manifest, one, recording_transitions, shown
 
 from restock.errors import RecordingError, StoreError
-from restock.ingest import prepared as prepared_module
+from restock.ingest import pipeline
 from restock.ingest.batch import IngestJob, ingest_all
-from restock.ingest.prepared import GROUP_S, CommitGroup, IngestResult, OnRepeat, Prepared
+from restock.ingest.pipeline import GROUP_S, CommitGroup, IngestResult, OnRepeat, Prepared
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
@@ -78,7 +78,7 @@ def test_the_first_is_committed_at_once_then_groups(tmp_path):
 
 
 def test_no_more_than_so_many_wait(store, group, tmp_path, monkeypatch):
-    monkeypatch.setattr(prepared_module, "MAX_WAITING", 2)
+    monkeypatch.setattr(pipeline, "MAX_WAITING", 2)
     for place in range(5):
         group.add(place, waiting(store, one(place + 1)))
     assert list(group.results) == [0, 1, 2, 3, 4]
@@ -158,7 +158,7 @@ def test_a_recording_given_twice_is_unchanged_the_second_time(tmp_path):
 KILLED = """
 import os, signal, sys
 from support.stores import one
-from restock.ingest.prepared import CommitGroup, IngestResult, Prepared
+from restock.ingest.pipeline import CommitGroup, IngestResult, Prepared
 from restock.ingest.store.writer import StoreWriter
 
 place, when = sys.argv[1:]

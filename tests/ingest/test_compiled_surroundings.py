@@ -10,14 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock import native
-from restock.ingest.task.scan import Body
 from restock.ingest.task.surroundings import (
     came_nearer,
     plan_distances_m,
     returns_on_plan,
     view_route,
 )
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 
 compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
 pytestmark = [compiled, pytest.mark.filterwarnings("ignore::RuntimeWarning")]

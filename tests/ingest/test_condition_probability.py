@@ -17,7 +17,7 @@ from restock.ingest.task.conditions import (
     too_near_to_call,
 )
 from restock.ingest.task.schema import steps_schema
-from restock.ingest.task.signals import Noise
+from restock.ingest.task.task import Noise
 
 FILE = """-- Fast, for a while.
 -- timing: pre

@@ -11,8 +11,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task import conditions
 from restock.ingest.task.conditions import Condition, label, let_values, primary, shipped
 from restock.ingest.task.schema import SIGNAL_COLUMNS
-from restock.ingest.task.signals import Noise
-from restock.ingest.task.task import STAND_IN_LIMITS
+from restock.ingest.task.task import STAND_IN_LIMITS, Noise
 
 SHIPPED = list(shipped().values())
 

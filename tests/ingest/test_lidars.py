@@ -23,7 +23,7 @@ from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.task.scan import MovedMap, outline_reach, with_unseen
+from restock.ingest.task.surroundings import MovedMap, outline_reach, with_unseen
 from restock.replay.trace.moment import seen_between
 
 TASK = load_profile("warehouse_amr").task

@@ -13,13 +13,12 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import MixtureError
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.pipeline import ingest
-from restock.ingest.prepared import IngestResult
+from restock.ingest.pipeline import IngestResult, ingest
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.robot import NONE, SPEED, Limits, limit
-from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
+from restock.ingest.task.task import LIDAR_SIGNALS, STORED_SIGNALS
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.plan.plan import plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits

@@ -8,8 +8,7 @@ import pytest
 from support.paths import ROOT
 
 from restock.ingest.profile.tables import Clock, Episodes, Frames, Input, Motion, Zone
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Rewards, Task
+from restock.ingest.task.task import Body, Rewards, Task
 
 PAGE = (ROOT / "docs" / "profile.md").read_text("utf-8").partition("## Keys of a profile")[2]
 TABLES_WITHIN = {"body", "rewards"}

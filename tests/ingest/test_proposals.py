@@ -45,8 +45,7 @@ from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import RobotProposal
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.frames import PoseSeries
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Task, nearest_action
+from restock.ingest.task.task import Body, Task, nearest_action
 from restock.replay.store.store import Store
 from restock.train.twin.physics.simulation import blocks_of
 from restock.train.twin.survey.poses import candidate_poses

@@ -14,10 +14,10 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.prepared import RemovedRecording, remove_recordings
 from restock.ingest.relabel import RecordingCorrections, correct_store
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.manifest import Correction
+from restock.ingest.store.removal import RemovedRecording, remove_recordings
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store

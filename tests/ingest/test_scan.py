@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from restock.ingest.task.scan import Body, MovedMap, SectorMap, outline_reach
+from restock.ingest.task.surroundings import MovedMap, SectorMap, outline_reach
+from restock.ingest.task.task import Body
 
 BODY = Body(length_m=0.7, width_m=0.5)
 POINT = Body(length_m=1e-9, width_m=1e-9)

@@ -17,8 +17,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.propose.robot_choice import DriveEvidence, drive_evidence
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
 from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.perturbation import Perturbation

@@ -21,8 +21,8 @@ from support.stores import one, shown
 import restock
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.prepared import remove_recordings
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.removal import remove_recordings
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 

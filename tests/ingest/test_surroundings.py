@@ -8,9 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from restock.ingest.task.scan import Body, SectorMap
-from restock.ingest.task.surroundings import came_nearer, plan_distances_m, returns_on_plan
-from restock.ingest.task.task import Task
+from restock.ingest.task.surroundings import (
+    SectorMap,
+    came_nearer,
+    plan_distances_m,
+    returns_on_plan,
+)
+from restock.ingest.task.task import Body, Task
 
 TASK = Task(body=Body(length_m=0.7, width_m=0.5), actions=((0.0, 0.0), (1.0, 0.0)))
 BEARINGS = (np.arange(360) + 0.5) * (2 * np.pi / 360) - np.pi

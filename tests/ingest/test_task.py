@@ -8,19 +8,22 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.scan import Body
-from restock.ingest.task.signals import SIGNALS, localised_velocity, wrap_angle, yaw_of
 from restock.ingest.task.task import (
+    SIGNALS,
+    Body,
     Mirror,
     Rewards,
     Task,
     clearance_ahead,
+    localised_velocity,
     nearest_action,
     observe,
     reached_goal,
     reward,
     reward_parts,
     terminated,
+    wrap_angle,
+    yaw_of,
 )
 
 TASK = Task(

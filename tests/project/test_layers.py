@@ -21,7 +21,7 @@ SHARED = {
     *("renamed", "state", "stats", "toml"),
 }
 MAY_IMPORT = {
-    "ingest": "containers decoding profile steps store task",
+    "ingest": "containers profile steps store task",
     "ingest/decoding": "",
     "ingest/containers": "decoding",
     "ingest/task": "",
@@ -158,7 +158,7 @@ MODULES = {
 
 
 def imports(path: Path) -> Iterator[str]:
-    """Yield what a file imports of Restock, as paths: `ingest/task/scan`, `errors`."""
+    """Yield what a file imports of Restock, as paths: `ingest/task/task`, `errors`."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):

@@ -16,9 +16,8 @@ from deltalake import write_deltalake
 from restock.ingest.store.summary import summarised
 from restock.ingest.store.version import FORMAT
 from restock.ingest.task.conditions import labels_version, primary, shipped
-from restock.ingest.task.scan import Body
 from restock.ingest.task.schema import STEP_BITS, recording_schema, transition_schema
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 from restock.replay.store.definitions import Definitions
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 
 from restock.ingest.task.conditions import Condition
-from restock.ingest.task.scan import Body
-from restock.ingest.task.signals import STORED_SIGNALS
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import STORED_SIGNALS, Body, Task
 from restock.train.twin.physics.episode import EpisodeSpec
 
 CELLS = 6

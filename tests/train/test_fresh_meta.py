@@ -9,7 +9,7 @@ import pyarrow as pa
 import restock  # noqa: F401 - registers the environment
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import label, primary
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import STORED_SIGNALS
 from restock.replay.sampling.ring import FreshRing
 from restock.train.libraries.mixed_feed import FreshMeta, InfoLabels
 from restock.train.twin.env.drivers import PlannerFollower

@@ -12,7 +12,7 @@ from restock import cli
 from restock.errors import ExitCode
 from restock.ingest.profile.profile import Profile, load_profile, profile_toml
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.model import robot_model

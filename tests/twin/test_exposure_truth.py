@@ -9,10 +9,8 @@ import pytest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import label_table
 from restock.ingest.task.conditions import label, shipped
-from restock.ingest.task.scan import Body
 from restock.ingest.task.schema import true_names
-from restock.ingest.task.signals import STORED_SIGNALS
-from restock.ingest.task.task import Rewards, Task
+from restock.ingest.task.task import STORED_SIGNALS, Body, Rewards, Task
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.navigation import EXPOSURES, Truth
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

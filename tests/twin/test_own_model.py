@@ -14,7 +14,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile.description import MAX_BYTES, mjcf_problem
 from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.model import robot_model
 from restock.train.twin.physics.perturbation import Perturbation

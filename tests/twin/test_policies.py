@@ -6,8 +6,7 @@ import pytest
 from support.long import one_in
 
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 from restock.train.twin.env.drivers import (
     BehaviourPolicy,
     Handover,

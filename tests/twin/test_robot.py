@@ -17,8 +17,7 @@ from restock.ingest.profile.profile import (
     read_profile_toml,
 )
 from restock.ingest.task.robot import Lidar, Robot
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Warehouse, default_warehouse

@@ -12,8 +12,7 @@ from twin.test_robot import AMR, amr_with, driven
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.scan import Body
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Body, Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 import restock  # noqa: F401 - registers the environment
 from restock.errors import ConfigError, RunError
-from restock.ingest.task.signals import SIGNALS
-from restock.ingest.task.task import observe, reward
+from restock.ingest.task.task import SIGNALS, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
 from restock.train.twin.env.drivers import PlannerFollower

@@ -6,7 +6,7 @@ import pytest
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import unseen
-from restock.ingest.task.signals import LIDAR_SIGNALS
+from restock.ingest.task.task import LIDAR_SIGNALS
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.navigation import PathFollower

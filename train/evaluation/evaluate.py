@@ -24,8 +24,7 @@ from torch import Tensor
 from restock.arrays import F32, F64, Ints
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.robot import NONE, STOP
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Signals, Task
 from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.learner import Learner, value_lag
 from restock.train.feed.collector import Collector

@@ -28,8 +28,7 @@ from restock.ingest.task.conditions import (
     unseen,
 )
 from restock.ingest.task.schema import signal_arrays, steps_schema
-from restock.ingest.task.signals import STORED_SIGNALS, Signals
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import STORED_SIGNALS, Signals, Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import NOMINAL_PRIORITY, ResolvedStratum, assign, rules_of

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Signals, Task
 from restock.replay.fleet.missions_file import MissionOrder, read_missions
 from restock.state import Stateful
 from restock.train.dqn.config import PracticeConfig, TrainConfig

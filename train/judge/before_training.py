@@ -24,8 +24,7 @@ from restock.errors import ConfigError, RestockError, RunError, StoreError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.signals import STORED_SIGNALS
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import STORED_SIGNALS, Task
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
 from restock.train.evaluation.ope import EssGate

@@ -17,8 +17,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.store.transitions import label_table
 from restock.ingest.task.conditions import Condition, label
-from restock.ingest.task.signals import STORED_SIGNALS, Signals
-from restock.ingest.task.task import reward_parts, terminated
+from restock.ingest.task.task import STORED_SIGNALS, Signals, reward_parts, terminated
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 from restock.stats import (

@@ -30,7 +30,7 @@ from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.task.schema import signal_arrays
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import STORED_SIGNALS
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.ring import META, NONE, StratumSlots

@@ -26,8 +26,7 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.signals import wrap_angle
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Task, wrap_angle
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.open_loop import LoggedSegments, OpenLoopResult, replay_segments
 from restock.train.twin.physics.perturbation import RANGES, Perturbation

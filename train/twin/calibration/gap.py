@@ -32,8 +32,15 @@ from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.filling import Routing
 from restock.ingest.task.robot import Robot
-from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
-from restock.ingest.task.task import Task, clearance_ahead, observe, reward_parts
+from restock.ingest.task.task import (
+    Signals,
+    Task,
+    clearance_ahead,
+    localised_velocity,
+    observe,
+    reward_parts,
+    wrap_angle,
+)
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_quantiles, clustered_ratio
 from restock.train.twin.calibration.logged_steps import (

@@ -24,8 +24,7 @@ from restock.errors import ConfigError, StoreError
 from restock.ingest.profile.profile import read_profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Signals, Task
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store, profiles_of
 from restock.train.twin.physics.model import robot_model

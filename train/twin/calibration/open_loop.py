@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
-from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Signals, Task, localised_velocity, wrap_angle
 from restock.train.twin.calibration.logged_steps import COMMAND, LoggedSteps, rows_of
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools
-from restock.ingest.task.signals import wrap_angle
+from restock.ingest.task.task import wrap_angle
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
 from restock.train.twin.calibration.open_loop import (
     LoggedSegments,

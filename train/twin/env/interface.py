@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.arrays import F32, Bools, Ints
-from restock.ingest.task.signals import Signals
+from restock.ingest.task.task import Signals
 from restock.toml import Checked
 
 if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not

@@ -57,11 +57,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.ingest.task.scan import Body
 from restock.ingest.task.schema import truth_text
-from restock.ingest.task.signals import Signals
 from restock.ingest.task.surroundings import view_route
-from restock.ingest.task.task import Task, reached_goal
+from restock.ingest.task.task import Body, Signals, Task, reached_goal
 from restock.state import Stateful
 from restock.train.twin.env.interface import Info
 from restock.train.twin.floors.layout import AGENTS, Warehouse, pallet_half_m

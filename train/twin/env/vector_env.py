@@ -35,8 +35,7 @@ from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Limits, Robot, limit, refuse_beyond_steering
-from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task, nearest_action, observe, reward
+from restock.ingest.task.task import Signals, Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful

@@ -18,7 +18,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError, RunError
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.floors.layout import AGENTS, NO_PATCH, PATCHES, Walk, Warehouse, no_pallets
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import floor_gap

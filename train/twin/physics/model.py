@@ -20,7 +20,7 @@ import numpy as np
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.task.robot import Lidar, Robot
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.floors.layout import (
     FORKLIFT_HALF_M,
     FORKLIFTS,

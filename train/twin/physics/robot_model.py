@@ -20,7 +20,7 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.robot import USUAL_STEERING_RAD, Drive, Lidar, Robot
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.floors.layout import NO_PATCH, PATCHES
 
 FLOOR_FRICTION = 0.8

@@ -22,7 +22,7 @@ import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.task.robot import Drive, Robot
-from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Body
 from restock.train.twin.physics.robot_model import (
     CHASSIS_MASK,
     DRAWN_GROUP,

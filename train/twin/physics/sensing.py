@@ -1,4 +1,4 @@
-"""The robot's sensors: the signals of `restock.ingest.task.signals` from the simulation.
+"""The robot's sensors: the signals of `restock.ingest.task.task` from the simulation.
 
 The functions that turn ranges into clearances and plans into waypoints are ingest's own; here are
 only the sensors: lidar, localisation, encoders, gyroscope, accelerometer and bumper, with the
@@ -13,18 +13,25 @@ from statistics import NormalDist
 import numpy as np
 
 from restock.arrays import F64, Ints
-from restock.ingest.task.scan import Body, SectorMap, outline_reach
-from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.surroundings import (
     PLAN_PARTS,
     SCANNED,
+    SectorMap,
     came_nearer,
+    outline_reach,
     plan_distances_m,
     returns_on_plan,
     steps_remembered,
     view_route,
 )
-from restock.ingest.task.task import Task, clearance_ahead
+from restock.ingest.task.task import (
+    Body,
+    Signals,
+    Task,
+    clearance_ahead,
+    localised_velocity,
+    wrap_angle,
+)
 from restock.state import Stateful
 from restock.train.twin.physics.model import passed_over
 from restock.train.twin.physics.perturbation import Perturbation

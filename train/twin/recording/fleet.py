@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.signals import Signals
+from restock.ingest.task.task import Signals
 from restock.replay.fleet.missions_file import MissionsFile, as_toml
 from restock.train.twin.env.drivers import (
     BehaviourPolicy,

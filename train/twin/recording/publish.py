@@ -23,7 +23,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.ingest.task.signals import wrap_angle
+from restock.ingest.task.task import wrap_angle
 from restock.toml import Checked
 from restock.train.twin.recording import robot_topics as topics
 from restock.train.twin.recording.bag_writer import Message

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.ingest.task.signals import Signals
+from restock.ingest.task.task import Signals
 from restock.train.twin.floors.layout import (
     FORKLIFT_HALF_M,
     NO_PATCH,

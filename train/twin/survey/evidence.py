@@ -26,7 +26,7 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.footprint import Footprint, footprint_of
-from restock.ingest.task.signals import yaw_of
+from restock.ingest.task.task import yaw_of
 from restock.replay.store.store import Store, is_store
 from restock.train.twin.floors.floor_files import FURTHEST_M, read_grid
 from restock.train.twin.floors.occupancy_grid import (

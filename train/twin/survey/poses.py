@@ -27,7 +27,7 @@ from restock.ingest.propose.roles import (
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import PARENT, Edges, rotations
 from restock.ingest.steps.input_columns import fixes_of
-from restock.ingest.task.signals import yaw_of
+from restock.ingest.task.task import yaw_of
 
 MAX_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
 JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive

@@ -21,7 +21,7 @@ from restock.errors import (
 )
 
 if TYPE_CHECKING:
-    from restock.ingest.prepared import IngestResult
+    from restock.ingest.pipeline import IngestResult
 
 
 @dataclass

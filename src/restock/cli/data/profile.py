@@ -18,7 +18,7 @@ from restock.files import write_text
 
 if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
-    from restock.ingest.prepared import IngestResult
+    from restock.ingest.pipeline import IngestResult
     from restock.ingest.profile.profile import Profile
     from restock.ingest.propose.drives import Drives, RobotTraits
 

@@ -11,7 +11,7 @@ import tyro
 from restock.errors import ConfigError, ExitCode, counted, quoted
 
 if TYPE_CHECKING:
-    from restock.ingest.prepared import Removed
+    from restock.ingest.store.removal import Removed
     from restock.ingest.store.writer import StoreWriter
 
 
@@ -149,7 +149,7 @@ class RemoveCommand:
     def run(self) -> ExitCode:
         """Remove, and say what was removed and how to get it back."""
         from restock.cli import output
-        from restock.ingest.prepared import remove_recordings
+        from restock.ingest.store.removal import remove_recordings
         from restock.ingest.store.writer import StoreWriter
 
         store = StoreWriter(self.store)

@@ -429,7 +429,7 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
 
 def _not_evaluated(document: dict[str, Any]) -> list[str]:
     """Return the conditions that the twin cannot show, and why."""
-    from restock.ingest.task.signals import LIDAR_SIGNALS
+    from restock.ingest.task.task import LIDAR_SIGNALS
 
     return [
         f"condition {name!r} is not evaluated in the twin, which has no {', '.join(signals)}: "

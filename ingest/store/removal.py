@@ -1,0 +1,167 @@
+"""Recordings taken out of a store, named by their ids or paths, in one commit.
+
+Neither their files nor their manifests are deleted then: earlier versions need them until the
+retention is over, as they need replaced ones.
+"""
+
+from __future__ import annotations
+
+import os.path
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path, PurePath
+from typing import Any
+
+from restock.errors import StoreError, counted, quoted
+from restock.ingest.store.writer import StoreWriter
+
+OPERATION = "restock store remove"
+ID_DIGITS = 16
+PREFIX_DIGITS = 6  # of an id, at least
+_MAX_NAMED = 5
+_HEX = re.compile(rf"[0-9a-f]{{1,{ID_DIGITS}}}")
+
+
+@dataclass(frozen=True)
+class RemovedRecording:
+    """A recording that was taken out of a store, or would be."""
+
+    recording_id: str
+    source_file: str  # as it was ingested
+    transitions: int
+    episodes: int
+    corrections: int  # of its labels, by people: what ingesting it again does not bring back
+    tags: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Removed:
+    """Recordings that were removed from a store, or would be."""
+
+    recordings: list[RemovedRecording] = field(default_factory=list)
+    left: int = 0  # recordings that stay
+    version_before: int | None = None  # of the store: it has what was removed
+    version: int | None = None  # without it; None where nothing was written
+
+
+def remove_recordings(
+    store: StoreWriter, names: Sequence[str], *, dry_run: bool = False
+) -> Removed:
+    """Take recordings out of a store, all or none of them.
+
+    A recording is named by its id, by the first digits of it (PREFIX_DIGITS at least), or by the
+    path that it was ingested by, of which the last parts are enough.
+
+    Raises:
+        StoreError: a name is of no recording in the store, or of several; one was ingested again
+            meanwhile; the store cannot be written. Nothing is removed.
+    """
+    store.expect_store()
+    live = sorted(store.live().to_pylist(maps_as_pydicts="strict"), key=_by_path)
+    chosen = _chosen(live, names, str(store.path))
+    removed = [_removed(row) for row in chosen]
+    left = len(live) - len(chosen)
+    if dry_run or not chosen:
+        return Removed(removed, left)
+    ingests = {row["recording_id"]: row["ingest_id"] for row in chosen}
+    before, version = store.remove_recordings(ingests, OPERATION)
+    return Removed(removed, left, before, version)
+
+
+def _removed(row: Mapping[str, Any]) -> RemovedRecording:
+    return RemovedRecording(
+        row["recording_id"],
+        row["source_file"],
+        row["transitions"],
+        row["episodes"],
+        len(row["corrections"] or ()),
+        row["tags"] or {},
+    )
+
+
+def _by_path(row: Mapping[str, Any]) -> tuple[str, str]:
+    return row["source_file"], row["recording_id"]
+
+
+def _chosen(
+    live: Sequence[dict[str, Any]], names: Iterable[str], where: str
+) -> list[dict[str, Any]]:
+    """Return the named manifests, each once. Raise StoreError if a name is ambiguous or unknown."""
+    chosen: dict[str, dict[str, Any]] = {}
+    problems = []
+    for name in dict.fromkeys(names):
+        found = _named(live, name)
+        if len(found) == 1:
+            chosen[found[0]["recording_id"]] = found[0]
+        else:
+            problems.append(_problem(live, name, found))
+    if problems:
+        raise StoreError(
+            "\n    ".join(["nothing was removed:", *problems]),
+            where=where,
+            remedy="name each recording by its id (or at least its first"
+            f" {PREFIX_DIGITS} digits) or its path; `restock sql {quoted(where)}"
+            ' "SELECT recording_id, source_file FROM recordings"` lists them',
+        )
+    return sorted(chosen.values(), key=_by_path)
+
+
+def _named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """Find the recordings that a name fits: by id or exact path, else by the path's end."""
+    digits = name.lower()
+    if len(digits) == ID_DIGITS and (found := [r for r in live if r["recording_id"] == digits]):
+        return found
+    is_prefix = len(digits) >= PREFIX_DIGITS and _HEX.fullmatch(digits)
+    found = [
+        row
+        for row in live
+        if (is_prefix and row["recording_id"].startswith(digits)) or _same_path(row, name)
+    ]
+    return found or [row for row in live if _ends_with(row, name)]
+
+
+def _same_path(row: Mapping[str, Any], name: str) -> bool:
+    return row["source_file"] == name or _absolute(row["source_file"]) == _absolute(name)
+
+
+def _absolute(path: str) -> str:
+    return os.path.normpath(Path(path).absolute())
+
+
+def _ends_with(row: Mapping[str, Any], name: str) -> bool:
+    """Return whether a path ends in these parts, as `logs/b.mcap` ends in `b.mcap`."""
+    given = PurePath(name).parts
+    return bool(given) and PurePath(row["source_file"]).parts[-len(given) :] == given
+
+
+def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:
+    """Say why a name does not select one recording, and which ones it may mean."""
+    if found:
+        what = f"{name!r} is the name of {len(found)} recordings"
+        return f"{what}: {_listed(found)}"
+    digits = name.lower()
+    if len(digits) < PREFIX_DIGITS and _HEX.fullmatch(digits):
+        begin = [row for row in live if row["recording_id"].startswith(digits)]
+        if begin:
+            least = f"{PREFIX_DIGITS} digits at least"
+            return f"{name!r} is too short for the beginning of an id ({least}): {_listed(begin)}"
+    by_path = {row["source_file"]: row for row in live}
+    files = {PurePath(path).name: path for path in by_path}
+    near = [
+        *get_close_matches(name, by_path, n=_MAX_NAMED),
+        *(files[one] for one in get_close_matches(PurePath(name).name, files, n=_MAX_NAMED)),
+    ]
+    what = f"no recording {name!r} is in the store"
+    if near := list(dict.fromkeys(near)):
+        return f"{what}; similar: {_listed([by_path[path] for path in near])}"
+    if not live:
+        return f"{what}, which has no recordings"
+    return f"{what}; it has {counted(len(live), 'recording')}: {_listed(live)}"
+
+
+def _listed(rows: Sequence[dict[str, Any]]) -> str:
+    named = [f"{row['recording_id']} ({row['source_file']})" for row in rows[:_MAX_NAMED]]
+    more = len(rows) - len(named)
+    return ", ".join(named) + (f", and {more:,} more" if more else "")
