@@ -343,9 +343,7 @@ def _answer(ray: Any, result: Any, path: Path) -> Prepared | RestockError:
         return out_of_memory(path)
     except ray.exceptions.RayError as error:
         return RecordingError(
-            f"the process that read it died ({type(error).__name__})",
-            where=str(path),
-            remedy=AGAIN,
+            f"the process that read it died ({type(error).__name__})", where=str(path), remedy=AGAIN
         )
     return answer
 

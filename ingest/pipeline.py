@@ -39,12 +39,7 @@ from restock.ingest.profile.profile import Profile, profile_toml, read_profile_t
 from restock.ingest.profile.tag_rules import RecordingTags, in_words, resolve_tags
 from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
 from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
-from restock.ingest.steps.needs import (
-    as_recorded,
-    read_topics,
-    renamed_inputs,
-    unknown_directions,
-)
+from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs, unknown_directions
 from restock.ingest.store.lineage import Ingest, own_path
 from restock.ingest.store.manifest import (
     LabelScore,

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import ConfigError, StoreError, expect
+from restock.errors import ConfigError, StoreError
 from restock.ingest.profile.profile import profile_toml, read_profile_toml, with_conditions
 from restock.ingest.store.manifest import (
     COLUMN,
@@ -92,7 +92,6 @@ def relabel_store(
         StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
         ConfigError: a condition's SQL does not run over the signals that are stored.
     """
-    expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
     outcomes: list[Relabelled] = []
     stale: list[dict[str, Any]] = []
     for row in store.live().to_pylist():
@@ -109,12 +108,8 @@ def relabel_store(
             outcomes.append(outcome)
             yield manifest, rows
 
-    if dry_run or not stale:
-        for _ in relabelled():
-            pass
-        return outcomes, None
     read = {row["recording_id"]: row["ingest_id"] for row in stale}
-    return outcomes, store.write_all(relabelled(), instead_of=read)
+    return outcomes, _write(store, relabelled(), read, dry_run)
 
 
 def relabel_rows(

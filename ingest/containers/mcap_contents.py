@@ -30,13 +30,7 @@ from restock.ingest.containers.mcap_records import (
     parse,
     walk,
 )
-from restock.ingest.containers.storage import (
-    Extra,
-    Metadata,
-    Watch,
-    keep_entries,
-    unwatched,
-)
+from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entries, unwatched
 
 # What the survey keeps is bounded, whatever a file is made of.
 MAX_CHUNKS = 1_000_000

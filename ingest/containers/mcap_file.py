@@ -161,10 +161,7 @@ class ChunkReader:
             yield channel, batch_of(buffer, [at[channel] for at in located if channel in at])
 
     def _by_index(
-        self,
-        parts: list[_Part],
-        buffer: NDArray[np.uint8],
-        wanted: set[int],
+        self, parts: list[_Part], buffer: NDArray[np.uint8], wanted: set[int]
     ) -> dict[int, Messages] | None:
         """Find the messages of some chunks by their indexes; None if one index is wrong."""
         entries: dict[int, list[Indexed]] = {}

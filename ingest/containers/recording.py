@@ -284,9 +284,7 @@ class Recording:
             return []
 
     def read(
-        self,
-        wanted: Mapping[str, Sequence[str]],
-        reductions: Mapping[str, Reduction] | None = None,
+        self, wanted: Mapping[str, Sequence[str]], reductions: Mapping[str, Reduction] | None = None
     ) -> dict[str, TopicColumns]:
         """Read columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
 
@@ -370,9 +368,7 @@ class Recording:
             raise RecordingError("it is closed", where=str(self.path), remedy="open it again")
 
     def _read_storage(
-        self,
-        storage: Storage,
-        readings: Mapping[str, TopicReading],
+        self, storage: Storage, readings: Mapping[str, TopicReading]
     ) -> Iterator[int]:
         """Read one file, and yield how many messages were read each time."""
         decoders: dict[int, Decoder] = {}

@@ -20,14 +20,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.message_factory import GetMessageClass  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from restock.ingest.decoding.columns import (
-    DTYPES,
-    CannotDecode,
-    FieldType,
-    Leaf,
-    Many,
-    MessageType,
-)
+from restock.ingest.decoding.columns import DTYPES, CannotDecode, FieldType, Leaf, Many, MessageType
 from restock.ingest.decoding.row_by_row import Unparsable, objects
 
 LARGEST = 256 << 20  # bytes of a message

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.errors import ConfigError, expect
+from restock.errors import ConfigError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
 from restock.ingest.profile.profile import Profile, not_live
 from restock.ingest.profile.signal_paths import conventions_of, element_of
@@ -210,7 +210,6 @@ class LiveObserver:
     """
 
     def __init__(self, profile: Profile, max_ahead_s: float | None = None) -> None:
-        expect("profile", profile, Profile, "`load_profile(NAME_OR_FILE)` gives one")
         if lacking := not_live(profile):
             raise ConfigError(
                 "takes " + " and ".join(f"{one.takes}, {one.why}" for one in lacking),

@@ -205,10 +205,7 @@ class Pilot:
         signals = observed.signals
         before = [signals["command_speed_mps"], signals["command_yaw_rate_radps"]]
         limited = limit(
-            limits,
-            np.array([proposal]),
-            signals["sector_clearance_m"],
-            np.stack(before, axis=-1),
+            limits, np.array([proposal]), signals["sector_clearance_m"], np.stack(before, axis=-1)
         )
         speed, turn = limited.command[0].tolist()
         return (speed, turn), int(limited.rule[0])

@@ -399,11 +399,7 @@ CONVENTIONS = (
     # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". Of
     # the scans that fill an input, `restock.ingest.task.surroundings` makes clearance.
     Convention(
-        "Range",
-        ("range",),
-        ("min_range", "max_range"),
-        _within,
-        "outside min_range to max_range",
+        "Range", ("range",), ("min_range", "max_range"), _within, "outside min_range to max_range"
     ),
     Convention(
         "LaserScan",

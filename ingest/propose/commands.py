@@ -25,10 +25,7 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import Gaps
-from restock.ingest.propose.robot_choice import (
-    DriveEvidence,
-    drive_evidence,
-)
+from restock.ingest.propose.robot_choice import DriveEvidence, drive_evidence
 from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.task import wrap_angle

@@ -40,13 +40,7 @@ from restock.ingest.propose.commands import (
 from restock.ingest.propose.footprint import Footprint, descriptions
 from restock.ingest.propose.gather import Evidence, GoalChoice, gather
 from restock.ingest.propose.proposal_lines import profile_lines
-from restock.ingest.propose.propose import (
-    Proposal,
-    RobotKind,
-    propose_from,
-    propose_profile,
-    tried,
-)
+from restock.ingest.propose.propose import Proposal, RobotKind, propose_from, propose_profile, tried
 from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.propose.trial import Advice, Trial
 from restock.ingest.steps.clocks import STAMP

@@ -152,11 +152,7 @@ def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
     places = description.places(OUTLINE)
     length, width = (float(side) for side in (high - low)[:2])
     middle_x, middle_y = (float(low[axis] + high[axis]) / 2 for axis in (0, 1))
-    found = Footprint(
-        length,
-        width,
-        f"shapes of {count} links in {source}",
-    )
+    found = Footprint(length, width, f"shapes of {count} links in {source}")
     if (lidar := _lidar(places, scan_frame)) is None:
         return found
     at_m, yaw, upside_down = lidar

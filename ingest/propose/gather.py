@@ -13,18 +13,8 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.signal_paths import conventions_of, plain
 from restock.ingest.profile.tables import HINDSIGHT, Input, is_motion
-from restock.ingest.propose.candidates import (
-    CameraTopic,
-    Candidate,
-    camera_topics,
-    candidates,
-)
-from restock.ingest.propose.clock_choice import (
-    PAUSE,
-    ClockChoice,
-    Gaps,
-    choose_clock,
-)
+from restock.ingest.propose.candidates import CameraTopic, Candidate, camera_topics, candidates
+from restock.ingest.propose.clock_choice import PAUSE, ClockChoice, Gaps, choose_clock
 from restock.ingest.propose.commands import (
     CommandChoice,
     CommandHold,

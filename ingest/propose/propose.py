@@ -28,13 +28,7 @@ from restock.ingest.propose.proposal_lines import (
     profile_lines,
     steered_by,
 )
-from restock.ingest.propose.roles import (
-    REQUIRED,
-    Kind,
-    clouds_alone,
-    robots_in,
-    several_commands,
-)
+from restock.ingest.propose.roles import REQUIRED, Kind, clouds_alone, robots_in, several_commands
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path

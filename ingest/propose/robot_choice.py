@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ MIN_DRIVEN_M = 0.05  # else it may not have been able to move
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """Evidence in drives that their robot steers as a car; `joined` over several drives."""
+    """Evidence in a drive that its robot steers as a car."""
 
     driven_m: float = 0.0
     pivoted_rad: float = 0.0  # in turns on the spot
@@ -91,18 +91,6 @@ class DriveEvidence:
             return f"{requested}: too little to tell"
         turns = f"{self.curved_rad:.1f} rad of turns in {self.driven_m:.1f} m"
         return f"in {turns} it never turned on the spot, and was never commanded to"
-
-    @staticmethod
-    def joined(drives: Sequence[DriveEvidence]) -> DriveEvidence:
-        """Join the evidence of several drives of one robot."""
-        return DriveEvidence(
-            driven_m=sum(one.driven_m for one in drives),
-            pivoted_rad=sum(one.pivoted_rad for one in drives),
-            requested_rad=sum(one.requested_rad for one in drives),
-            spells=sum(one.spells for one in drives),
-            followed_rad=sum(one.followed_rad for one in drives),
-            curved_rad=sum(one.curved_rad for one in drives),
-        )
 
 
 def drive_evidence(

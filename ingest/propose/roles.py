@@ -11,9 +11,7 @@ from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
-from restock.ingest.profile.signal_paths import (
-    last_part,
-)
+from restock.ingest.profile.signal_paths import last_part
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.needs import field_paths
 
@@ -177,8 +175,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     ),
     "goal": (
         Kind(  # all that move_base was sent
-            "move_base_msgs/msg/MoveBaseActionGoal",
-            _under("goal.target_pose.pose", _PLACE),
+            "move_base_msgs/msg/MoveBaseActionGoal", _under("goal.target_pose.pose", _PLACE)
         ),
         Kind("geometry_msgs/msg/PoseStamped", _under("pose", _PLACE), ("goal",), must=True),
         Kind("foxglove.PoseInFrame", _under("pose", _PLACE), ("goal",), must=True),

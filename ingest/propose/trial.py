@@ -76,11 +76,7 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     why = f"{why}; {remedy}" if remedy else why
     if not len(steps):
         return Trial(problem=why)
-    requested = _Advisor(profile, topics, steps, episodes)
-    advice = [
-        *requested.ages(),
-        *requested.outline(),
-    ]
+    advice = [*_ages(profile, topics, steps, episodes), *_outline(profile, topics, steps)]
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     problem = "" if episodes.transitions else f"no transition: {why}"
     stamps = steps.signals["stamp_ns"]
@@ -136,75 +132,67 @@ def _even_s(stamp_ns: Ints, period_s: float) -> float:
     return even_s
 
 
-class _Advisor:
-    """Changes one choice at a time and counts what comes of it."""
-
-    def __init__(
-        self, profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps, episodes: Split
-    ) -> None:
-        self.profile, self.topics, self.steps = profile, topics, steps
-        self.dropped, self.now = episodes.dropped, episodes.transitions
-
-    def ages(self) -> list[Advice]:
-        """Say how old each input is that is often stale, and what another age gives."""
-        found = []
-        for reason, count in sorted(self.dropped.items(), key=lambda item: -item[1]):
-            name, _, what = reason.partition(": ")
-            if what != "stale" or count < MUCH * len(self.steps):
-                continue
-            source = dict(self.profile.inputs.items()).get(name)
-            if source is None or source.max_age_s is None:
-                continue
-            latest = align_inputs(self.profile, self.topics).latest(name)
-            ages = latest.age_ns[latest.known] * 1e-9
-            most = float(np.ceil(np.percentile(ages, 95) * 10) / 10) if len(ages) else 0.0
-            tried = [
-                f"{age:g} s makes {number:,}" if age else f"without it (latched) {number:,}"
-                for age in dict.fromkeys((most if most > source.max_age_s else None, None))
-                if (number := self._with_age(name, age)) > GAIN * self.now
-            ]
-            text = (
-                f"{source.max_age_s:g} s drops {count:,} of {len(self.steps):,} ticks: "
-                f"{source.topic} is up to {ages.max(initial=0.0):.1f} s old; {self.now:,} "
-                "transitions" + "".join(f", {one}" for one in tried)
-            )
-            if name == "command" and tried:
-                text += " (correct only if the robot continues with its last command)"
-            found.append(Advice(f"inputs.{name}.max_age_s", text))
-        return found
-
-    def outline(self) -> list[Advice]:
-        """Say whether the lidar sees things inside the robot's outline, or almost touching it."""
-        scan = self.profile.inputs.scan
-        if scan is None or scan.topic not in self.topics:
-            return []
-        usable = np.array([problem == "" for problem in self.steps.problem], np.bool_)
-        clearance = self.steps.signals["clearance_m"][usable]
-        near_m = self.profile.task.rewards.tight_clearance_m  # as of near_collision and recovery
-        inside, near = int((clearance <= 0).sum()), int((clearance < near_m).sum())
-        often = inside > OFTEN_INSIDE * len(clearance) or near > OFTEN_NEAR * len(clearance)
-        if not len(clearance) or not often:
-            return []
-        body = self.profile.task.body
+def _ages(
+    profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps, episodes: Split
+) -> list[Advice]:
+    """Say how old each input is that is often stale, and what another age gives."""
+    found = []
+    for reason, count in sorted(episodes.dropped.items(), key=lambda item: -item[1]):
+        name, _, what = reason.partition(": ")
+        if what != "stale" or count < MUCH * len(steps):
+            continue
+        source = dict(profile.inputs.items()).get(name)
+        if source is None or source.max_age_s is None:
+            continue
+        latest = align_inputs(profile, topics).latest(name)
+        ages = latest.age_ns[latest.known] * 1e-9
+        most = float(np.ceil(np.percentile(ages, 95) * 10) / 10) if len(ages) else 0.0
+        tried = [
+            f"{age:g} s makes {number:,}" if age else f"without it (latched) {number:,}"
+            for age in dict.fromkeys((most if most > source.max_age_s else None, None))
+            if (number := _with_age(profile, topics, name, age)) > GAIN * episodes.transitions
+        ]
         text = (
-            f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something "
-            f"nearer than {near_m:g} m at {near:,} of {len(clearance):,} ticks, and inside the "
-            f"robot at {inside:,}: these are labelled near_collision and recovery. Measure the "
-            "robot"
+            f"{source.max_age_s:g} s drops {count:,} of {len(steps):,} ticks: "
+            f"{source.topic} is up to {ages.max(initial=0.0):.1f} s old; {episodes.transitions:,} "
+            "transitions" + "".join(f", {one}" for one in tried)
         )
-        return [Advice("task.body", text)]
-
-    def _with_age(self, name: str, age_s: float | None) -> int:
-        return self._count(_held(self.profile, name, age_s))
-
-    def _count(self, profile: Profile) -> int:
-        try:
-            return split(profile.task, steps_of(profile, self.topics)).transitions
-        except RecordingError:
-            return 0
+        if name == "command" and tried:
+            text += " (correct only if the robot continues with its last command)"
+        found.append(Advice(f"inputs.{name}.max_age_s", text))
+    return found
 
 
-def _held(profile: Profile, name: str, age_s: float | None) -> Profile:
+def _with_age(
+    profile: Profile, topics: Mapping[str, TopicColumns], name: str, age_s: float | None
+) -> int:
+    """Count the transitions that another age of an input makes."""
     source = msgspec.structs.replace(getattr(profile.inputs, name), max_age_s=age_s)
     inputs = msgspec.structs.replace(profile.inputs, **{name: source})
-    return msgspec.structs.replace(profile, inputs=inputs)
+    profile = msgspec.structs.replace(profile, inputs=inputs)
+    try:
+        return split(profile.task, steps_of(profile, topics)).transitions
+    except RecordingError:
+        return 0
+
+
+def _outline(profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps) -> list[Advice]:
+    """Say whether the lidar sees things inside the robot's outline, or almost touching it."""
+    scan = profile.inputs.scan
+    if scan is None or scan.topic not in topics:
+        return []
+    usable = np.array([problem == "" for problem in steps.problem], np.bool_)
+    clearance = steps.signals["clearance_m"][usable]
+    near_m = profile.task.rewards.tight_clearance_m  # as of near_collision and recovery
+    inside, near = int((clearance <= 0).sum()), int((clearance < near_m).sum())
+    often = inside > OFTEN_INSIDE * len(clearance) or near > OFTEN_NEAR * len(clearance)
+    if not len(clearance) or not often:
+        return []
+    body = profile.task.body
+    text = (
+        f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something "
+        f"nearer than {near_m:g} m at {near:,} of {len(clearance):,} ticks, and inside the "
+        f"robot at {inside:,}: these are labelled near_collision and recovery. Measure the "
+        "robot"
+    )
+    return [Advice("task.body", text)]

@@ -213,8 +213,7 @@ def _align(
     stamped = stamped_topics(topics, latched | transforms)
     if not stamped:
         raise RecordingError(
-            "none of the profile's topics has a header stamp (other than zero)",
-            remedy=BY_LOG_TIME,
+            "none of the profile's topics has a header stamp (other than zero)", remedy=BY_LOG_TIME
         )
     stamped = {name: one for name, one in stamped.items() if name not in commands} or stamped
     for name, ahead_ns in _stamped_ahead(stamped).items():

@@ -85,12 +85,7 @@ class AlignedInputs:
         return replace(latest, age_ns=age_ns, fresh=fresh)
 
     def latest_of(
-        self,
-        topic: str,
-        max_age_s: float | None,
-        *,
-        lead_ns: int = 0,
-        keep: Bools | None = None,
+        self, topic: str, max_age_s: float | None, *, lead_ns: int = 0, keep: Bools | None = None
     ) -> LatestMessages:
         """Return a topic's latest message (of those to `keep`) at each tick, or a lead after it."""
         parts = []

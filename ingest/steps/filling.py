@@ -189,10 +189,7 @@ class Filling:
         }
         if "imu" in self.inputs.by_name:
             self._numbers(
-                "imu",
-                instead,
-                yaw_rate_radps="gyro_yaw_rate_radps",
-                accel_x_mps2="accel_x_mps2",
+                "imu", instead, yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2"
             )
             if self.inputs.no_estimate("imu", "yaw_rate_radps").all():
                 self.stand_ins["imu"] = NO_ESTIMATE["angular_velocity"].removeprefix(": ")

@@ -49,7 +49,7 @@ EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS84
 COVARIANCES = 9  # of a fix
 MAX_STD_M = 5.0  # of a fix, where it says and the profile does not
 TRACK_M = 1.0
-_BLOCK, _SIDES = 64, 16
+_BLOCK = 64
 NO_FIX, UNCERTAIN, NOT_DRIVEN, NO_HEADING = (
     *("no fix", "fix too uncertain", "heading unknown until the robot has driven"),
     "no heading yet",
@@ -182,71 +182,29 @@ def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
     From the latest earlier position that is so far away; where the robot has not been so far from
     where it is since, the direction before is held. NaN until it has driven so far.
     """
+    # A robot that stands for an hour leaves an hour of positions that are all near: of a block of
+    # them, each is looked at only if a corner of the box around them is far.
+    whole = len(x_m) // _BLOCK * _BLOCK
+    boxes = [column[:whole].reshape(-1, _BLOCK) for column in (x_m, y_m)]
+    (left, right), (low, high) = ((box.min(axis=1), box.max(axis=1)) for box in boxes)
     yaw = np.full(len(x_m), np.nan)
-    track = _Track(x_m, y_m, track_m)
     held, back = np.nan, 0  # nothing before `back` is looked at: it lies before the last turn
-    for here in range(len(x_m)):
-        far = track.latest_far(here, back)
-        if far is not None:
-            back = far
-            held = float(np.arctan2(y_m[here] - y_m[back], x_m[here] - x_m[back]))
+    for here, (x, y) in enumerate(zip(x_m, y_m, strict=True)):
+        first, last = back // _BLOCK, here // _BLOCK
+        at = slice(first, last)
+        reach = np.hypot(
+            np.maximum(x - left[at], right[at] - x), np.maximum(y - low[at], high[at] - y)
+        )
+        may_be_far = np.flatnonzero(reach >= track_m * (1 - 1e-9)) + first
+        for block in (last, *may_be_far[::-1]):
+            rows = slice(max(block * _BLOCK, back), min((block + 1) * _BLOCK, here + 1))
+            far = np.flatnonzero(np.hypot(x - x_m[rows], y - y_m[rows]) >= track_m)
+            if len(far):
+                back = rows.start + int(far[-1])
+                held = float(np.arctan2(y - y_m[back], x - x_m[back]))
+                break
         yaw[here] = held
     return yaw
-
-
-class _Track:
-    """Positions (N,) with a fast search for the latest one that is far enough away.
-
-    A robot that stands for an hour leaves an hour of positions that are all near. So they lie in
-    blocks, of twice as many at each level, each within an outline of a few sides: where none of
-    its corners is far from here, no position in the block is.
-    """
-
-    def __init__(self, x_m: F64, y_m: F64, far_m: float) -> None:
-        self._x, self._y, self._far_m = x_m, y_m, far_m
-        self._corners: list[F64] = []  # of each level (blocks, _SIDES, 2)
-        whole = len(x_m) // _BLOCK * _BLOCK
-        angle = np.arange(_SIDES) * (2 * np.pi / _SIDES)
-        sides = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        most = [
-            (x_m[:whole] * cos + y_m[:whole] * sin).reshape(-1, _BLOCK).max(axis=1)
-            for cos, sin in sides
-        ]
-        reach = np.stack(most, axis=1) + 1e-9 * far_m  # in the direction of each side; rounding
-        between = angle[1] - angle[0]
-        while len(reach):
-            # A side meets the next one so far along it, counter-clockwise.
-            along = (np.roll(reach, -1, axis=1) - reach * np.cos(between)) / np.sin(between)
-            ahead = np.stack([-sides[:, 1], sides[:, 0]], axis=1)
-            self._corners.append(reach[..., None] * sides + along[..., None] * ahead)
-            reach = reach[: len(reach) // 2 * 2].reshape(-1, 2, _SIDES).max(axis=1)
-
-    def latest_far(self, here: int, first: int) -> int | None:
-        """Return the latest of `first` to `here` that is at least `far_m` away; None if none is."""
-        block = here // _BLOCK
-        found = self._far_within(block * _BLOCK, here + 1, here, first)
-        while found is None and block * _BLOCK > first:  # the blocks before it are left
-            level = (block & -block).bit_length() - 1  # of the largest that ends there
-            far = self._may_be_far(level, (block >> level) - 1, here)
-            while far and level:
-                level -= 1
-                far = self._may_be_far(level, (block >> level) - 1, here)
-            block -= 1 << level
-            if far:
-                found = self._far_within(block * _BLOCK, (block + 1) * _BLOCK, here, first)
-        return found
-
-    def _may_be_far(self, level: int, block: int, here: int) -> bool:
-        corners = self._corners[level][block]
-        away = (corners[:, 0] - self._x[here]) ** 2 + (corners[:, 1] - self._y[here]) ** 2
-        return bool(away.max() >= self._far_m**2)
-
-    def _far_within(self, begin: int, end: int, here: int, first: int) -> int | None:
-        begin = max(begin, first)
-        rows = slice(begin, end)
-        away = np.hypot(self._x[here] - self._x[rows], self._y[here] - self._y[rows])
-        far = np.flatnonzero(away >= self._far_m)
-        return begin + int(far[-1]) if len(far) else None
 
 
 class InputColumns:

@@ -463,13 +463,7 @@ class _ScanReducer:
             for index, one in enumerate(kinds):
                 rows = np.flatnonzero(kind == index)
                 self._fill(clearance, close, blind, ranges, rows, one)
-        return {
-            SECTORS: clearance,
-            BEAMS: beams,
-            CLOSE: close,
-            BLIND: blind,
-            UNAIMED: unaimed,
-        }
+        return {SECTORS: clearance, BEAMS: beams, CLOSE: close, BLIND: blind, UNAIMED: unaimed}
 
     def _fill(
         self,

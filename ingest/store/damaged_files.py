@@ -36,13 +36,7 @@ from restock.ingest.store.lineage import (
     held_by,
     stored_files,
 )
-from restock.ingest.store.location import (
-    FRAMES,
-    RECORDINGS,
-    TRANSITIONS,
-    Location,
-    open_parquet,
-)
+from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
 from restock.ingest.store.writer import StoreWriter
 
 OPERATION = "restock store compact --drop-damaged"

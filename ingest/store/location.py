@@ -26,7 +26,7 @@ from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.fs import DeltaStorageHandler
 
-from restock.errors import StoreError, expect, quoted
+from restock.errors import StoreError, quoted
 from restock.files import first_line
 from restock.ingest.store.version import (
     LOG,
@@ -95,7 +95,6 @@ class Location:
         """
         if isinstance(place, Location):
             return place
-        expect("a store's place", place, (str, Path), "give a folder, or s3://bucket/prefix")
         text, version = split_version(str(place))
         if not text.strip():
             raise StoreError(

@@ -267,11 +267,7 @@ def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
 
 
 def transitions(
-    profile: Profile,
-    steps: Steps,
-    episodes: Split,
-    rows: EpisodeRows,
-    provenance: Provenance,
+    profile: Profile, steps: Steps, episodes: Split, rows: EpisodeRows, provenance: Provenance
 ) -> pa.Table:
     """Return one row a transition of a recording.
 

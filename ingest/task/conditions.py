@@ -373,7 +373,7 @@ def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -
             remedy="make the values that it computes smaller, or shorten its windows",
         ) from error
     raise ConfigError(
-        f"its SQL fails on the steps: {_first_line(error)}",
+        f"its SQL fails on the steps: {first_line(error)}",
         where=where,
         remedy=f"the steps have the columns {', '.join(steps.column_names)}",
     ) from error
@@ -491,10 +491,6 @@ def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
         holds[name] = np.zeros(len(lists), np.bool_)
         holds[name][row[named == name]] = True
     return holds
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]
 
 
 MAX_BYTES = 100_000  # of a condition's file

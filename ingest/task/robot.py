@@ -272,11 +272,7 @@ class Limited:
 
 
 def limit(
-    limits: Limits,
-    proposed: F64,
-    clearance_m: F64,
-    previous: F64,
-    unknown: Bools | None = None,
+    limits: Limits, proposed: F64, clearance_m: F64, previous: F64, unknown: Bools | None = None
 ) -> Limited:
     """Limit the proposed commands to what may be driven.
 

@@ -89,15 +89,9 @@ COVERAGE: tuple[Column, ...] = (
         "probability of each condition that has a rule for it",
     ),
     Column(
-        "uncertain",
-        pa.list_(pa.string()),
-        "conditions that are uncertain by their probability",
+        "uncertain", pa.list_(pa.string()), "conditions that are uncertain by their probability"
     ),
-    Column(
-        "exposures",
-        pa.list_(pa.string()),
-        "all exposures that hold, whatever the condition",
-    ),
+    Column("exposures", pa.list_(pa.string()), "all exposures that hold, whatever the condition"),
     Column(
         "true_exposure",
         pa.string(),
@@ -133,11 +127,7 @@ COVERAGE: tuple[Column, ...] = (
 )
 PROVENANCE: tuple[Column, ...] = (
     Column("ingest_id", pa.string(), "the ingest that wrote this row; joins `recordings`"),
-    Column(
-        "source_file",
-        pa.string(),
-        "path of the recording as given, odd characters escaped",
-    ),
+    Column("source_file", pa.string(), "path of the recording as given, odd characters escaped"),
     Column(
         "profile_hash", pa.string(), "hash of the profile with which it was ingested, 12 hex digits"
     ),
@@ -417,10 +407,7 @@ class Perturbed:
         values = [None if item is None else list(item[1].items()) for item in self.sets]
         row = self.row[places]
         chosen = pa.array(row, pa.int64(), mask=row < 0)
-        return (
-            pa.array(named, pa.string()).take(chosen),
-            pa.array(values, VALUES).take(chosen),
-        )
+        return (pa.array(named, pa.string()).take(chosen), pa.array(values, VALUES).take(chosen))
 
 
 def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:

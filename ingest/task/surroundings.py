@@ -262,10 +262,7 @@ FASTEST_MPS = 2.0  # that anybody walks: a return that comes faster was hidden b
 MIN_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
-_MOTION = (
-    *("stamp_ns", "gyro_yaw_rate_radps"),
-    *("localised_speed_mps", "localised_lateral_mps"),
-)
+_MOTION = (*("stamp_ns", "gyro_yaw_rate_radps"), *("localised_speed_mps", "localised_lateral_mps"))
 SCANNED = (*_MOTION, "sector_clearance_m")  # the signals that `came_nearer` takes
 _ROUNDING_M = 1e-6  # of a range that is the lidar's longest: nothing came back
 
