@@ -15,7 +15,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -43,7 +43,6 @@ from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs,
 from restock.ingest.store.lineage import Ingest, own_path
 from restock.ingest.store.manifest import (
     LabelScore,
-    correction_rows,
     corrections_in,
     definitions,
     label_scores,
@@ -280,7 +279,7 @@ class _Ingest:
         facts |= {
             "tags": self.reported.tags,
             "labels_version": table["labels_version"][0].as_py(),
-            "corrections": correction_rows(self.corrections),
+            "corrections": [asdict(one) for one in self.corrections],
         }
         steps = steps.without_values()
         kept = [KeptFrames.of(name, one, rows.tick) for name, one in steps.cameras.items()]

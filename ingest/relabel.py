@@ -11,7 +11,7 @@ import datetime as dt
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -28,32 +28,27 @@ from restock.ingest.store.manifest import (
     LabelScore,
     Moments,
     conditions_json,
-    correction_rows,
     corrections_in,
-    count_rows,
     driven_plan,
     label_scores,
     lay_over,
     merged,
     rules_of,
-    score_rows,
+    score_columns,
     uncertain_conditions,
 )
-from restock.ingest.store.transitions import by_name, episode_ends, names_of, replaced
+from restock.ingest.store.transitions import episode_ends, label_columns, replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
-    NOMINAL,
     Condition,
     Kind,
     held,
     label_with_probabilities,
     labels_version,
     of_kind,
-    primary,
     reported,
     runnable,
     stored,
-    too_near_to_call,
     unknown_rows,
 )
 from restock.ingest.task.schema import recording_schema
@@ -141,7 +136,6 @@ def relabel_rows(
     if row["format"] == TWIN:  # which fills none of the profile's own signals
         conditions, exposures = (runnable(stored, one) for one in (conditions, exposures))
     steps = pa.concat_tables([stored, ends.cast(stored.schema)])
-    begin = np.arange(len(rows))
     try:
         every, probable = label_with_probabilities(steps, [*conditions, *exposures])
     except ConfigError as error:
@@ -155,15 +149,10 @@ def relabel_rows(
         {one.name: every[one.name][: len(rows)] for one in several}
         for several in (conditions, exposures)
     )
-    named = primary(labels, conditions) or [NOMINAL] * len(rows)
     before = rows["condition"].to_pylist()
     ingest_id = uuid.uuid4().hex[:16]
     new = {
-        "condition": named,
-        "conditions": names_of(labels, begin),
-        "probabilities": by_name(probable, begin),
-        "uncertain": names_of(too_near_to_call(probable, conditions), begin),
-        "exposures": names_of(situations, begin),
+        **label_columns(labels, situations, probable, conditions, np.arange(len(rows))),
         "labels_version": labels_version(definitions),
         "ingest_id": ingest_id,
     }
@@ -178,12 +167,11 @@ def relabel_rows(
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
         "labels_version": rows["labels_version"][0].as_py(),
-        "label_scores": score_rows(scores),
-        "label_counts": count_rows(scores),
+        **score_columns(scores),
         "unknown_conditions": unknown_rows(
             definitions, lidar=task.lidar, driven_plan=driven_plan(rows)
         ),
-        "corrections": correction_rows(corrections),
+        "corrections": [asdict(one) for one in corrections],
         "conditions_json": conditions_json(every_condition),
         "exposures_json": conditions_json(every_exposure),
         "profile_toml": profile_toml(profile),
@@ -336,9 +324,8 @@ def _one(
     manifest = row | {
         "ingest_id": ingest_id,
         "labels_version": rows["labels_version"][0].as_py(),
-        "label_scores": score_rows(scores),
-        "label_counts": count_rows(scores),
-        COLUMN: correction_rows(every),
+        **score_columns(scores),
+        COLUMN: [asdict(one) for one in every],
     }
     outcome = _outcome(row, before, rows, given, conditions)
     return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome

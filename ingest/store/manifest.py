@@ -92,8 +92,7 @@ def manifest_row(
         "drops": [{"reason": reason, "count": count} for reason, count in drops],
         "topics": [],
         "stand_ins": [],
-        "label_scores": score_rows(scores),
-        "label_counts": count_rows(scores),
+        **score_columns(scores),
         "clocks": [],
         "findings": [],
         "signals": [],
@@ -202,9 +201,9 @@ def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
     return [{name: getattr(score, name) for name in names} for score in scores]
 
 
-def count_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
-    """Return the counts of scores, which add up over recordings, as the manifest holds them."""
-    return [asdict(score) for score in scores]
+def score_columns(scores: Sequence[LabelScore]) -> dict[str, Any]:
+    """Return a manifest's columns of scores, and of their counts, which add up over recordings."""
+    return {"label_scores": score_rows(scores), "label_counts": [asdict(one) for one in scores]}
 
 
 def conditions_json(conditions: Sequence[Condition]) -> str:
@@ -262,11 +261,6 @@ class Moments:
 def corrections_in(manifest: Mapping[str, Any]) -> list[Correction]:
     """Read the corrections of a manifest row."""
     return [Correction(**row) for row in manifest[COLUMN]]
-
-
-def correction_rows(corrections: Iterable[Correction]) -> list[dict[str, Any]]:
-    """Return corrections in the manifest's form."""
-    return [asdict(correction) for correction in corrections]
 
 
 def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:

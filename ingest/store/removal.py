@@ -61,24 +61,23 @@ def remove_recordings(
     store.expect_store()
     live = sorted(store.live().to_pylist(maps_as_pydicts="strict"), key=_by_path)
     chosen = _chosen(live, names, str(store.path))
-    removed = [_removed(row) for row in chosen]
+    removed = [
+        RemovedRecording(
+            row["recording_id"],
+            row["source_file"],
+            row["transitions"],
+            row["episodes"],
+            len(row["corrections"] or ()),
+            row["tags"] or {},
+        )
+        for row in chosen
+    ]
     left = len(live) - len(chosen)
     if dry_run or not chosen:
         return Removed(removed, left)
     ingests = {row["recording_id"]: row["ingest_id"] for row in chosen}
     before, version = store.remove_recordings(ingests, OPERATION)
     return Removed(removed, left, before, version)
-
-
-def _removed(row: Mapping[str, Any]) -> RemovedRecording:
-    return RemovedRecording(
-        row["recording_id"],
-        row["source_file"],
-        row["transitions"],
-        row["episodes"],
-        len(row["corrections"] or ()),
-        row["tags"] or {},
-    )
 
 
 def _by_path(row: Mapping[str, Any]) -> tuple[str, str]:

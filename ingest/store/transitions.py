@@ -19,6 +19,7 @@ from restock.ingest.steps.episodes import Split, Steps, changed_route, with_rout
 from restock.ingest.store.summary import ENDS, WIDE
 from restock.ingest.task.conditions import (
     NOMINAL,
+    Condition,
     label_with_probabilities,
     primary,
     reported,
@@ -323,7 +324,6 @@ def transition_table(
     last = rows.is_end[begin + 1]
     # The twin evaluates no condition over signals that it does not fill.
     evaluated = [one for one in profile.conditions if one.name in rows.labels]
-    named = primary(rows.labels, evaluated) or [NOMINAL] * len(rows.tick)
     observation, next_observation = _vectors(values.observation, begin)
     columns: dict[str, Any] = {
         "transition_id": transition_ids(provenance.recording_id, tick),
@@ -338,12 +338,8 @@ def transition_table(
         "next_observation": next_observation,
         "terminated": last & values.terminates,
         "truncated": last & ~values.terminates,
-        "condition": [named[row] for row in begin],
-        "conditions": names_of(rows.labels, begin),
+        **label_columns(rows.labels, rows.exposures, rows.probabilities, evaluated, begin),
         "true_condition": values.truth,
-        "probabilities": by_name(rows.probabilities, begin),
-        "uncertain": names_of(too_near_to_call(rows.probabilities, evaluated), begin),
-        "exposures": names_of(rows.exposures, begin),
         "true_exposure": values.true_exposure or pa.nulls(count, pa.string()),
         "perturbation": values.perturbation[0],
         "perturbation_values": values.perturbation[1],
@@ -368,6 +364,27 @@ def transition_table(
     arrays = [column_array(columns[field.name], field.type, count) for field in schema]
     table = pa.table(arrays, schema=schema)
     return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
+
+
+def label_columns(
+    labels: dict[str, Bools],
+    exposures: Mapping[str, Bools],
+    probabilities: Mapping[str, F32],
+    conditions: Sequence[Condition],
+    rows: Ints,
+) -> dict[str, Any]:
+    """Return the columns that say which conditions and exposures hold at these rows.
+
+    `conditions` are the definitions of `labels`.
+    """
+    named = primary(labels, conditions)
+    return {
+        "condition": [named[row] for row in rows] if named else [NOMINAL] * len(rows),
+        "conditions": names_of(labels, rows),
+        "probabilities": by_name(probabilities, rows),
+        "uncertain": names_of(too_near_to_call(probabilities, conditions), rows),
+        "exposures": names_of(exposures, rows),
+    }
 
 
 def _sorted_truths(truth: Sequence[str | None], tick: Ints) -> list[str | None]:
