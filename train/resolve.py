@@ -23,7 +23,7 @@ from restock.replay.sampling.packed_rows import row_width
 from restock.replay.sampling.ring import META
 from restock.replay.store.audit import capacity_of_rows
 from restock.toml import changed
-from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught
+from restock.train.dqn.config import PLANNER, TeacherConfig, TrainConfig, refuse_untaught
 from restock.train.feed.batches import check_terms
 from restock.train.feed.practice import mission_orders
 from restock.train.feed.teacher import cloned
@@ -86,6 +86,13 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
         source = "operator" if profile.task.goal == "route" else "none"
         teacher = msgspec.structs.replace(teacher, source=source)
     refuse_untaught(teacher)
+    if teacher.source == PLANNER and profile.inputs.nav_command is None:
+        raise ConfigError(
+            f"profile {profile.name} does not read what navigation proposes",
+            where="teacher.source",
+            remedy="name its topic under [inputs.nav_command], and ingest again; or choose another"
+            " source",
+        )
     teacher = msgspec.structs.replace(teacher, successes=_clones_successes(teacher, profile))
     if teacher.offline_updates is None:
         rows = 0 if panel is None or not teacher.filters else int(cloned(panel, teacher).sum())
@@ -233,11 +240,11 @@ def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
             where=where,
             remedy="give --panel",
         )
-    if config.teacher.source not in (None, "logs", "none"):
+    if config.teacher.source not in (None, "logs", "none", PLANNER):
         raise ConfigError(
             f"false, but the teacher {config.teacher.source!r} needs the twin",
             where=where,
-            remedy='use teacher.source = "logs" or "none"',
+            remedy='use teacher.source = "logs", "planner" or "none"',
         )
     teacher = config.teacher
     if teacher.source is None:

@@ -25,7 +25,7 @@ from restock.toml import by_path
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EvaluationBuffer, Score, fixed_episodes
-from restock.train.evaluation.policies import kept_one, load_kept, save_agent
+from restock.train.evaluation.policies import kept_one, load_kept, make_learner, save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches, LogTerms
 from restock.train.feed.collector import Collector, FreshStrata, ring_conditions
@@ -300,7 +300,7 @@ def open_session(
     """
     torch.set_num_threads(config.threads)
     seed = config.seed
-    learner = Learner(config, task.observation_size, len(task.actions))
+    learner = make_learner(config, task)
     names = ring_conditions(conditions)
     strata = None
     if logs is not None and logs.panel is not None:

@@ -66,8 +66,8 @@ class QRDQN:
         self, network: QuantileNetwork, target: QuantileNetwork, batch: TrainingBatch
     ) -> Tensor:
         chooses = network(batch.next_observation)
-        if batch.plausible is not None:  # what a teacher finds plausible
-            chooses = chooses.masked_fill(~batch.plausible, -torch.inf)
+        if batch.preference is not None:  # a teacher's
+            chooses = chooses + batch.preference
         following = _of_action(target.quantiles(batch.next_observation), chooses.argmax(dim=1))
         return batch.reward.unsqueeze(1) + batch.discount.unsqueeze(1) * following
 

@@ -463,6 +463,20 @@ def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
     return np.concatenate([known, scaled], axis=-1)
 
 
+def proposal_reader(task: Task) -> tuple[F64, F64, F64]:
+    """Return how to read the proposed action from an observation (D,): W (A, D), b (A,), k (D,).
+
+    The proposed action, that of `nearest_action`, has the largest value of W @ observation + b;
+    k @ observation is 1 if navigation proposes something, else 0.
+    """
+    scaled, names = task.scaled_actions, task.observation_names
+    near = np.zeros((len(scaled), len(names)))
+    near[:, names.index("nav_speed")], near[:, names.index("nav_yaw_rate")] = 2 * scaled.T
+    known = np.zeros(len(names))
+    known[names.index("nav_known")] = 1.0
+    return near, -(scaled**2).sum(axis=1), known
+
+
 def _fastest(task: Task) -> NDArray[np.float64]:
     """Return the largest speed (m/s) and yaw rate (rad/s) among the actions, (2,)."""
     largest = np.abs(np.asarray(task.actions, np.float64)).max(axis=0)

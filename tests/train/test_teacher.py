@@ -64,10 +64,10 @@ def test_the_target_looks_among_the_plausible_alone() -> None:
     reward, discount = tensor([1.0, 0.0]), tensor([0.5, 0.0])
     slow = tensor([[4.0, 2.0, 8.0], [9.0, 9.0, 9.0]])
     online = tensor([[1.0, 3.0, 5.0], [0.0, 1.0, 2.0]])
-    plausible = tensor([[True, True, False], [False, True, False]])
+    plausible = tensor([[0, 0, -torch.inf], [-torch.inf, 0, -torch.inf]])
     # Online's best is action 2, which is not plausible; of the others it is 1, worth 2 to slow.
     assert td_target(reward, discount, slow, online, plausible).tolist() == [1 + 0.5 * 2, 0.0]
-    assert td_target(reward, discount, slow, plausible=plausible).tolist() == [1 + 0.5 * 4, 0.0]
+    assert td_target(reward, discount, slow, preference=plausible).tolist() == [1 + 0.5 * 4, 0.0]
 
 
 def test_imitation_is_cross_entropy_over_answered_states() -> None:
@@ -98,7 +98,7 @@ def test_unlikely_actions_are_neither_taken_nor_targeted() -> None:
     state = torch.eye(6)
     for _ in range(200):
         behaviour.learn(Labelled(state, torch.full((6,), FORWARD)))
-    assert behaviour.plausible(state).tolist() == [[False, True, False]] * 6
+    assert behaviour.preference(state).tolist() == [[-np.inf, 0, -np.inf]] * 6
     with torch.no_grad():
         one.network.advantage.bias.copy_(tensor([9.0, 0.0, 5.0]))
     assert greedy_actions(one.network, state.numpy()).tolist() == [STOP] * 6

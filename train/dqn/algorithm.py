@@ -43,7 +43,8 @@ class TrainingBatch:
     reward: Tensor  # (B,) float32, the sum of the row's n discounted rewards
     discount: Tensor  # (B,) float32, gamma**n where the row bootstraps, else 0
     weight: Tensor | None = None  # (B,) importance weights; None: ones
-    plausible: Tensor | None = None  # (B, A) bool, actions at s' to choose from; None: all
+    # (B, A) float32, added to Q(s', a) where the next action is chosen; None: nothing.
+    preference: Tensor | None = None
     logged: int = 0  # L, how many of the first rows are from logs
     conservative: float | Tensor = 0.0  # weight of the CQL term, or that of each logged row (L,)
     expert: Tensor | None = None  # (L,) bool, rows with the margin term; None: none
@@ -62,8 +63,8 @@ class Loss:
 class Algorithm(Protocol):
     """How values are learnt. Made from a run's `LossConfig`.
 
-    The greedy action is the best value of the network, among the plausible ones if a teacher
-    filters: one rule for the twin, evaluation and ONNX.
+    The greedy action is the best value of the network, to which a teacher's preference may be
+    added: one rule for the twin, evaluation and ONNX.
     """
 
     def make_network(
@@ -121,7 +122,7 @@ class DQN:
                 batch.discount,
                 target(batch.next_observation),
                 next_online_q,
-                batch.plausible,
+                batch.preference,
             )
         q = network(batch.observation)
         delta = self.settings.huber_delta
@@ -193,7 +194,7 @@ def td_target(
     discount: Tensor,
     next_target_q: Tensor,
     next_online_q: Tensor | None = None,
-    plausible: Tensor | None = None,
+    preference: Tensor | None = None,
 ) -> Tensor:
     """Return the TD target of Q(s, a), (B,).
 
@@ -203,12 +204,12 @@ def td_target(
         next_target_q: (B, A), the target network at s'.
         next_online_q: (B, A), the online network at s': it selects the action that the target
             network evaluates (Double DQN). None lets the target network do both (DQN).
-        plausible: (B, A) bool, at least one of each row: the actions at s' that may be selected
-            (discrete BCQ, arXiv:1910.01708). None: all of them.
+        preference: (B, A), added where the next action is selected, and not to its value: -inf
+            for what may not be selected (discrete BCQ, arXiv:1910.01708). None: nothing.
     """
     chooses = next_target_q if next_online_q is None else next_online_q
-    if plausible is not None:
-        chooses = chooses.masked_fill(~plausible, -torch.inf)
+    if preference is not None:
+        chooses = chooses + preference
     best = chooses.argmax(dim=1, keepdim=True)
     return reward + discount * next_target_q.gather(1, best).squeeze(1)
 

@@ -1,4 +1,11 @@
-"""A behaviour network beside Q: it says which actions are plausible, and Q chooses among them.
+"""What a teacher prefers is added to Q: the best sum is taken.
+
+Navigation's proposal is preferred by a margin: another action is taken where Q says that it is
+better by more than that. So the policy begins as the stack that drives today, and deviates where
+its values have learnt that deviating pays (safe policy improvement with a baseline,
+arXiv:1712.06924). Its target chooses by the same rule, so Q is the value of this very policy.
+
+A behaviour network says which actions are plausible, and Q chooses among them.
 
 G(a|s) is learnt by cross-entropy from what a teacher would do in the visited states, and from
 what it did in the logs. An action is plausible where G(a|s) is at least `ratio` times the largest;
@@ -13,14 +20,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from restock.arrays import F64
 from restock.replay.mixture.mixture import value_at
 from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
-from restock.train.dqn.config import TeacherConfig, TrainConfig
+from restock.train.dqn.config import PLANNER, TeacherConfig, TrainConfig
 from restock.train.dqn.network import (
     FlatAdam,
     FlatParameters,
@@ -80,7 +89,48 @@ class FilteredNetwork(nn.Module):
         return q.masked_fill(~plausible, -torch.inf)
 
 
-PolicyNetwork = QNetwork | FilteredNetwork
+# How to read a proposal from an observation o (D,): W (A, D) and b (A,), with W @ o + b largest for
+# the proposed action; and k (D,), with k @ o = 1 where there is one, else 0.
+Proposal = tuple[F64, F64, F64]
+
+
+class ProposalNetwork(nn.Module):
+    """A network that gives Q, and `margin` more for the action that navigation proposes.
+
+    Where nothing is proposed it gives Q alone.
+    """
+
+    nearest: Tensor  # (A, D): which action is nearest to the proposal, by the largest value
+    offset: Tensor  # (A,)
+    lead: Tensor  # (D,), the margin where a proposal is known
+
+    def __init__(self, values: QNetwork, proposal: Proposal | None, margin: float) -> None:
+        """`proposal` None: buffers wait for kept weights."""
+        super().__init__()
+        self.values = values
+        self.observation_size, self.actions = values.observation_size, values.actions
+        shape = self.actions, self.observation_size
+        nearest, offset, known = proposal or (
+            np.zeros(shape),
+            np.zeros(shape[0]),
+            np.zeros(shape[1]),
+        )
+        for name, of in (("nearest", nearest), ("offset", offset), ("lead", margin * known)):
+            self.register_buffer(name, torch.from_numpy(np.asarray(of, np.float32)))
+
+    def preference(self, observation: Tensor) -> Tensor:
+        """Return what is added to the values (B, A) of observations (B, D)."""
+        near = functional.linear(observation, self.nearest, self.offset)
+        proposed = near >= near.amax(dim=1, keepdim=True)
+        return proposed * (observation @ self.lead)[:, None]
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return action values (B, A) of observations (B, D)."""
+        q: Tensor = self.values(observation)
+        return q + self.preference(observation)
+
+
+PolicyNetwork = QNetwork | FilteredNetwork | ProposalNetwork
 
 
 def make_behaviour(
@@ -95,6 +145,8 @@ def make_behaviour(
 def make_policy(config: TrainConfig, observation_size: int, actions: int) -> PolicyNetwork:
     """Return the policy network that a run's config describes, to load weights into."""
     values = make_network(config, observation_size, actions)
+    if config.teacher.source == PLANNER:
+        return ProposalNetwork(values, None, config.teacher.margin)
     if not config.teacher.filters:
         return values
     return FilteredNetwork(values, make_behaviour(observation_size, actions))
@@ -172,6 +224,8 @@ class Behaviour(Stateful):
         loss.backward()  # type: ignore[no-untyped-call]
 
     @torch.no_grad()
-    def plausible(self, observation: Tensor) -> Tensor:
-        """Return which actions (B, A) bool are plausible in observations (B, D)."""
-        return plausible_actions(self._logits(observation), self.ratio)
+    def preference(self, observation: Tensor) -> Tensor:
+        """Return 0 for plausible actions (B, A) in observations (B, D), -inf for others."""
+        logits = self._logits(observation)
+        plausible = plausible_actions(logits, self.ratio)
+        return torch.zeros_like(logits).masked_fill_(~plausible, -torch.inf)

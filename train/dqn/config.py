@@ -26,6 +26,7 @@ from restock.train.twin.missions import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
 
 GIVEN = "given"  # the source of a teacher that Python code passed in
+PLANNER = "planner"  # the source of a teacher that the observation contains
 
 Count = Annotated[int, Meta(ge=1)]
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -129,9 +130,11 @@ class ScheduleConfig(Checked, frozen=True):
 class TeacherConfig(Checked, frozen=True):
     """The teacher, and how far the policy may deviate from its actions."""
 
-    # operator: the twin's; logs: rows of `policies` alone; none; or your own, as module:name.
+    # operator: the twin's; planner: navigation's proposal, from which the policy deviates where Q
+    # sees `margin` more; logs: rows of `policies` alone; none; or your own, as module:name.
     # None: the operator where the task has a goal, else none.
     source: str | None = None
+    margin: NonNegative = 0.2  # reward by which another action must be better than the planner's
     ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; or a schedule
     policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
     # And rows of other drivers' episodes that reached their goal without one of `policies`: before
@@ -148,18 +151,18 @@ class TeacherConfig(Checked, frozen=True):
     @property
     def filters(self) -> bool:
         """Return whether there is a behaviour network."""
-        return self.source not in (None, "none")
+        return self.source not in (None, "none", PLANNER)
 
     @property
     def asks(self) -> bool:
         """Return whether somebody is asked in the twin."""
-        return self.source not in (None, "none", "logs")
+        return self.source not in (None, "none", "logs", PLANNER)
 
     def check(self) -> None:
-        named = (None, "none", "logs", "operator", GIVEN)
+        named = (None, "none", "logs", "operator", PLANNER, GIVEN)
         if self.source not in named and not re.fullmatch(r"[\w.]+:\w+", str(self.source)):
             raise ValueError(
-                "source must be none, operator, logs, or your own teacher as module:name,"
+                "source must be none, operator, planner, logs, or your own teacher as module:name,"
                 f" got {self.source!r}"
             )
 
@@ -243,11 +246,16 @@ class TrainConfig(Checked, frozen=True):
 
 
 def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
-    """Raise ConfigError where a setting of the teacher is given, but nobody teaches."""
-    if teacher.source == "none" and (keys := changed(teacher, source="none")):
+    """Raise ConfigError where a setting of the teacher is given that its source does not have."""
+    keys = changed(teacher, source=teacher.source)
+    if teacher.source == PLANNER:
+        idle = [key for key in keys if key != "margin"]
+    else:
+        idle = keys if teacher.source == "none" else [key for key in keys if key == "margin"]
+    if idle:
         raise ConfigError(
-            'has no effect where teacher.source is "none"',
-            where=f"{within}teacher.{keys[0]}",
+            f'has no effect where teacher.source is "{teacher.source}"',
+            where=f"{within}teacher.{idle[0]}",
             remedy="leave it out, or set teacher.source",
         )
 

@@ -7,7 +7,7 @@ that the config, metrics and checkpoints of a run all carry.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -19,8 +19,15 @@ from torch import Tensor
 from restock.errors import ConfigError
 from restock.state import Stateful
 from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm
-from restock.train.dqn.behaviour import Behaviour, FilteredNetwork, Labelled, PolicyNetwork
-from restock.train.dqn.config import Polyak, TargetRule, TrainConfig
+from restock.train.dqn.behaviour import (
+    Behaviour,
+    FilteredNetwork,
+    Labelled,
+    PolicyNetwork,
+    Proposal,
+    ProposalNetwork,
+)
+from restock.train.dqn.config import PLANNER, Polyak, TargetRule, TrainConfig
 from restock.train.dqn.network import (
     FlatAdam,
     FlatParameters,
@@ -66,8 +73,14 @@ class Learner(Stateful):
         actions: int,
         *,
         path: UpdatePath | None = None,
+        proposal: Proposal | None = None,
     ) -> None:
-        """Build the networks; `path` None takes the fastest allowed; paths agree up to rounding."""
+        """Build the networks.
+
+        Args:
+            path: None takes the fastest allowed; paths agree up to rounding.
+            proposal: of the task, where navigation's is the teacher.
+        """
         self.device = open_device(config.device)
         self.algorithm = make_algorithm(config.loss)
         self.network = self.algorithm.make_network(
@@ -93,6 +106,7 @@ class Learner(Stateful):
         self._target = differentiable(self.path, self.target_network, self._slow)
         self.gradient_steps = 0
         self.behaviour: Behaviour | None = None
+        self._preference: Callable[[Tensor], Tensor] | None = None
         self._acting: PolicyNetwork = self.network
         self.policy: PolicyNetwork = self.policy_network  # what is evaluated and kept
         if config.teacher.filters:
@@ -105,8 +119,14 @@ class Learner(Stateful):
                 path=self.path,
             )
             ratio = self.behaviour.ratio
+            self._preference = self.behaviour.preference
             self._acting = FilteredNetwork(self.network, self.behaviour.network, ratio)
             self.policy = FilteredNetwork(self.policy_network, self.behaviour.average, ratio)
+        elif config.teacher.source == PLANNER:
+            margin = config.teacher.margin
+            acting = ProposalNetwork(self.network, proposal, margin).to(self.device)
+            self._preference, self._acting = acting.preference, acting
+            self.policy = ProposalNetwork(self.policy_network, proposal, margin).to(self.device)
 
     def update(
         self,
@@ -185,17 +205,11 @@ class Learner(Stateful):
         return TrainingBatch(
             *parts,
             weight=terms.weight,
-            plausible=self._plausible(parts[1]),
+            preference=None if self._preference is None else self._preference(parts[1]),
             logged=terms.logged,
             conservative=terms.conservative,
             expert=terms.expert,
         )
-
-    def _plausible(self, next_observation: Tensor) -> Tensor | None:
-        """Return the actions (B, A) that the target's maximum may look at; None: all."""
-        if self.behaviour is None:
-            return None
-        return self.behaviour.plausible(next_observation)
 
     @property
     def is_finite(self) -> bool:
@@ -217,7 +231,7 @@ class Learner(Stateful):
         return td, self.network(batch.observation), self.target_network(batch.observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the best action (N,) of each observation (N, D), among the plausible ones."""
+        """Return the best action (N,) of each observation (N, D), with the teacher's preference."""
         return greedy_actions(self._acting, observation)
 
 

@@ -31,7 +31,7 @@ from restock.ingest.task.task import Task
 from restock.process import import_extra
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
-from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
+from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposalNetwork
 from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.evaluate import STUCK_RADIUS_M, STUCK_WINDOW_S
 from restock.train.evaluation.ope_dataset import panel_store
@@ -113,10 +113,12 @@ def to_onnx(network: PolicyNetwork) -> Any:
     """Translate the network into an ONNX model, node for layer; a filter is in the same graph."""
     onnx = _onnx()
     graph = _Graph(onnx)
-    plain = network.values if isinstance(network, FilteredNetwork) else network
-    values = graph.values(plain, "q")
     if isinstance(network, FilteredNetwork):
-        values = graph.filter(network, values, "plausible_values")
+        values = graph.filter(network, graph.values(network.values, "q"), "plausible_values")
+    elif isinstance(network, ProposalNetwork):
+        values = graph.propose(network, graph.values(network.values, "q"), "preferred_values")
+    else:
+        values = graph.values(network, "q")
     graph.node("Identity", [values], "values")
     graph.node("ArgMax", ["values"], "action", axis=1, keepdims=0)
     tensor, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
@@ -194,6 +196,19 @@ class _Graph:
         plausible = self.node("GreaterOrEqual", [logits, least], "plausible")
         none = self.constant("behaviour.none", np.array(-np.inf, np.float32))
         return self.node("Where", [plausible, values, none], output)
+
+    def propose(self, network: ProposalNetwork, values: str, output: str) -> str:
+        """Add the nodes that add the margin to the proposed action's value, (N, A)."""
+        nearest = self.constant("proposal.nearest", _array(network.nearest))
+        offset = self.constant("proposal.offset", _array(network.offset))
+        near = self.node("Gemm", ["observation", nearest, offset], "proposal.near", transB=1)
+        axes = self.constant("proposal.axes", np.array([1], np.int64))
+        largest = self.node("ReduceMax", [near, axes], "proposal.largest", keepdims=1)
+        proposed = self.node("GreaterOrEqual", [near, largest], "proposed")
+        lead = self.constant("proposal.lead", _array(network.lead)[:, None])
+        margin = self.node("MatMul", ["observation", lead], "proposal.margin")
+        preferred = self.node("Add", [values, margin], "proposal.preferred")
+        return self.node("Where", [proposed, preferred, values], output)
 
 
 class OnnxPolicy:

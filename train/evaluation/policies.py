@@ -20,14 +20,14 @@ import numpy as np
 
 from restock.arrays import F32, Bools, Ints
 from restock.errors import ConfigError, PanelError, RunError, StoreError
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Task, proposal_reader
 from restock.replay.panel.panel import Panel
 from restock.state import first_mismatch
 from restock.train.dqn.behaviour import PolicyNetwork, make_policy
-from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.config import PLANNER, TrainConfig, parse_config
 from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_probabilities
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.network import QNetwork
+from restock.train.dqn.network import QNetwork, UpdatePath
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.ope_dataset import MODEL_ROWS, held_out_rows
 from restock.train.run import checkpoint
@@ -35,6 +35,12 @@ from restock.train.run.kept_evaluations import CloneQuality, keep_clone
 from restock.train.run.run import PolicyOrigin, Run, env_steps_of, latest_drives, resuming
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.env.interface import Policy
+
+
+def make_learner(config: TrainConfig, task: Task, *, path: UpdatePath | None = None) -> Learner:
+    """Make the learner of a task; `path` as in `Learner`."""
+    proposal = proposal_reader(task) if config.teacher.source == PLANNER else None
+    return Learner(config, task.observation_size, len(task.actions), path=path, proposal=proposal)
 
 
 class GreedyPolicy:
@@ -128,7 +134,7 @@ def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
     """
     state = checkpoint.load(run.latest)
     plain = msgspec.structs.replace(config, device="cpu")
-    learner = Learner(plain, task.observation_size, len(task.actions))
+    learner = make_learner(plain, task)
     try:
         learner.load_state_dict(state["learner"])
     except (KeyError, ValueError, RuntimeError, RunError) as error:

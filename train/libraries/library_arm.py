@@ -78,7 +78,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
             ('replay.ring_capacity "auto"', config.replay.ring_capacity == "auto"),
-            ("teacher.source", config.teacher.filters),
+            ("teacher.source", config.teacher.source not in (None, "none")),
             ("practice.rule", config.practice.rule != "natural"),
             ("evaluation.missions", config.evaluation.missions != "drawn"),
         )

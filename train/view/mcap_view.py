@@ -25,8 +25,7 @@ from restock.errors import RunError
 from restock.ingest.decoding.columns import Channel
 from restock.replay.trace.moment import Moment, SeenScan
 from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.dqn.learner import Learner
-from restock.train.evaluation.policies import load_agent
+from restock.train.evaluation.policies import load_agent, make_learner
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
@@ -83,7 +82,7 @@ def _packed(moment: Moment, discount: float) -> F32:
 
 def _of_checkpoint(run: Run, config: TrainConfig, rows: F32, moment: Moment) -> Critic:
     task = moment.task
-    learner = Learner(config, task.observation_size, len(task.actions))
+    learner = make_learner(config, task)
     state = checkpoint.load(run.latest)
     try:
         learner.load_state_dict(state["learner"])

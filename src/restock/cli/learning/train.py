@@ -290,6 +290,7 @@ _OF_LOGS = ("policies", "successes", "offline_updates")  # of a teacher's settin
 def describe_run(prepared: Prepared) -> str:
     """Describe the run, and what not to expect of it, in a line each."""
     from restock.toml import changed
+    from restock.train.dqn.config import PLANNER
     from restock.train.twin.floors.floors import open_floors
     from restock.train.twin.physics.episode import sealed
 
@@ -313,6 +314,11 @@ def describe_run(prepared: Prepared) -> str:
         lines.append(f"a ring of {ring['ring_rows']:,} rows: {ring['reason']}")
     if config.teacher.filters:
         lines.append(_teacher(config.teacher, panel))
+    elif config.teacher.source == PLANNER:
+        lines.append(
+            "teacher planner: the policy does what navigation proposes, except where Q is more than"
+            f" {config.teacher.margin:g} better for another action"
+        )
     if panel is None and config.teacher.asks:
         resolved = {"successes": False, "offline_updates": config.schedule.offline_updates}
         lines += [

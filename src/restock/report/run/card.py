@@ -120,7 +120,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         "teacher": {
             **{
                 name: teacher.get(name)
-                for name in ("source", "ratio", "target", "policies", "successes", "mirror")
+                for name in ("source", "margin", "ratio", "policies", "successes", "mirror")
             },
             "states": _columns(facts.teacher, *_TEACHER),
         }
@@ -203,6 +203,11 @@ def _teacher(teacher: dict[str, Any] | None, sampled: list[dict[str, Any]]) -> s
     """Say who decides what is plausible; `sampled` are the policies of the rows drawn."""
     if teacher is None:
         return "none: every action may be chosen"
+    if teacher["source"] == "planner":
+        return (
+            "what navigation proposes, except where Q is more than"
+            f" {teacher['margin']:g} better for another action"
+        )
     ratio = teacher["ratio"]
     ratio = f"{ratio:g}" if isinstance(ratio, int | float) else f"a schedule ({_words(ratio)})"
     drawn = {row["behaviour_policy"] for row in sampled if row["source"] == "logs"}
@@ -212,8 +217,7 @@ def _teacher(teacher: dict[str, Any] | None, sampled: list[dict[str, Any]]) -> s
     mirrored = ", half of its rows mirrored" if teacher["mirror"] else ""
     return (
         f"{teacher['source']}; {cloned}{mirrored}; an action is plausible"
-        f" from {ratio} of the likeliest's probability on; the target looks at"
-        f" {teacher['target']} actions"
+        f" from {ratio} of the likeliest's probability on"
     )
 
 

@@ -1,0 +1,172 @@
+"""Navigation's proposal as the teacher: when Q deviates from it, what is kept, what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from support.paths import ROOT
+from support.toy_run import assert_same_run, config, run_to_end, session
+from torch import Tensor, tensor
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import nearest_action, proposal_reader
+from restock.train.dqn.behaviour import ProposalNetwork, make_policy
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.learner import Learner, greedy_actions
+from restock.train.evaluation.policies import make_learner
+from restock.train.loop import train
+from restock.train.prepare import prepare_new
+from restock.train.run import checkpoint
+from restock.train.twin.env.drivers import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+TASK = load_profile("warehouse_amr").task
+KNOWN = TASK.observation_names.index("nav_known")
+BY_PLANNER = {"teacher": {"source": "planner"}}
+
+
+def observed(command: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Observations (N, D) with these proposed commands (N, 2), in m/s and rad/s."""
+    rng = np.random.default_rng(0)
+    observation = rng.normal(size=(len(command), TASK.observation_size)).astype(np.float32)
+    scaled = command / np.abs(np.asarray(TASK.actions)).max(axis=0)
+    observation[:, KNOWN:] = np.where(known[:, None], np.column_stack([known, scaled]), 0.0)
+    return observation
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_reads_the_action_nearest_to_the_proposal(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    command, known = rng.uniform(-1.2, 1.2, (50, 2)), rng.random(50) < 0.7
+    near, offset, says = proposal_reader(TASK)
+    observation = observed(command, known)
+    found = (observation @ near.T + offset).argmax(axis=1)
+    wanted, _ = nearest_action(TASK, command[:, 0], command[:, 1])
+    assert (found == wanted)[known].all()
+    assert ((observation @ says) == known).all()
+
+
+def learner(margin: float, *, path: str | None = None) -> Learner:
+    document = {"teacher": {"source": "planner", "margin": margin}, "network": {"hidden": [16]}}
+    return make_learner(parse_config(document, where="test"), TASK, path=path)
+
+
+def values(one: Learner, q: list[float]) -> None:
+    """Let Q be `q` (A,) in every state."""
+    for network in (one.network, one.target_network, one.policy_network):
+        with torch.no_grad():
+            network.advantage.weight.zero_()
+            network.advantage.bias.copy_(tensor(q))
+
+
+def test_deviates_only_where_q_is_better_by_the_margin() -> None:
+    one = learner(0.3)
+    command = np.asarray(TASK.actions)  # each action is proposed once
+    observation = observed(command, np.ones(len(command), np.bool_))
+    values(one, [0.0, 0.25, *[0.0] * (len(command) - 2)])
+    assert one.greedy(observation).tolist() == list(range(len(command)))
+    values(one, [0.0, 0.35, *[0.0] * (len(command) - 2)])
+    assert one.greedy(observation).tolist() == [1] * len(command)
+    values(one, [0.0, 0.05, *[0.0] * (len(command) - 2)])
+    unknown = observed(command, np.zeros(len(command), np.bool_))
+    assert one.greedy(unknown).tolist() == [1] * len(command)  # nothing is proposed: Q alone
+
+
+@pytest.mark.parametrize("path", ["native", "autograd"])
+def test_target_is_the_value_of_what_the_policy_would_do(path: str) -> None:
+    one = learner(0.3, path=path)
+    values(one, [1.0, 1.2, *[0.5] * (len(TASK.actions) - 2)])
+    after = observed(np.array([[0.0, 0.0], TASK.actions[2]]), np.ones(2, np.bool_))
+    scalars = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5]], np.float32)
+    rows = torch.from_numpy(np.concatenate([after, after, scalars], axis=1))
+    td, _, _ = one.td_error(rows)
+    # Of 0, proposed, and 1, better by .2 alone, it is 0; action 2 is .7 worse than 1.
+    assert td.tolist() == pytest.approx([1.0 - 0.5 * 1.0, 1.0 - 0.5 * 1.2])
+
+
+def test_with_constant_values_it_drives_as_the_planner_does() -> None:
+    one = learner(0.3)
+    values(one, [0.0] * len(TASK.actions))
+    env = WarehouseVectorEnv(8, seed=3)
+    observation, _ = env.reset(seed=3)
+    planner = PlannerFollower(epsilon=0.0)
+    taken = []
+    for _ in range(60):
+        wanted = planner.choose(env)
+        found = one.greedy(observation)
+        assert (found == wanted).all()
+        taken += found.tolist()
+        observation, *_ = env.step(found)
+    assert len(set(taken)) > 3
+
+
+def test_onnx_deviates_where_torch_does() -> None:
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    from restock.train.evaluation.onnx_policy import to_onnx
+
+    policy = learner(0.3).policy
+    file = runtime.InferenceSession(to_onnx(policy).SerializeToString())
+    rng = np.random.default_rng(0)
+    observation = observed(rng.uniform(-1, 1, (512, 2)), rng.random(512) < 0.7)
+    values, action = file.run(["values", "action"], {"observation": observation})
+    with torch.no_grad():
+        expected: Tensor = policy(torch.from_numpy(observation))
+    np.testing.assert_allclose(values, expected.numpy(), atol=1e-5)
+    np.testing.assert_array_equal(action, greedy_actions(policy, observation))
+
+
+def test_a_stopped_run_ends_as_a_whole_one(tmp_path: Path) -> None:
+    settings = config(**BY_PLANNER)
+    whole = run_to_end(tmp_path / "whole", settings)
+    stopped = session(tmp_path / "stopped", settings)
+    requested = iter(range(150))
+    with pytest.raises(Exception, match="restock train --resume"):
+        train(stopped, stop=lambda: next(requested, None) is None)
+    stopped.close()
+    resumed = session(tmp_path / "stopped", settings, resume=True)
+    train(resumed)
+    resumed.close()
+    assert_same_run(whole, resumed)
+    kept = make_policy(settings, whole.learner.network.observation_size, 3)
+    kept.load_state_dict(checkpoint.load(whole.run.best)["network"])
+    assert isinstance(kept, ProposalNetwork)
+    assert torch.equal(kept.lead, whole.learner.policy.lead)
+    assert kept.lead.abs().max() == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "where"),
+    [
+        ({"source": "planner", "ratio": 0.5}, "teacher.ratio"),
+        ({"source": "planner", "policies": ["teleop"]}, "teacher.policies"),
+        ({"source": "operator", "margin": 0.5}, "teacher.margin"),
+        ({"source": "none", "margin": 0.5}, "teacher.margin"),
+    ],
+)
+def test_settings_without_effect_are_refused(
+    settings: dict[str, object], where: str, tmp_path: Path
+) -> None:
+    given = parse_config({"teacher": settings}, where="test")
+    with pytest.raises(ConfigError) as refused:
+        prepare_new(tmp_path / "run", None, given)
+    assert refused.value.where == where
+
+
+def test_a_robot_whose_proposals_are_not_read_is_refused(tmp_path: Path) -> None:
+    text = (ROOT / "ingest/profile/profiles/warehouse_amr.toml").read_text("utf-8")
+    begin = text.index("[inputs.nav_command]")
+    end = text.index("\n[", begin)
+    mute = tmp_path / "mute.toml"
+    mute.write_text(text[:begin] + text[end + 1 :])
+    words = ["teacher.source=planner", f"profile={mute}"]
+    with pytest.raises(ConfigError, match="does not read what navigation proposes") as refused:
+        prepare_new(tmp_path / "run", None, TrainConfig(), words)
+    assert refused.value.where == "teacher.source"
+    assert not (tmp_path / "run").exists()
