@@ -195,7 +195,7 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str
         what = f"transitions must be a Store or a table, got {repr(given)[:80]}"
         raise ArgumentError(what, remedy=remedy) from error
     kinds = {name.casefold(): kind for name, kind in _kinds(connection.table("given")).items()}
-    needed = _NEEDED
+    needed: tuple[str, ...] = _NEEDED
     if "episode_id" not in kinds:
         needed, remedy = _OF_ANY_TASK, f"give {', '.join(_OF_ANY_TASK)}: docs/panel.md"
     elif "condition" in kinds:
