@@ -98,14 +98,6 @@ def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
         assert value == pytest.approx(getattr(evidence(stray=False), field), abs=0.01), field
 
 
-def test_drives_of_one_robot_are_judged_together() -> None:
-    one = DriveEvidence(driven_m=2.0, requested_rad=1.2, spells=1)
-    assert not one.steers
-    assert DriveEvidence.joined([one, one]).steers
-    turned = DriveEvidence(pivoted_rad=3.0)
-    assert DriveEvidence.joined([one, one, turned]).pivots
-
-
 def bag(folder: Path, *, pivots: bool) -> Path:
     """20 s: ahead, and told twice to turn on the spot."""
     time_s = np.arange(0, 20, 0.05)

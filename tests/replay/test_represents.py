@@ -299,7 +299,7 @@ def test_a_natural_sample_stands_for_itself(rows, data):
         ('represents = "incidents"', "", "represents"),
         ("represents = { near_collision = 0.7, nominal = 0.6 }", "", "sum to 1.3"),
         ("represents = { near_collision = 1.5 }", "", "near_collision|<= 1"),
-        ("", 'represents = "archive"', "this is it"),
+        ("", 'represents = "archive"', "this is the main store"),
         ("represents = {}", "", "an empty table"),
         ("", "represents = {}", "an empty table"),
     ],

@@ -184,11 +184,11 @@ def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(panels, name, way)
         # A worker passes the text on alone.
         refusal = str(error) if error.remedy or "workers" in way else ""
     if name in FOLLOW_TD and way in NOT_TOLD:
-        assert "follow TD errors" in refusal
+        assert "depend on TD errors" in refusal
         assert len(batches) <= 1
         return
     if name == "scheduled" and way.startswith("PanelDataset"):
-        assert "follow environment steps" in refusal
+        assert "depend on environment steps" in refusal
         assert not batches
         return
     # With a limit the rows end; without one they do not.

@@ -24,7 +24,7 @@ from restock.train.prepare import prepare_new
         ("env.conditions={nominal = 0}", r"env\.conditions must have a share above 0"),
         ("target={rule='polyak', tau=2}", r"target\.tau must be in \(0, 1\], got 2"),
         ("seed=-1", r"seed must be in \[0, 2147483647\], got -1"),
-        ("teacher.source='the planner'", "source must be none, operator, logs"),
+        ("teacher.source='the planner'", "source must be none, operator, planner"),
         ("threads=0", r"threads must be in \[1, 1024\], got 0"),
         (
             "loss.n_step=1000000",
@@ -82,7 +82,7 @@ def test_a_run_that_cannot_be_opened_leaves_no_folder(tmp_path, monkeypatch):
         raise MemoryError
 
     prepared = prepare_new(tmp_path / "run", None, None, ["env.num_envs=1"])
-    monkeypatch.setattr("restock.train.session.Learner", refuse)
+    monkeypatch.setattr("restock.train.session.make_learner", refuse)
     with pytest.raises(MemoryError):
         prepared.open()
     assert not (tmp_path / "run").exists()

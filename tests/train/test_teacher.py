@@ -231,7 +231,7 @@ def test_rows_are_mirrored_if_the_operator_teaches(tmp_path):
         ([1.0, 1.0, 1.0, 1.0], r"returned float64 \(4,\)"),
         ([1, 1, 3, 1], "returned action 3 for environment 2: the task's are 0 to 2"),
         ([1, -2, 0, 1], "returned action -2 for environment 1"),
-        ([[1], [1, 2], [0], [1]], "returned a list that is no array"),
+        ([[1], [1, 2], [0], [1]], "returned a list that is not an array"),
     ],
 )
 def test_a_teacher_that_gives_no_action_is_refused(answer, message, tmp_path):

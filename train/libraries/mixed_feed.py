@@ -192,7 +192,7 @@ class MixedFeed:
         if self._td_missing:
             others = ", ".join(name for name, rule in RULES.items() if not rule.follows_td)
             raise MixtureError(
-                "the mixture's draws follow TD errors, and this buffer gets none",
+                "the mixture's draws depend on TD errors, and this buffer gets none",
                 remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix with"
                 f" a `within` of {others}",
             )
