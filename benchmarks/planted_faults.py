@@ -59,7 +59,7 @@ SETTINGS = {
     "epsilon.steps": 8_000,
     "optimizer.learning_rate": 0.0003,
     "record.every_updates": 250,
-    "record.tensorboard": "false",
+    "record.trackers": "[]",
 }
 
 

@@ -36,7 +36,7 @@ from restock.stats import interval_text, wilson
 
 LOGS = Path(__file__).parent.parent / "sample_logs"
 BUDGETS = {"demo": 48_000, "three-minutes": 128_000, "ten-minutes": 288_000, "hour": 1_800_000}
-SETTINGS = ["practice.rule=success", "record.tensorboard=false", "evaluation.episodes=20"]
+SETTINGS = ["practice.rule=success", "record.trackers=[]", "evaluation.episodes=20"]
 PERTURBATIONS = "friction,latency,payload,wheels,sensors"
 UNSEEN = "unseen floors"
 RARELY_AND_WELL = ["evaluation.every_env_steps=48000", "evaluation.episodes=50"]

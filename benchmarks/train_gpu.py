@@ -102,7 +102,7 @@ def seconds_of_runs(device: str, part: float, folder: Path) -> dict[str, dict[st
                     settings=[
                         *(f"device={place}", f"schedule.env_steps={WARM_UP + length}"),
                         *(f"schedule.warmup_env_steps={WARM_UP}", "evaluation.episodes=1"),
-                        *("record.tensorboard=false", *settings),
+                        *("record.trackers=[]", *settings),
                     ],
                 )
                 took.append(time.perf_counter() - began)

@@ -53,7 +53,7 @@ AGENTS: dict[str, list[str]] = {
 }
 SETTINGS = [
     "evaluation.every_env_steps=20000",
-    "record.tensorboard=false",
+    "record.trackers=[]",
 ]
 BANDS = (0.02, 0.025, 0.03, 0.045)
 RESAMPLES = 2000

@@ -36,7 +36,7 @@ from restock.train.feed.update_blocks import UpdateBlocks
 from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
-from restock.train.run.events import Events, TensorBoard, tracker_sinks
+from restock.train.run.events import Events, tracker_sinks
 from restock.train.run.run import Run, RunLock
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -198,10 +198,7 @@ class Session(Stateful):
         """Begin to write curves; a resumed run purges those after its checkpoint."""
         run, record = self.run, self.config.record
         from_step = self.progress.env_steps if run.latest.exists() else None
-        sinks = tracker_sinks(run, record.trackers)
-        if record.tensorboard:
-            sinks["tensorboard"] = lambda: TensorBoard(run.path / "tensorboard", from_step)
-        self.events = Events(run.path, sinks)
+        self.events = Events(run.path, tracker_sinks(run, record.trackers, from_step))
 
     def restore(self) -> None:
         """Continue from the run's latest checkpoint.

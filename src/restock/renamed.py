@@ -46,6 +46,7 @@ TRAINING_KEYS = {
     "practice.warmup_episodes": _FIXED,
     "record.keep_checkpoints": _FIXED,
     "record.probe_rows": _FIXED,
+    "record.tensorboard": "it was removed: record.trackers names tensorboard, or does not",
     "teacher.hidden": _FIXED,
     "teacher.learning_rate": _FIXED,
     "teacher.logs_share": _FIXED,

@@ -21,7 +21,7 @@ TINY = [
     *("--env-steps", "40", "--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=40"),
     *("--set", "schedule.offline_updates=20", "--set", "network.hidden=[8]"),
     *("--set", "evaluation.episodes=1", "--set", "record.every_updates=10"),
-    *("--set", "record.tensorboard=false", "--set", "replay.batch_size=16"),
+    *("--set", "record.trackers=[]", "--set", "replay.batch_size=16"),
     *("--set", "record.audit_share=0.5", "--set", "replay.ring_capacity=100"),
     *("--set", "env.conditions={nominal=1.0}"),
 ]

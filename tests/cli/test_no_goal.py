@@ -14,7 +14,7 @@ TINY = [
     *("--env-steps", "400", "--set", "env.num_envs=8", "--set", "schedule.warmup_env_steps=40"),
     *("--set", "schedule.offline_updates=0", "--set", "network.hidden=[8]"),
     *("--set", "evaluation.episodes=1", "--set", "record.every_updates=10"),
-    *("--set", "record.tensorboard=false", "--set", "replay.batch_size=16"),
+    *("--set", "record.trackers=[]", "--set", "replay.batch_size=16"),
     *("--set", "env.conditions={nominal=1.0}"),
 ]
 

@@ -37,7 +37,7 @@ SMALL: dict[str, Any] = {
         "every_updates": 50,
         "audit_share": 0.1,
         "checkpoint_every_env_steps": 400,
-        "tensorboard": False,
+        "trackers": (),
     },
 }
 CLOCKED = {"wall_s", "env_steps_per_s", "updates_per_s"}  # the only columns that time decides

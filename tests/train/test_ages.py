@@ -16,7 +16,7 @@ DAY_NS = 86_400 * 10**9
 TINY = [
     *("env.num_envs=2", "schedule.offline_updates=20", "schedule.env_steps=4"),
     *("network.hidden=[16]", "evaluation.episodes=1", "record.every_updates=10"),
-    *("record.tensorboard=false", "replay.batch_size=32", "record.audit_share=1.0"),
+    *("record.trackers=[]", "replay.batch_size=32", "record.audit_share=1.0"),
 ]
 
 

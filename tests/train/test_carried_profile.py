@@ -39,7 +39,7 @@ abs(wheel_speed_mps) < 0.3
 TINY = [
     *("schedule.env_steps=200", "schedule.offline_updates=5", "schedule.warmup_env_steps=40"),
     *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=200"),
-    *("record.tensorboard=false", "network.hidden=[8]", "replay.batch_size=16"),
+    *("record.trackers=[]", "network.hidden=[8]", "replay.batch_size=16"),
     "env.conditions={nominal=1.0}",
 ]
 TUESDAY, MONDAY = str(ROOT / "sample_logs/amr_tuesday"), str(ROOT / "sample_logs/amr_monday.mcap")

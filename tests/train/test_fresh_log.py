@@ -309,7 +309,7 @@ def test_a_step_that_blew_up_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.slow
 def test_flushing_to_a_store_twice_changes_nothing(tmp_path, capsys):
     small = ["env.num_envs=4", "evaluation.episodes=1", "network.hidden=[16]"]
-    keys = [word for key in (*small, "record.tensorboard=false") for word in ("--set", key)]
+    keys = [word for key in (*small, "record.trackers=[]") for word in ("--set", key)]
     run, store = str(tmp_path / "a"), str(tmp_path / "store")
     new = ["train", "--out", run, "--env-steps", "1000", *keys]
     assert main([*new, "--flush-fresh", store, "--json"]) == 0

@@ -80,7 +80,7 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, capsys
         *("network.hidden=[16]", "env.num_envs=4", "replay.batch_size=16", "schedule.env_steps=80"),
         *("schedule.warmup_env_steps=20", "schedule.updates_per_env_step=1"),
         *("evaluation.every_env_steps=80", "evaluation.episodes=1", "record.every_updates=10"),
-        "record.tensorboard=false",
+        "record.trackers=[]",
     ]
     live = prepare_new(path, None, None, settings).open()
     interrupted(live, lambda: live.progress.env_steps >= 60)

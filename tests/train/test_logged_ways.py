@@ -158,7 +158,7 @@ def test_a_runs_evaluations_drive_logged_ways_on_request(panel: Panel, tmp_path:
     line = [*LOGGED_TRAINING, "--panel", str(panel.path)]
     line += ["--set", "env.num_envs=4", "--set", "schedule.offline_updates=2"]
     line += ["--set", "network.hidden=[8]", "--set", "replay.batch_size=16"]
-    line += ["--set", "evaluation.episodes=2", "--set", "record.tensorboard=false"]
+    line += ["--set", "evaluation.episodes=2", "--set", "record.trackers=[]"]
     line += ["--set", "env.conditions={nominal=1.0}", "--env-steps", "40"]
     assert main([*line, "--out", str(tmp_path / "run")]) == 0
     driven = read_table(tmp_path / "run" / "evaluations.parquet").to_pylist()

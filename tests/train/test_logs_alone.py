@@ -12,7 +12,7 @@ from restock.train.twin.env import vector_env
 
 TINY = [
     *("schedule.offline_updates=30", "network.hidden=[8]", "replay.batch_size=16"),
-    *("record.tensorboard=false", "record.every_updates=10"),
+    *("record.trackers=[]", "record.every_updates=10"),
 ]
 
 

@@ -305,7 +305,7 @@ def test_resumed_run_says_that_its_budget_is_used_up(undisturbed: Session, tmp_p
 
 
 def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path) -> None:
-    settings = config(schedule={"env_steps": 1200}, record={"tensorboard": True})
+    settings = config(schedule={"env_steps": 1200}, record={"trackers": ["tensorboard"]})
     done = session(tmp_path / "run", settings)
     outcome = train(done)
     done.close()

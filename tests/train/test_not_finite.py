@@ -25,7 +25,7 @@ from restock.train.run.run import Run
 TINY = [
     *("--set", "env.num_envs=4", "--set", "schedule.offline_updates=30"),
     *("--set", "network.hidden=[32, 32]", "--set", "evaluation.episodes=1"),
-    *("--set", "record.every_updates=20", "--set", "record.tensorboard=false"),
+    *("--set", "record.every_updates=20", "--set", "record.trackers=[]"),
     *("--set", "replay.batch_size=32", "--env-steps", "80"),
 ]
 

@@ -205,7 +205,7 @@ def test_training_evaluates_off_policy_before_it_drives(panel, tmp_path, quick_m
     path = tmp_path / "run"
     argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]
     small = ["schedule.offline_updates=3", "network.hidden=[8]", "evaluation.episodes=1"]
-    small += ["record.tensorboard=false", "evaluation.off_policy=true", "replay.batch_size=8"]
+    small += ["record.trackers=[]", "evaluation.off_policy=true", "replay.batch_size=8"]
     assert main([*argv, *(flag for value in small for flag in ("--set", value))]) == 0
     rows = pq.read_table(path / "off_policy.parquet").to_pylist()
     assert {row["measure"] for row in rows} == {"return", "success"}

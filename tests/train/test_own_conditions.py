@@ -33,7 +33,7 @@ unit = "V"
 SMALL = [
     *("schedule.env_steps=500", "schedule.offline_updates=10", "schedule.warmup_env_steps=100"),
     *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=500"),
-    *("record.tensorboard=false", "network.hidden=[16]"),
+    *("record.trackers=[]", "network.hidden=[16]"),
 ]
 
 

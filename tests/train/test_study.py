@@ -26,7 +26,7 @@ schedule.warmup_env_steps = 150
 schedule.updates_per_env_step = 0.1
 evaluation.every_env_steps = 400
 evaluation.episodes = 1
-record.tensorboard = false
+record.trackers = []
 [evaluation]
 episodes = 1
 [[arms]]

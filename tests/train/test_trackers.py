@@ -70,7 +70,7 @@ def test_training_ends_as_ever_where_a_tracker_fails(tmp_path, monkeypatch, caps
     def refuses() -> Broken:
         raise OSError("no route to host")
 
-    def sinks(run: Run, names: Any) -> dict[str, Any]:
+    def sinks(run: Run, names: Any, from_step: int | None) -> dict[str, Any]:
         return {"wandb": refuses, "mlflow": Broken} if names else {}
 
     monkeypatch.setattr("restock.train.session.tracker_sinks", sinks)

@@ -30,7 +30,7 @@ TINY = [
     *("--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=100"),
     *("--set", "schedule.offline_updates=30", "--set", "network.hidden=[32, 32]"),
     *("--set", "evaluation.episodes=1", "--set", "record.every_updates=20"),
-    *("--set", "record.tensorboard=false", "--set", "replay.batch_size=32"),
+    *("--set", "record.trackers=[]", "--set", "replay.batch_size=32"),
     *("--set", "record.audit_share=0.2"),
 ]
 

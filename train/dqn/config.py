@@ -212,8 +212,7 @@ class RecordConfig(Checked, frozen=True):
     every_updates: Count = 500  # length of a logging interval
     audit_share: Share = 0.01  # share of batches whose rows are all recorded
     checkpoint_every_env_steps: Count = 40_000
-    tensorboard: bool = True
-    trackers: tuple[Literal["wandb", "mlflow"], ...] = ()  # trackers that also get the curves
+    trackers: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ("tensorboard",)  # of curves
 
 
 class TrainConfig(Checked, frozen=True):

@@ -197,9 +197,12 @@ def require_trackers(names: Sequence[str]) -> None:
             )
 
 
-def tracker_sinks(run: Run, names: Sequence[str]) -> dict[str, Callable[[], Sink]]:
-    """Return a function per tracker that opens it for a new or resumed run."""
+def tracker_sinks(
+    run: Run, names: Sequence[str], from_step: int | None = None
+) -> dict[str, Callable[[], Sink]]:
+    """Return a function per tracker that opens it; `from_step` is where a run is resumed."""
     kinds: dict[str, Callable[[], Sink]] = {
+        "tensorboard": lambda: TensorBoard(run.path / "tensorboard", from_step),
         "wandb": lambda: WandbSink(run),
         "mlflow": lambda: MlflowSink(run),
     }
