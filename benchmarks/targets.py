@@ -67,10 +67,11 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=300, help="of each kind, as they are")
     options = parser.parse_args()
     few = (4, 4, 4) if options.quick else (options.episodes, 60, 100)
-    settings = [*SETTINGS, f"schedule.env_steps={BUDGETS[options.budget]}"]
-    alone = options.teacher == "planner"
+    steps, alone = BUDGETS[options.budget], options.teacher == "planner"
     if alone:  # nobody is queried, so as long a time has a third more steps
-        settings.append(f"schedule.env_steps={BUDGETS[options.budget] * 4 // 3}")
+        steps = steps * 4 // 3
+    settings = [*SETTINGS, f"schedule.env_steps={steps}"]
+    if alone:
         settings += ["teacher.source=planner", *RARELY_AND_WELL]
     if options.quick:
         settings += ["schedule.env_steps=2000", "schedule.offline_updates=200"]

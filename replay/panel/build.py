@@ -16,6 +16,7 @@ from threading import Event
 
 import duckdb
 import msgspec
+import numpy as np
 import pyarrow as pa
 
 from restock import __version__
@@ -217,7 +218,7 @@ def _fill(
     """Put rows as a store has them in place of `given`; return those left out, by reason."""
     if not isinstance(table, pa.Table):  # a frame of pandas or Polars
         table = pa.table(table)
-    connection.register("given", table.append_column("place", pa.array(range(len(table)))))
+    connection.register("given", table.append_column("place", pa.array(np.arange(len(table)))))
     try:
         connection.execute((files("restock.replay.panel") / "any_table.sql").read_text("utf-8"))
     except duckdb.Error as error:

@@ -273,10 +273,11 @@ def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
     assert "--out" not in said
 
 
-def test_an_experiment_repeats_a_run_without_a_teacher(tmp_path, monkeypatch):
+@pytest.mark.parametrize("source", ["none", "planner"])
+def test_an_experiment_repeats_a_run_without_a_teacher(source, tmp_path, monkeypatch):
     """Its config has the other settings of `teacher`, resolved, which nobody may give."""
     run = make_run(tmp_path / "r", lag=0.9)
-    run.document["config"]["teacher"] |= {"source": "none", "successes": False, "ratio": 0.2}
+    run.document["config"]["teacher"] |= {"source": source, "successes": False, "ratio": 0.2}
     run.document["panel"] = None
     taught: list[TeacherConfig] = []
 
@@ -287,7 +288,7 @@ def test_an_experiment_repeats_a_run_without_a_teacher(tmp_path, monkeypatch):
     monkeypatch.setattr(Prepared, "open", stop)
     with pytest.raises(RunError, match="prepared"):
         confirm(run, diagnose([run]), tmp_path / "c")
-    assert (taught[0].source, taught[0].ratio) == ("none", TeacherConfig().ratio)
+    assert (taught[0].source, taught[0].ratio) == (source, TeacherConfig().ratio)
 
 
 @pytest.mark.parametrize(

@@ -244,16 +244,18 @@ class TrainConfig(Checked, frozen=True):
             )
 
 
+def has_effect(source: str | None, key: str) -> bool:
+    """Return whether a teacher of this source has the setting `teacher.<key>`."""
+    return source != "none" and (key == "margin") == (source == PLANNER)
+
+
 def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
     """Raise ConfigError where a setting of the teacher is given that its source does not have."""
-    keys = changed(teacher, source=teacher.source)
-    if teacher.source == PLANNER:
-        idle = [key for key in keys if key != "margin"]
-    else:
-        idle = keys if teacher.source == "none" else [key for key in keys if key == "margin"]
-    if idle:
+    source = teacher.source
+    if idle := [key for key in changed(teacher, source=source) if not has_effect(source, key)]:
+        named = "not given" if source is None else f'"{source}"'
         raise ConfigError(
-            f'has no effect where teacher.source is "{teacher.source}"',
+            f"has no effect where teacher.source is {named}",
             where=f"{within}teacher.{idle[0]}",
             remedy="leave it out, or set teacher.source",
         )

@@ -44,7 +44,7 @@ def make_learner(config: TrainConfig, task: Task, *, path: UpdatePath | None = N
 
 
 class GreedyPolicy:
-    """A Q network that always takes its best action, or its best plausible one if filtered."""
+    """A policy network that always takes its best action."""
 
     name = "agent"
 

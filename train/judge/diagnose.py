@@ -23,7 +23,14 @@ from typing import Any
 import msgspec
 
 from restock.errors import RestockError, RunError, counted
-from restock.train.dqn.config import Polyak, TargetRule, apply_overrides, as_overrides, parse_config
+from restock.train.dqn.config import (
+    Polyak,
+    TargetRule,
+    apply_overrides,
+    as_overrides,
+    has_effect,
+    parse_config,
+)
 from restock.train.judge.before_training import RowDiagnosis, diagnose_before_training
 from restock.train.judge.comparability import refuse_dependent
 from restock.train.judge.windows import (
@@ -324,9 +331,10 @@ def confirm(
     if what is not None:
         raise RunError(f"is {cause}: {what}", where=where, remedy=remedy)
     panel = run.document["panel"]
-    if config["teacher"]["source"] == "none":  # its other settings, resolved, have no effect
-        config = config | {"teacher": {"source": "none"}}
-    settings = as_overrides(config) + changed
+    given = config["teacher"]  # resolved, with settings that its source does not have
+    has = {"source", *(key for key in given if has_effect(given["source"], key))}
+    taught = {key: value for key, value in given.items() if key in has}
+    settings = as_overrides(config | {"teacher": taught}) + changed
     prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)
     session = prepared.open()
     try:
