@@ -111,7 +111,7 @@ def lidar(change: Callable[[np.ndarray], np.ndarray], share: float = 1.0) -> Sig
 
 
 def frozen(share: float) -> Signalled:
-    """A lidar that repeats its first scan of a mission, in a share of the missions."""
+    """Return a lidar that repeats its first scan of a mission, in a share of the missions."""
 
     def plant(filling: Filling, rng: Draws) -> None:
         mission = number(filling)
@@ -337,7 +337,7 @@ def twice(share: float) -> Rowed:
 
 
 def other_policy(share: float) -> Rowed:
-    """The planner's episodes under the operator's name, and the other way round."""
+    """Store the planner's episodes under the operator's name, and the other way round."""
 
     def plant(rows: pa.Table, rng: Draws) -> pa.Table:
         episode = rows["episode_index"].to_numpy()
@@ -357,7 +357,7 @@ def _successes(rows: pa.Table) -> tuple[np.ndarray, np.ndarray]:
 
 
 def only_failures(condition: str, share: float) -> Rowed:
-    """A condition's episodes without a share of those that succeeded."""
+    """Remove from a condition's episodes a share of those that succeeded."""
 
     def plant(rows: pa.Table, rng: Draws) -> pa.Table:
         episode, success = _successes(rows)

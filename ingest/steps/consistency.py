@@ -29,6 +29,9 @@ TURNS_RAD = 0.3  # in a window
 STEPS_PER_WINDOW = 2 / 3  # of its time that must be known
 BEYOND, BEYOND_MPS = 1.5, 0.1  # times the fastest command or wheels, and a margin
 OFTEN = 0.02  # of the steps
+SPIKE = 3.0  # times what commands and poses reach
+SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # beyond that: a robot may be carried
+SPIKES = 0.1  # of the messages, at most: more are another scale
 MIN_STEPS = 5
 JUMP_M = 0.2  # further than that, less is the localiser's noise
 LEADS, SURE = 0.03, 0.8  # of a correlation: how much better it is, and how good
@@ -46,7 +49,7 @@ MIN_FOLLOWED = 150  # steps: in fewer, two unrelated motions may look alike
 class Finding:
     """A contradiction between a topic and the rest of its recording."""
 
-    kind: str  # clock, sources, wheels, gyro or order
+    kind: str  # clock, sources, wheels, gyro, rates or order
     topic: str
     what: str  # with its size
     steps: int  # ticks concerned
@@ -132,6 +135,7 @@ def findings_of(
         found += _compared(
             turned, ("gyro", topics["imu"], "its yaw rate", topics["pose"]), len(problem)
         )
+    found += _spikes(aligned.inputs, drive)
     found += _order(drive, topics["command"], topics.get("wheels", topics["pose"]), period_s)
     return found + _scans(drive, [*profile.inputs.scans], topics, period_s)
 
@@ -256,6 +260,47 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
         "gyro": "leave out [inputs.imu], or correct what publishes it",
     }[kind]
     return [Finding(kind, topic, said, steps, cause, remedy)]
+
+
+def _spikes(inputs: InputColumns, drive: Drive) -> list[Finding]:
+    """Find messages whose speed or turn neither commands nor poses come near."""
+    yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
+    turned = wrap_angle(yaw - np.roll(yaw, 1)) / np.where(drive.joined, drive.seconds, np.inf)
+    of_poses = {"speed_mps": drive.signals["localised_speed_mps"], "yaw_rate_radps": turned}
+    found = []
+    for name, key, signal in (
+        ("wheels", "speed_mps", "wheel_speed_mps"),
+        ("wheels", "yaw_rate_radps", "wheel_yaw_rate_radps"),
+        ("imu", "yaw_rate_radps", "gyro_yaw_rate_radps"),
+    ):
+        source = inputs.by_name.get(name)
+        if source is None or key not in source.fields or not drive.joined.any():
+            continue
+        moved = np.percentile(np.abs(of_poses[key])[drive.joined], 99)
+        most = max(float(np.abs(drive.signals[f"command_{key}"]).max()), float(moved))
+        reported = inputs.numbers(name, key)
+        limit = SPIKE * most + SPIKE_MARGIN[key]
+        beyond = np.abs(reported) > limit
+        if not 0 < beyond.sum() <= SPIKES * len(reported):
+            continue
+        size, unit = float(np.median(np.abs(reported[beyond]))), key.split("_")[-1]
+        period_s = float(np.median(np.diff(inputs.topics[source.topic].log_time_ns))) / NS
+        wraps = unit == "radps" and abs(size * period_s - 2 * np.pi) < 0.1 * 2 * np.pi
+        found.append(
+            Finding(
+                "rates",
+                source.topic,
+                f"{int(beyond.sum()):,} of {counted(len(reported), 'message')} report"
+                f" {size:.3g} {unit[:-2]}/s (median), where commands and poses stay below"
+                f" {most:.2g} {unit[:-2]}/s",
+                int((np.abs(drive.signals[signal]) > limit).sum()),
+                "the driver differentiates a heading across its wrap at pi"
+                if wraps
+                else "single values that nothing else shows",
+                "correct what publishes it, or take the speeds from the poses ([motion])",
+            )
+        )
+    return found
 
 
 def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Finding]:

@@ -109,6 +109,14 @@ def two_frames(topics: Topics) -> Topics:
     return {**topics, "/odom": replace(one, fields={**one.fields, "header.frame_id": frames})}
 
 
+def wrapped(topics: Topics) -> Topics:
+    """Return the same with three turns of 125 rad/s: a heading differentiated across its wrap."""
+    one = topics["/odom"]
+    rate = np.asarray(one.fields[RATE]).copy()
+    rate[[100, 301, 500]] -= 2 * np.pi / 0.05
+    return {**topics, "/odom": replace(one, fields={**one.fields, RATE: rate})}
+
+
 def slipping(topics: Topics) -> Topics:
     """Return the same, with wheels that turn twice as fast for a third of the time."""
     one = topics["/odom"]
@@ -236,6 +244,7 @@ WRONG = {
     "rate": (lambda t: scaled(t, "/odom", -1, RATE), "wheels", "/odom", "its yaw rate is -1"),
     "degrees": (lambda t: scaled(t, "/imu", 57.3, GYRO), "gyro", "/imu", "57 times"),
     "no gyro": (lambda t: scaled(t, "/imu", 0, GYRO), "gyro", "/imu", "stays at 0"),
+    "wrapped": (wrapped, "rates", "/odom", "3 of 900 messages report 125 rad/s (median), where"),
     "late odometry": (lambda t: shifted(t, "/odom", -0.6), "order", "/odom", "before the commands"),
 }
 
