@@ -181,13 +181,13 @@ def _make_stores(store: Path, logs: Logs, hours: int, workers: int, small: bool)
         if missions
     ]
     if logs.archive is None:
-        _make_store(store, [*day, *incidents], workers)
+        make_store(store, [*day, *incidents], workers)
     else:
-        _make_store(store, day, workers)
-        _make_store(store.with_name(logs.archive), incidents, workers)
+        make_store(store, day, workers)
+        make_store(store.with_name(logs.archive), incidents, workers)
 
 
-def _make_store(store: Path, requested: list[tuple[Path, list[str], str]], workers: int) -> None:
+def make_store(store: Path, requested: list[tuple[Path, list[str], str]], workers: int) -> None:
     """Make a store of recordings, given their paths, flags and conditions."""
 
     def make() -> None:
