@@ -1,9 +1,11 @@
-"""What can be queried: a store, a run directory or a panel, each as views of one connection."""
+"""What can be queried: a store, a run, a panel or recordings, as views of one connection."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from glob import has_magic
 from importlib import resources
 from pathlib import Path
 
@@ -12,12 +14,12 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from restock.errors import RunError, StoreError
+from restock.errors import RecordingError, RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import REMAKE, read_parquet
-from restock.replay.store.store import Store, is_store
+from restock.replay.store.store import Store, is_store, set_memory_limit
 
 RUN_CONFIG = "config.json"
 
@@ -29,19 +31,23 @@ def open_place(
     beside: Mapping[str, str | Path] | None = None,
     only_store: bool = False,
     opened: Callable[[Store], None] = lambda store: None,
+    lost: Callable[[str], None] = lambda loss: None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Yield a connection with the views of a store, a run or a panel.
+    """Yield a connection with the views of a store, a run or a panel, or the topics of recordings.
 
-    Query it with `query` or `install_named`, which make the store's views that a text names.
+    Query it with `query` or `install_named`, which make those views that a text names.
 
     Args:
-        path: the place: a folder, or `s3://bucket/prefix` for a store; `store@12` for a version.
+        path: the place: a folder, or `s3://bucket/prefix` for a store; `store@12` for a version; a
+            recording, a folder of recordings, or a glob.
         beside: a run and a panel, each under a schema of its own: `{"run": "runs/a"}` gives
             `run.audit`, `{"panel": "panel"}` gives `panel.rows`.
         only_store: take nothing but a store.
         opened: called with the store before it is queried: `Store.verify` verifies its files.
+        lost: called with each loss of recordings: damage, or messages of a topic that was read.
 
     Raises:
+        RecordingError: a file that is no recording, or a folder without one that can be opened.
         StoreError: there is nothing that can be queried, or no such version; or what is beside it
             is no run or panel, or has logged rows, all of them of recordings that the store does
             not hold.
@@ -58,20 +64,44 @@ def open_place(
         return
     place.expect_both_tables()
     path = place.folder
-    if not path.exists():
+    found = path.exists() or has_magic(str(path))
+    if not found:
         raise StoreError("it does not exist", where=str(path), remedy=place.remedy_if_absent())
     if place.version is not None:
         raise StoreError("only a store has versions", where=str(path), remedy="leave out the @")
-    with duckdb.connect() as connection:
-        if _add(connection, path, "main") is None:
-            raise StoreError(
-                "it is not a store, a run or a panel",
-                where=str(path),
-                remedy=place.remedy_if_absent(),
-            )
+    with (
+        tempfile.TemporaryDirectory(prefix="restock-") as spill,
+        duckdb.connect(config={"temp_directory": spill}) as connection,
+    ):
+        set_memory_limit(connection, where=path)
+        topics = None
+        if path.is_dir() and _add(connection, path, "main") is not None:
+            _list_columns(connection)
+        else:
+            topics = _topics(connection, path, lost, remedy=place.remedy_if_absent())
         _add_all(connection, beside)
-        _list_columns(connection)
         yield connection
+        del topics  # its tables are made on demand as long as it is there
+
+
+def _topics(
+    connection: duckdb.DuckDBPyConnection, path: Path, lost: Callable[[str], None], *, remedy: str
+) -> object:
+    """Make the topics of recordings tables; return what makes them."""
+    from restock.ingest.containers.open_recording import recordings_in
+    from restock.replay.topics import Topics  # with it comes rosbags
+
+    try:
+        recordings_in(path)
+    except RecordingError as error:
+        if not path.is_dir():
+            raise
+        raise StoreError(
+            "it is not a store, a run or a panel, and holds no recording",
+            where=str(path),
+            remedy=remedy,
+        ) from error
+    return Topics(connection, path, lost)
 
 
 def add_computed_tables(store: Store) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -318,19 +317,23 @@ class Recording:
     def batches(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[Ints, Fields]]:
         """Yield log times (N,) and columns of these fields, some messages of a topic at a time.
 
-        They come in file order. What cannot be decoded is left out; `read` accounts for it.
+        They come in file order. What cannot be decoded is left out: after the last, `accounts` says
+        how much that is, unless `read` has said so before.
         """
         self._expect_open()
+        reading = TopicReading(self.topics[topic], fields)
         for storage in self._storages:
             decoders: dict[int, Decoder] = {}
             for stream in self._channels(topic):
                 if stream.storage is storage:
-                    with suppress(CannotDecode):
+                    try:
                         decoders[stream.channel.id] = self._decoder(topic, stream, fields)
+                    except CannotDecode as reason:
+                        reading.skip(str(reason), storage.counts.get(stream.channel.id, 0))
             for channel, batch in storage.batches(list(decoders)):
-                for plain, _ in decompressed(batch):
-                    decoded = decoders[channel].decode(plain)
+                for plain, decoded in reading.decoded(decoders[channel].decode, batch):
                     yield plain.log_time_ns[decoded.rows], decoded.fields
+        self.accounts.setdefault(topic, reading.close(self._lost(topic)))
 
     def raw_between(self, low_ns: int, high_ns: int) -> list[RawMessage]:
         """Return messages logged in [low_ns, high_ns] and those in force before, by log time.

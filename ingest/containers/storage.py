@@ -406,24 +406,29 @@ class TopicReading:
 
     def take(self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch) -> None:
         """Decode a batch and keep its columns."""
-        self._account.read += len(batch)
+        for plain, decoded in self.decoded(decode, batch):
+            rows = decoded.rows
+            self._add_times(plain.log_time_ns[rows], plain.publish_time_ns[rows])
+            for path, column in self._kept(decoded.fields).items():
+                self._fields[path].add(column, self._account.expected)
+
+    def decoded(
+        self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch
+    ) -> Iterator[tuple[MessageBatch, Decoded]]:
+        """Yield what a batch decodes to, in pieces, and account for it."""
+        account = self._account
+        account.read += len(batch)
         for plain, damaged in decompressed(batch):
             if damaged:
                 self._add({"its zstd data is damaged": damaged})
-            self._take(decode, plain)
-
-    def _take(self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch) -> None:
-        account = self._account
-        sane = (batch.log_time_ns >= 0) & (batch.log_time_ns < LATEST_NS)
-        if not sane.all():
-            self._add({IMPLAUSIBLE: int((~sane).sum())})
-            batch = batch.select(np.flatnonzero(sane))
-        decoded = decode(batch)
-        self._add(decoded.bad)
-        account.decoded += len(decoded.rows)
-        self._add_times(batch.log_time_ns[decoded.rows], batch.publish_time_ns[decoded.rows])
-        for path, column in self._kept(decoded.fields).items():
-            self._fields[path].add(column, account.expected)
+            sane = (plain.log_time_ns >= 0) & (plain.log_time_ns < LATEST_NS)
+            if not sane.all():
+                self._add({IMPLAUSIBLE: int((~sane).sum())})
+                plain = plain.select(np.flatnonzero(sane))
+            decoded = decode(plain)
+            self._add(decoded.bad)
+            account.decoded += len(decoded.rows)
+            yield plain, decoded
 
     def _add_times(self, log_ns: Ints, publish_ns: Ints) -> None:
         if self._publish is None and not np.array_equal(log_ns, publish_ns):

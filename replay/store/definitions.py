@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.resources import files
+from typing import Protocol
 from weakref import WeakKeyDictionary, ref
 
 import duckdb
@@ -161,7 +162,7 @@ FEW_ROWS = 100_000  # of about 1 kB
 FEW_SUMMARISED_ROWS = 2_000_000  # of about 50 bytes
 _INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.sql
 # A text with one of these words lists what there is.
-_LISTS = {
+LISTS = {
     "columns",
     "information_schema",
     "duckdb_views",
@@ -214,11 +215,12 @@ class Definitions:
         self._made: set[str] = set()
         self._held: list[str] = []
         _OF[connection] = ref(self)
+        make_on_demand(connection, self)
 
     def make(self, text: str) -> None:
         """Create the views that a query names, or all of them if it lists views."""
         words = set(re.findall(r"\w+", text.lower()))
-        if words & _LISTS:
+        if words & LISTS:
             self.make_all()
             return
         self._make(words)
@@ -281,8 +283,29 @@ class Definitions:
             )
 
 
+class Maker(Protocol):
+    """Makes tables and views of a connection when a query names them."""
+
+    def make(self, text: str) -> None:
+        """Make what a text names."""
+
+    def make_all(self) -> None:
+        """Make all there are."""
+
+
 # Weakly both ways: they hold their store, and with it the connection.
 _OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDictionary()
+_MAKERS: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Maker]] = WeakKeyDictionary()
+
+
+def make_on_demand(connection: duckdb.DuckDBPyConnection, maker: Maker) -> None:
+    """Let a maker look at each query of a connection before it runs, as long as it lives."""
+    _MAKERS[connection] = ref(maker)
+
+
+def _maker(connection: duckdb.DuckDBPyConnection) -> Maker | None:
+    made = _MAKERS.get(connection)
+    return None if made is None else made()
 
 
 def _of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
@@ -291,8 +314,8 @@ def _of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
 
 
 def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
-    """Make what a text names, on a store's connection; a run's or a panel's has all it has."""
-    if (made := _of(connection)) is not None:
+    """Make what a text names of a store or of recordings; a run or a panel has all it has."""
+    if (made := _maker(connection)) is not None:
         made.make(text)
 
 
@@ -336,8 +359,8 @@ def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
 
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Make all there are; False for a connection that is not a store's."""
-    made = _of(connection)
+    """Make all there are; False for a connection on which nothing is made on demand."""
+    made = _maker(connection)
     if made is not None:
         made.make_all()
     return made is not None

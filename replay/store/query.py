@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from difflib import get_close_matches
 from functools import partial
 from itertools import count
+from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -80,7 +82,7 @@ def query(
         last = _counted(connection, statements[-1].query)
         relation = _named(connection, partial(connection.sql, last))
     except duckdb.Error as error:
-        raise _translated(error, where) from error
+        raise _translated(error, where, connection) from error
     if relation is None:
         raise QueryError(
             "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
@@ -175,9 +177,28 @@ def fetch(
             count = len(rows) if len(rows) <= at_most else len(relation)
             return _distinct(relation.columns), rows[:at_most], count
         except duckdb.Error as error:
-            raise _translated(error, where) from error
+            raise _translated(error, where, connection) from error
 
     return interruptible(connection, run)
+
+
+def write_parquet(
+    connection: duckdb.DuckDBPyConnection, text: str, path: Path, *, where: str
+) -> None:
+    """Write the rows of a query to a Parquet file, as they come.
+
+    Raises:
+        QueryError: as `fetch` does.
+    """
+
+    def run() -> None:
+        relation = query(connection, text, where=where, alone=True)
+        try:
+            relation.write_parquet(str(path))
+        except duckdb.Error as error:
+            raise _translated(error, where, connection) from error
+
+    interruptible(connection, run)
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
@@ -239,10 +260,30 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
                 raise
 
 
-def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
+def _translated(
+    error: duckdb.Error, where: str, connection: duckdb.DuckDBPyConnection
+) -> QueryError | StoreError:
     """Turn DuckDB's error into one about the query, or about a file that it could not read."""
-    said = QueryError(_message(error), where=where, remedy=hint(error))
+    remedy = hint(error)
+    if (near := _nearest(error, connection)) and remedy:
+        remedy = f"the nearest names are {near}; {remedy}"
+    said = QueryError(_message(error), where=where, remedy=remedy)
     return damage(error, where=where) or said
+
+
+_NO_TABLE = re.compile(r"Table with name (.+?) does not exist!")
+
+
+def _nearest(error: duckdb.Error, connection: duckdb.DuckDBPyConnection) -> str:
+    """Return the names that are most like that of a missing table, as SQL writes them, or ""."""
+    missing = _NO_TABLE.search(str(error))
+    if not isinstance(error, duckdb.CatalogException) or not missing:
+        return ""
+    views = connection.execute(
+        "SELECT view_name FROM duckdb_views() WHERE NOT internal AND view_name NOT LIKE 'stored_%'"
+    ).fetchall()
+    near = get_close_matches(missing[1], [name for (name,) in views], n=4, cutoff=0.5)
+    return ", ".join(name if name.isidentifier() else f'"{name}"' for name in near)
 
 
 def _message(error: duckdb.Error) -> str:

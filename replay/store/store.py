@@ -122,8 +122,7 @@ class Store:
                 "disabled_optimizers": AS_WRITTEN,
             }
         )
-        if limit := memory_limit or os.environ.get(MEMORY_LIMIT):
-            self._set_memory(limit)
+        set_memory_limit(self.bare, memory_limit, where=self.path)
         try:
             held = stored_files(self.path, TRANSITIONS, transitions)
             self._ingests = ingests_table(held)
@@ -429,19 +428,29 @@ class Store:
             files = frame_files(self._manifests.filter(held))
         return StoredTable(self.path, "stored_frames", FRAMES, frame_schema(), files)
 
-    def _set_memory(self, limit: str) -> None:
-        if _UNLIMITED_OR_ZERO.match(limit):
-            raise StoreError(
-                f"the memory limit {limit!r} is not a positive size",
-                where=str(self.path),
-                remedy=_MEMORY_REMEDY,
-            )
-        try:
-            self.bare.execute(f"SET memory_limit = '{limit}'")
-        except duckdb.Error as error:
-            raise StoreError(
-                f"no memory limit {limit!r}", where=str(self.path), remedy=_MEMORY_REMEDY
-            ) from error
+
+def set_memory_limit(
+    connection: duckdb.DuckDBPyConnection, limit: str | None = None, *, where: object
+) -> None:
+    """Bound what DuckDB holds in memory; without a limit, by RESTOCK_MEMORY_LIMIT if it is set.
+
+    Raises StoreError where it is not a size.
+    """
+    limit = limit or os.environ.get(MEMORY_LIMIT)
+    if not limit:
+        return
+    if _UNLIMITED_OR_ZERO.match(limit):
+        raise StoreError(
+            f"the memory limit {limit!r} is not a positive size",
+            where=str(where),
+            remedy=_MEMORY_REMEDY,
+        )
+    try:
+        connection.execute(f"SET memory_limit = '{limit}'")
+    except duckdb.Error as error:
+        raise StoreError(
+            f"no memory limit {limit!r}", where=str(where), remedy=_MEMORY_REMEDY
+        ) from error
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
@@ -525,7 +534,8 @@ def export_views(store: Store, out: str | Path) -> Path:
     out = Path(out)
     if out.suffix not in (".sql", ".duckdb"):
         raise StoreError(f"no export to {out.suffix or 'a file without an ending'}", where=str(out),
-                         remedy="name it .sql (for `duckdb -init`) or .duckdb")  # fmt: skip
+                         remedy="name it .sql (for `duckdb -init`) or .duckdb; or give a query,"
+                         " whose rows go to a .parquet, .csv or .json file")  # fmt: skip
     if out.exists():
         raise StoreError(
             "already there", where=str(out), remedy="choose another name, or remove it"

@@ -38,6 +38,20 @@ def visible(text: str, keep: str = "") -> str:
     )
 
 
+def spreadsheet_safe(value: object) -> object:
+    """Return a CSV cell, with a `'` before text that a spreadsheet would run as a formula.
+
+    Names of files and topics may begin with `=`. Text that is a number stays as it is.
+    """
+    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
+
+
 def print_traceback(error: Exception) -> None:
     """Print an error's traceback on stderr if the environment asks for it."""
     if os.environ.get(TRACEBACK):

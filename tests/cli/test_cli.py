@@ -111,19 +111,37 @@ def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(sample_rows, monkey
     assert lines[-1].split()[0] == "99"
     assert lines[-1].endswith(r"[a]\nb")
     assert lines[-1].count(",") == 29
-    few = f"FROM ({query}) LIMIT 3"
-    assert cli.main(["sql", str(store), few]) == 0
-    lines = capsys.readouterr().out.splitlines()  # too wide for a table: one below the other
-    assert [line for line in lines if line.startswith("row ")] == ["row 1", "row 2", "row 3"]
-    assert max(map(len, lines)) <= 120
+    assert cli.main(["sql", str(store), f"FROM ({query}) LIMIT 2 \\G"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["row", "number", "numbers", "text"] * 2
 
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     assert cli.main(["sql", str(store), query]) == 0
     shown, said = capsys.readouterr()
-    assert "… 30 in all" in shown
-    assert " 39 " in shown
-    assert " 40 " not in shown
+    assert [line.split()[0] for line in shown.splitlines()[2:]] == [str(n) for n in range(40)]
     assert "100 rows, 40 shown" in said
+    assert cli.main(["sql", str(store), f"FROM ({query}) LIMIT 1 \\G"]) == 0
+    assert "… 30 in all" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("columns", "shown"), [(80, 8), (40, 3)])
+def test_a_terminal_leaves_out_columns_in_the_middle(
+    store_path, columns, shown, monkeypatch, capsys
+):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    named = ", ".join(f"{number} AS c_{number}" for number in range(1, 20))
+    query = f"SELECT NULL AS first, {named}, {{'a': [1, NULL]}} AS last"
+    assert cli.main(["sql", str(store_path), query]) == 0
+    out, err = capsys.readouterr()
+    header, _, row = out.splitlines()
+    assert max(map(len, out.splitlines())) <= columns
+    assert header.split()[0] == "first"
+    assert header.split()[-1] == "last"
+    assert header.split().count("…") == 1
+    assert row.split()[0] == "NULL"
+    assert row.endswith("{a: [1, NULL]}")
+    assert f"21 columns, {len(header.split()) - 1} shown" in err
 
 
 @pytest.fixture

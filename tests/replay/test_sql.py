@@ -179,6 +179,38 @@ def test_without_a_query_there_is_a_prompt(store_path, capsys, monkeypatch):
     assert "nope" in captured.err
 
 
+def test_the_prompt_has_help_and_lists_tables(store_path, capsys, monkeypatch):
+    lines = iter([".help", ".tables", r"SELECT 7 AS seven \G", ".quit"])
+    monkeypatch.setattr("builtins.input", lambda prompt: next(lines))
+    monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    assert cli.main(["sql", str(store_path)]) == 0
+    captured = capsys.readouterr()
+    assert ".tables" in captured.err
+    assert {"transitions", "coverage"} <= {line.split()[0] for line in captured.out.splitlines()}
+    assert captured.out.endswith("row 1\n  seven  7\n")
+
+
+@pytest.mark.parametrize("ending", ["parquet", "csv", "json"])
+def test_rows_are_written_to_a_file_by_its_ending(store_path, tmp_path, capsys, ending):
+    out = tmp_path / f"rows.{ending}"
+    query = "SELECT range::INT AS n, '=' || range AS text, {'a': [range]} AS nested FROM range(2)"
+    line = ["sql", str(store_path), query, "--export", str(out)]
+    assert cli.main(line) == 0
+    assert [path.name for path in tmp_path.glob("*rows*")] == [out.name]
+    if ending == "csv":
+        found = out.read_text().splitlines()
+        assert found == ["n,text,nested", "0,'=0,{'a': [0]}", "1,'=1,{'a': [1]}"]
+    else:
+        rows = (
+            pq.read_table(out).to_pylist() if ending == "parquet" else json.loads(out.read_text())
+        )
+        assert rows == [{"n": n, "text": f"={n}", "nested": {"a": [n]}} for n in (0, 1)]
+    assert cli.main(line) == 2
+    assert "already there" in capsys.readouterr().err
+    assert cli.main([*line[:-1], str(tmp_path / "rows.txt")]) == 2
+    assert "name it .parquet, .csv or .json" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", one_in(2, ["views.sql", "views.duckdb"]))
 def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, capsys, name):
     out = tmp_path / name

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from restock.errors import counted, quoted, visible
+from restock.errors import counted, quoted, spreadsheet_safe, visible
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 PIPE_WIDTH = 120  # columns of a table in a file or a pipe: longer cells are wrapped, never cut
 GAP = 3  # columns between two columns of a table
+MAX_CELL = 40  # columns of a cell of a query's table on a terminal
 SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, to be searched
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
@@ -112,18 +113,20 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def print_json(value: Any) -> None:
-    """Print one JSON document to stdout."""
-    sys.stdout.write(json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n")
+def print_json(value: Any, file: TextIO | None = None) -> None:
+    """Print one JSON document to stdout, or to a file."""
+    (file or sys.stdout).write(json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n")
 
 
-def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None:
-    """Print a header and a line for each row to stdout."""
-    names = list(columns if columns is not None else rows[0] if rows else ())
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(names)
+def print_csv(rows: Sequence[Row], columns: Sequence[str], file: TextIO | None = None) -> None:
+    """Print a header and a line for each row to stdout, or to a file."""
+    writer = csv.writer(file or sys.stdout, lineterminator="\n")
+    writer.writerow(map(spreadsheet_safe, columns))
     writer.writerows(
-        [row[name] if isinstance(row[name], Decimal) else plain(row[name]) for name in names]
+        [
+            row[name] if isinstance(row[name], Decimal) else spreadsheet_safe(plain(row[name]))
+            for name in columns
+        ]
         for row in rows
     )
 
@@ -284,17 +287,20 @@ def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
     return total <= PIPE_WIDTH
 
 
-def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
-    """Print a table for files and pipes: one line for each row, however wide."""
+def print_plain(rows: Sequence[Row], columns: Sequence[str], *, values: bool = False) -> None:
+    """Print a table for files and pipes: one line for each row, however wide.
+
+    With `values` of a query, NULL is shown, and no column is padded beyond PIPE_WIDTH.
+    """
     numeric = [_numeric(rows, name) for name in columns]
-    texts = [
-        [cell(row[name]).replace(r"\[", "[").replace("\n", r"\n") for name in columns]
-        for row in rows
-    ]
+    text = value_text if values else (lambda value: cell(value).replace(r"\[", "["))
+    texts = [[text(row[name]).replace("\n", r"\n") for name in columns] for row in rows]
     widths = [
         max([len(name), *(len(line[place]) for line in texts)])
         for place, name in enumerate(columns)
     ]
+    if values:
+        widths = [min(width, PIPE_WIDTH) for width in widths]
 
     def line(cells: Sequence[str]) -> str:
         parts = zip(cells, widths, numeric, strict=True)
@@ -303,6 +309,61 @@ def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
 
     rule = " " + "─" * (sum(widths) + 3 * max(len(widths) - 1, 0)) + "\n"
     sys.stdout.writelines([line(list(columns)), rule, *(line(one) for one in texts)])
+
+
+def print_elided(rows: Sequence[Row], columns: Sequence[str]) -> int:
+    """Print a query's rows on a terminal, a line each; return how many columns were left out.
+
+    Cells are cut at MAX_CELL. If columns do not fit even then, those in the middle are left out.
+    """
+    from rich.cells import cell_len, set_cell_size
+
+    numeric = [_numeric(rows, name) for name in columns]
+    lines = [list(map(visible, columns))]
+    lines += [[value_text(row[name]).replace("\n", r"\n") for name in columns] for row in rows]
+    widths = [min(max(map(cell_len, column)), MAX_CELL) for column in zip(*lines, strict=True)]
+    room, first, last = table_width(), len(columns), len(columns)
+    if sum(widths) + GAP * (len(widths) - 1) > room:
+        room, first = room - 1, 0  # "…" stands for what is left out
+        while first < last:
+            at_left = first <= len(columns) - last  # from both ends in turn
+            room -= widths[first if at_left else last - 1] + GAP
+            if room < 0:
+                break
+            first, last = first + at_left, last - (not at_left)
+    for number, line in enumerate(lines):
+        padded = []
+        for text, width, right in zip(line, widths, numeric, strict=True):
+            short = text if cell_len(text) <= width else set_cell_size(text, width - 1) + "…"
+            space = " " * (width - cell_len(short))
+            padded.append(space + short if right else short + space)
+        shown = [*padded[:first], *(["…"] if first < last else []), *padded[last:]]
+        sys.stdout.write((" " * GAP).join(shown).rstrip() + "\n")
+        if not number:
+            sys.stdout.write((" " * GAP).join("─" * cell_len(text) for text in shown) + "\n")
+    return last - first
+
+
+def print_records(rows: Sequence[Row], columns: Sequence[str]) -> None:
+    """Print a query's rows one below the other, a line for each column."""
+    width = max([len(visible(name)) for name in columns], default=0)
+    for number, row in enumerate(rows, start=1):
+        sys.stdout.write(f"row {number}\n")
+        for name in columns:
+            text = value_text(row[name]).replace("\n", r"\n")
+            sys.stdout.write(f"  {visible(name):<{width}}  {text}\n")
+
+
+def value_text(value: Any) -> str:
+    """Return a value of a query's row: NULL in words, lists in [], structs in {}."""
+    if value is None:
+        return "NULL"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(value_text, value))}]"
+    if isinstance(value, Mapping):
+        pairs = (f"{visible(str(name))}: {value_text(one)}" for name, one in value.items())
+        return f"{{{', '.join(pairs)}}}"
+    return cell(value).replace(r"\[", "[")
 
 
 def cell(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""`restock sql`: any question to a store, a run or a panel."""
+"""`restock sql`: any question to a store, a run, a panel or recordings."""
 
 from __future__ import annotations
 
@@ -10,33 +10,39 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import QueryError, StoreError
+from restock.errors import ExitCode, QueryError, StoreError
 from restock.process import went_on_after_interrupt
 
 if TYPE_CHECKING:
     import duckdb
 
 SHOWN_ROWS = 40  # on a terminal; a file or a pipe gets all
-EXPANDED_ROWS = 20  # at most so many rows too wide for the terminal are printed one below the other
-
-CUT_TO = 4  # values of a list that are shown, where it has more than twice as many
+CUT_TO = 4  # values of a list in a record that are shown if it has more than twice as many
+RECORDS = r"\G"  # ends a query instead of a semicolon, as in MySQL
+HELP = r"""End a query with ";", or with "\G" to see each row as a record.
+  .tables          the tables and views
+  FROM columns;    every column of theirs
+  Ctrl-C stops a query; Ctrl-D or .quit ends."""
+_TABLES = 'SELECT "view", count(*) AS columns FROM columns GROUP BY ALL ORDER BY ALL'
 
 
 @dataclass
 class SqlCommand:
-    """Query a store, a run directory or a panel, in DuckDB's SQL.
+    """Query a store, a run directory, a panel or recordings, in DuckDB's SQL.
 
     A store has the views transitions, recordings, episodes, coverage, coverage_by_condition,
     missing_cells, reward_mix, ages, label_overlap, versions, conditions, actions, drops, topics,
     label_scores, drift and signal_weeks; `restock sql STORE "FROM columns"` lists every column
     with its meaning. A run has its tables (progress, strata, ages, audit, …) and the view
-    replay_audit; a panel has `rows`, `strata` and `evaluation_split`.
-    A terminal shows the first 40 rows and shortens long lists; a file or a pipe gets everything.
-    Queries are read-only, and Ctrl-C stops a query. Without a query, a prompt opens.
+    replay_audit; a panel has `rows`, `strata` and `evaluation_split`. A recording, or a folder of
+    them, has a table for each topic, and `topics` lists them; only what a query names is decoded.
+    A terminal shows the first 40 rows, and the columns that fit; a query that ends with \\G shows
+    each row as a record. A file or a pipe gets everything. Queries are read-only, and Ctrl-C stops
+    a query. Without a query, a prompt opens. The exit code is 3 if recordings have lost messages.
     """
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """A store, a run directory or a panel."""
+    """A store, a run directory, a panel, a recording, or a folder of recordings."""
     second: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
     """Beside a store: a panel or a run whose tables the query can also use, as panel.rows,
     run.audit, …"""
@@ -49,33 +55,40 @@ class SqlCommand:
     csv: bool = False
     """Print CSV with a header."""
     export: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a store's views for use in any DuckDB: an init file (.sql) or a database (.duckdb)."""
+    """Write the rows of the query to a .parquet, .csv or .json file. Without a query, write a
+    store's views for use in any DuckDB: an init file (.sql) or a database (.duckdb)."""
 
-    def run(self) -> None:
-        """Run the query and print its rows."""
+    def run(self) -> int:
+        """Run the query and print or write its rows."""
         from restock.cli import output
         from restock.replay.places import beside_of, open_place
 
         place, others, query = self._places()
-        if self.json and self.csv:
-            raise QueryError("--json and --csv cannot be combined", remedy="choose one")
-        if self.export is not None:
+        if self.json + self.csv + (self.export is not None) > 1:
+            raise QueryError("--json, --csv and --export cannot be combined", remedy="choose one")
+        if self.export is not None and (query is None or self.export.suffix in (".sql", ".duckdb")):
             if query is not None or others:
                 raise QueryError(
-                    "--export writes a store's views, and runs no query", remedy="leave out one"
+                    "--export writes a store's views, and runs no query",
+                    remedy="leave out one, or name a .parquet, .csv or .json file for its rows",
                 )
             self._export(place, self.export)
-            return
+            return ExitCode.OK
+        losses: list[str] = []
         with open_place(
             place,
             beside=beside_of(others),
             opened=output.say_unverified,
+            lost=losses.append,
         ) as connection:
             if query is None and sys.stdin.isatty():
                 self._prompt(connection)
             else:
                 text = sys.stdin.read() if query in (None, "-") else query
                 self._answer(connection, text or "", alone=True)
+        for loss in losses:
+            sys.stderr.write(f"lost: {loss}\n")
+        return ExitCode.LOSSY if losses else ExitCode.OK
 
     def _answer(
         self, connection: duckdb.DuckDBPyConnection, text: str, *, alone: bool = False
@@ -83,6 +96,11 @@ class SqlCommand:
         from restock.cli import output
         from restock.replay.store.query import fetch
 
+        text = text.rstrip()
+        records, text = text.endswith(RECORDS), text.removesuffix(RECORDS)
+        if self.export is not None:
+            self._write(connection, text, self.export)
+            return
         terminal = sys.stdout.isatty() and not (self.json or self.csv)
         columns, values, count = fetch(
             connection,
@@ -92,43 +110,77 @@ class SqlCommand:
             alone=alone,
         )
         rows = [dict(zip(columns, row, strict=True)) for row in values]
+        hidden = 0
         if self.json:
             output.print_json(rows)
         elif self.csv:
             output.print_csv(rows, columns)
-        elif not terminal and len(rows) > EXPANDED_ROWS:
-            output.print_plain(rows, columns)
+        elif records:
+            output.print_records([_cut(row) for row in rows] if terminal else rows, columns)
+        elif terminal:
+            hidden = output.print_elided(rows, columns)
         else:
-            self._show([_cut(row) for row in rows] if terminal else rows, columns)
+            output.print_plain(rows, columns, values=True)
         if count > len(rows):
             output.say(f"{count:,} rows, {len(rows)} shown; a file or a pipe gets all of them")
+        if hidden:
+            output.say(
+                f"{len(columns)} columns, {len(columns) - hidden} shown: end the query with"
+                f" {RECORDS} to see all, or name those you want"
+            )
 
-    def _show(self, rows: list[dict[str, Any]], columns: list[str]) -> None:
-        """Print a table, or the rows one below the other if a table would not fit."""
+    def _write(self, connection: duckdb.DuckDBPyConnection, text: str, out: Path) -> None:
+        """Write the rows of a query to a file, by its ending."""
         from restock.cli import output
+        from restock.files import expect_file_place, temporary_name
+        from restock.replay.store.query import fetch, write_parquet
 
-        if len(rows) <= EXPANDED_ROWS and output.too_wide(rows, columns):
-            for number, row in enumerate(rows, start=1):
-                lines = [
-                    {"column": name, "value": output.cell(row[name]).replace(r"\[", "[")}
-                    for name in columns
-                ]
-                output.print_table(lines, title=f"row {number}")
-        else:
-            output.print_table(rows, columns)
+        expect_file_place(out, "--export")
+        if out.suffix not in (".parquet", ".csv", ".json"):
+            raise QueryError(
+                f"rows are not written to {out.suffix or 'a file without an ending'}",
+                where=str(out),
+                remedy="name it .parquet, .csv or .json",
+            )
+        if out.exists():
+            raise QueryError("already there", where=str(out), remedy="choose another name")
+        temporary = temporary_name(out)
+        try:
+            if out.suffix == ".parquet":
+                write_parquet(connection, text, temporary, where=self.path)
+            else:
+                columns, values, _ = fetch(connection, text, where=self.path, alone=True)
+                rows = [dict(zip(columns, row, strict=True)) for row in values]
+                with temporary.open("w", encoding="utf-8", newline="") as file:
+                    if out.suffix == ".csv":
+                        output.print_csv(rows, columns, file)
+                    else:
+                        output.print_json(rows, file)
+            temporary.replace(out)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def _prompt(self, connection: duckdb.DuckDBPyConnection) -> None:
         """Answer queries one after the other: a semicolon ends each, Ctrl-D ends the prompt."""
         from restock.cli import output
 
         with contextlib.suppress(ImportError):
-            import readline  # noqa: F401  (gives the prompt a history)
-        output.say('End a query with ";". FROM columns; lists all columns. Ctrl-D to quit.')
+            import readline  # noqa: F401  (gives the prompt arrow keys and a history)
+        output.say('End a query with ";". help lists what else there is. Ctrl-D to quit.')
         text = ""
         while True:
             try:
                 text += input("restock> " if not text else "      -> ") + "\n"
-                if text.strip().endswith(";"):
+                word = text.strip().rstrip(";").lower()
+                if word in (".help", "help", ".quit", "quit", ".exit", "exit", ".tables"):
+                    text = ""
+                    if word in (".help", "help"):
+                        output.say(HELP)
+                    elif word == ".tables":
+                        self._answer(connection, _TABLES)
+                    else:
+                        return
+                if text.strip().endswith((";", RECORDS)):
                     question, text = text, ""
                     self._answer(connection, question)
             except EOFError:
@@ -160,7 +212,7 @@ class SqlCommand:
 
 
 def _cut(row: dict[str, Any]) -> dict[str, Any]:
-    """Cut long lists of a row for a terminal."""
+    """Cut long lists of a record for a terminal."""
     return {
         name: [*value[:CUT_TO], f"… {len(value):,} in all"]
         if isinstance(value, list | tuple) and len(value) > 2 * CUT_TO
