@@ -24,7 +24,7 @@ help:
 $(VENV)/.runtime: pyproject.toml $(wildcard src/restock/compiled/*)
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Restock needs Python 3.11 or newer: set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -e .
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[all]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.runtime
@@ -64,7 +64,7 @@ test-lowest: .venv-lowest/.ready
 .venv-lowest/.ready: pyproject.toml $(VENV)/.runtime
 	$(PYTHON) -m venv .venv-lowest
 	PYTHONPATH=tests $(BIN)/python -m support.lowest > .venv-lowest/constraints.txt
-	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test,onnx]'
+	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test,all]'
 	@touch $@
 
 # Where there are no wheels of rclpy the tests are skipped, and say so.
@@ -73,7 +73,7 @@ test-ros: .venv-ros/.ready
 
 .venv-ros/.ready: pyproject.toml
 	$(PYTHON) -m venv .venv-ros
-	.venv-ros/bin/pip install --quiet --disable-pip-version-check -e '.[onnx,ros]' \
+	.venv-ros/bin/pip install --quiet --disable-pip-version-check -e '.[all,ros]' \
 		pytest pytest-timeout hypothesis moto[server]
 	@touch $@
 

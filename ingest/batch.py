@@ -353,7 +353,7 @@ def cluster(workers: int) -> Iterator[Any]:
     """Return Ray, connected to a cluster."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
-    ray = import_extra("ray", "ray", "the engine ray needs Ray")
+    ray = import_extra("ray", "the engine ray")
     if ray.is_initialized():  # by the caller
         yield ray
         return

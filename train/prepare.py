@@ -17,7 +17,7 @@ from restock.arrays import F32, Bools, Ints
 from restock.errors import ConfigError, PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.conditions import Condition
-from restock.process import interrupts_raised
+from restock.process import expect_installed, interrupts_raised
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
@@ -50,7 +50,6 @@ from restock.train.resolve import (
     without_twin,
 )
 from restock.train.run.checkpoint import check_earlier, go_back
-from restock.train.run.events import require_trackers
 from restock.train.run.run import (
     Run,
     RunLock,
@@ -231,7 +230,7 @@ def prepare_new(
         file, config = config, load_config(config, overrides)
         chosen = "profile" in apply_overrides({} if file is None else read_toml(file), overrides)
     open_device(config.device)
-    require_trackers(config.record.trackers)
+    expect_installed("record.trackers", *config.record.trackers)
     driven = {config.env.layouts, _evaluation_layouts(config)} if config.env.twin else ()
     for layouts in driven:
         # Report errors before anything is written. Evaluation drives all kinds
@@ -275,7 +274,7 @@ def prepare_resumed(
     stored = run.document["config"]
     config = parse_config(apply_overrides(stored, overrides), where=str(path / "config.json"))
     open_device(config.device)
-    require_trackers(config.record.trackers)
+    expect_installed("record.trackers", *config.record.trackers)
     given = config.profile != stored.get("profile")
     profile = load_profile(config.profile) if given else profile_of_run(run)
     if profile.task.hash != run.document["task_hash"]:

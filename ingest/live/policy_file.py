@@ -87,7 +87,7 @@ class OnnxFile:
     """
 
     def __init__(self, path: Path) -> None:
-        runtime = import_extra("onnxruntime", "onnx", "an exported policy is run by onnxruntime")
+        runtime = import_extra("onnxruntime", "an exported policy")
         self.path, data = path, _read(path)
         try:
             model = _Model.FromString(data)

@@ -19,7 +19,7 @@ from typing import Any
 
 from restock.errors import StoreError
 from restock.files import building, expect_place
-from restock.process import install_command, installed, interrupts_raised
+from restock.process import expect_installed, interrupts_raised
 from restock.replay.export import FORMATS
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
@@ -147,18 +147,15 @@ def export_dataset(
     set carries.
 
     Raises:
-        StoreError: an unknown format, a library that is missing, something at `out`, no rows, a
-            disk too full for HDF5.
+        StoreError: an unknown format, something at `out`, no rows, a disk too full for HDF5.
+        ConfigError: a library that is not installed.
         PanelError, QueryError: see `open_selection`.
     """
     module, needs, ending = FORMATS.get(to, ("", "", ""))
     if not module:
         raise StoreError(f"no format {to!r}", remedy=f"one of {', '.join(FORMATS)}")
-    if needs and not installed(needs):
-        raise StoreError(
-            f"the format {to} needs {needs}, which is not installed",
-            remedy=f"pip install {needs}, or {install_command('libraries')}",
-        )
+    if needs:
+        expect_installed(f"the format {to}", needs)
     if cameras and to not in WITH_IMAGES:
         raise StoreError(
             f"the format {to} holds no images",

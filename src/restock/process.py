@@ -143,23 +143,44 @@ def _note_interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def import_extra(
-    name: str, extra: str, use: str, *, where: str | None = None, instead: str | None = None
-) -> Any:
-    """Import the module `name` of one of Restock's optional extras.
+# optional package -> the extra that has it
+EXTRAS = {
+    **dict.fromkeys(("altair", "scipy", "vl_convert"), "pages"),
+    **dict.fromkeys(("gymnasium", "mujoco", "safetensors", "tensorboard", "torch"), "train"),
+    **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
+    **dict.fromkeys(("h5py", "minari", "stable_baselines3", "tianshou"), "libraries"),
+    **dict.fromkeys(("wandb", "mlflow"), "track"),
+    "ray": "ray",
+}
 
-    `use` is a sentence ("a policy is exported with onnx"); `instead` is what does without it.
+
+def import_extra(name: str, use: str) -> Any:
+    """Import an optional package; `use` says what needs it.
 
     Raises:
-        ConfigError: it cannot be imported; says which extra has it.
+        ConfigError: it is not installed; says which command installs it.
     """
     try:
         return import_module(name)
     except ImportError as error:
-        remedy = install_command(extra) + (f", or {instead}" if instead else "")
-        raise ConfigError(
-            f"{use}, which is not installed ({error})", where=where, remedy=remedy
-        ) from error
+        raise not_installed(name, use) from error
+
+
+def expect_installed(use: str, *names: str) -> None:
+    """Refuse a use of optional packages before anything is written.
+
+    Raises:
+        ConfigError: the first that is not installed, and the command that installs it.
+    """
+    for name in names:
+        if not installed(name):
+            raise not_installed(name, use)
+
+
+def not_installed(name: str, use: str, extra: str = "") -> ConfigError:
+    """Return the error about an optional package; `extra` is another than its own that has it."""
+    remedy = install_command(extra or EXTRAS[name])
+    return ConfigError(f"{use} needs {name}, which is not installed", remedy=remedy)
 
 
 def install_command(extra: str = "") -> str:

@@ -28,7 +28,7 @@ from support.panels import panel_of
 from support.stores import TASK, recording_transitions, write_store
 
 from restock import cli
-from restock.errors import ExitCode, PanelError, QueryError, StoreError
+from restock.errors import ConfigError, ExitCode, PanelError, QueryError, StoreError
 from restock.ingest.store.transitions import replaced
 from restock.process import install_command
 from restock.replay.export import FORMATS
@@ -491,5 +491,5 @@ def test_a_missing_library_is_named_with_its_command(store_path, tmp_path, monke
         return None if name == "h5py" else find(name, package)
 
     monkeypatch.setattr(importlib.util, "find_spec", absent)
-    with pytest.raises(StoreError, match=re.escape(install_command("libraries"))):
+    with pytest.raises(ConfigError, match=re.escape(install_command("libraries"))):
         export_dataset(store_path, "d3rlpy", tmp_path / "logs.h5")

@@ -18,4 +18,7 @@ def lowest(requirement: str) -> str:
 
 if __name__ == "__main__":
     project = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))["project"]
-    sys.stdout.writelines(f"{lowest(one)}\n" for one in project["dependencies"])
+    extras = project["optional-dependencies"]
+    needed = [*project["dependencies"], *extras["pages"], *extras["train"]]
+    own = (one for one in needed if not one.startswith("restock"))
+    sys.stdout.writelines(f"{lowest(one)}\n" for one in own)

@@ -97,7 +97,7 @@ def test_tracker_that_is_not_installed_is_refused_first(tmp_path, monkeypatch, c
     words = ["train", "--out", str(tmp_path / "run"), "--set", 'record.trackers=["wandb"]']
     assert cli.main(words) == 2
     reported = capsys.readouterr().err
-    assert "wandb is not installed" in reported
+    assert "needs wandb, which is not installed" in reported
     assert install_command("track") in reported
     assert not (tmp_path / "run").exists()
 

@@ -234,7 +234,7 @@ def _array(tensor: torch.Tensor) -> F32:
 
 
 def _onnx() -> Any:
-    return import_extra("onnx", "onnx", "a policy is exported with onnx")
+    return import_extra("onnx", "the export of a policy")
 
 
 SAFE_ROWS = 50_000  # at most, of episodes chosen by hash: bounds memory and time

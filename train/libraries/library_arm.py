@@ -23,7 +23,7 @@ from restock.errors import ConfigError, RestockError
 from restock.files import write_text
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
-from restock.process import installed, kill_as_interrupt
+from restock.process import expect_installed, kill_as_interrupt
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import Hard, NetworkConfig, TrainConfig, describe, load_config
 from restock.train.dqn.network import QNetwork
@@ -53,15 +53,6 @@ class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     library: Library
     settings: tuple[str, ...] = ()  # key=value, as of `restock train --set`
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # the algorithm's own
-
-
-def check_installed() -> None:
-    """Raise ConfigError if Stable-Baselines3 is not installed."""
-    if not installed("stable_baselines3"):
-        raise ConfigError(
-            "an arm trains with Stable-Baselines3, which is not installed",
-            remedy="pip install stable-baselines3",
-        )
 
 
 def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
@@ -173,7 +164,7 @@ def train_library(arm: LibraryArm) -> None:
         ConfigError: the library is not installed, or refuses its arguments.
         RunError: there is something at `arm.out` already.
     """
-    check_installed()
+    expect_installed("an arm of a library", "stable_baselines3")
     from restock.train.libraries import sb3_drive
 
     config = resolve(arm.settings, arm.library)

@@ -20,9 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from restock.errors import ConfigError
 from restock.files import first_line, write_text
-from restock.process import install_command, installed
 from restock.toml import by_path
 from restock.train.run.run import Run
 
@@ -180,21 +178,6 @@ PROJECT = "restock"  # unless WANDB_PROJECT or MLFLOW_EXPERIMENT_NAME names anot
 _PANEL = ("id", "path", "store", "store_version", "others")
 _MAX_PARAMS = 100  # that MLflow takes at a time
 _MAX_VALUE = 500  # characters that every MLflow store takes
-
-
-def require_trackers(names: Sequence[str]) -> None:
-    """Refuse trackers that are not installed, before anything is written.
-
-    Raises:
-        ConfigError: names the first, and how it is installed.
-    """
-    for name in names:
-        if not installed(name):
-            raise ConfigError(
-                f"{name} is not installed",
-                where="record.trackers",
-                remedy=f"{install_command('track')}, or leave it out",
-            )
 
 
 def tracker_sinks(

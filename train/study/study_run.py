@@ -23,7 +23,7 @@ import numpy as np
 
 from restock.errors import RestockError, RunError
 from restock.files import write_text
-from restock.process import ended_with_us, interrupt_running, kill_as_interrupt
+from restock.process import ended_with_us, expect_installed, interrupt_running, kill_as_interrupt
 from restock.replay.panel.build import plan_only
 from restock.stats import paired_t
 from restock.train.judge.compare import Comparison, compare
@@ -31,7 +31,6 @@ from restock.train.libraries.library_arm import (
     TRAINED,
     Library,
     LibraryArm,
-    check_installed,
     resolve,
 )
 from restock.train.run.kept_evaluations import (
@@ -77,7 +76,7 @@ def run_study(
     """
     for arm in plan.study.arms:
         if arm.library is not None:
-            check_installed()
+            expect_installed("an arm of a library", "stable_baselines3")
             resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
     check_jobs(plan)
     for arm in plan.study.arms:

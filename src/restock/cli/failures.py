@@ -11,13 +11,16 @@ import os
 import traceback
 from collections.abc import Sequence
 
+from restock.cli import FOLDER_OF
 from restock.errors import TRACEBACK, RestockError, StoreError, print_traceback
 from restock.files import first_line, is_undecoded
+from restock.process import EXTRAS, not_installed
 
 _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = (
     f"{_CHECK}; `restock store compact STORE --drop-damaged --dry-run` looks for one in a store"
 )
+NEEDS_TRAIN = ("learning", "twin", "start")  # folders of verbs; `train` brings `pages`, too
 GL = "MUJOCO_GL"
 NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
 # package of an exception -> what to do
@@ -63,6 +66,12 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             + repr(os.fsencode(error.object))[2:-1],
             "rename the folder; or set a locale of UTF-8, if the shell has none: LC_ALL=C.UTF-8",
         )
+    if isinstance(error, ModuleNotFoundError):
+        missing = str(error.name).partition(".")[0]
+        if missing in EXTRAS:
+            names = (" ".join(args[:2]), *args[:1])
+            learns = any(FOLDER_OF.get(name) in NEEDS_TRAIN for name in names)
+            return not_installed(missing, where, "train" if learns else EXTRAS[missing])
     if _in_gl(error):  # raised while MuJoCo is imported, by any verb that needs the twin
         what = f"MuJoCo cannot use {os.environ[GL]!r}: {first_line(error)}"
         return known(what, NO_GL, f"{GL} in the environment")

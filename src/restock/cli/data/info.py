@@ -22,7 +22,7 @@ import tyro
 from restock import native
 from restock.cli.failures import GL, NO_GL
 from restock.errors import ExitCode, RecordingError, counted, quoted, visible
-from restock.process import cores, install_command
+from restock.process import cores, install_command, installed
 
 if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
@@ -390,7 +390,7 @@ def _packages() -> list[Finding]:
     """Check what Restock and its extras need, and say how to install what is missing."""
     from packaging.requirements import Requirement
 
-    found = []
+    findings = []
     for requirement in map(Requirement, requires("restock") or []):
         extra = EXTRA.search(str(requirement.marker or ""))
         if requirement.name == "restock" or (extra and extra[1] in FOR_DEVELOPERS):
@@ -402,17 +402,19 @@ def _packages() -> list[Finding]:
         name, wanted = requirement.name, requirement.specifier
         part = f"extra {extra[1]}" if extra else "needed"
         try:
-            installed, state = version(name), "ok"
+            found, state = version(name), "ok"
         except PackageNotFoundError:
-            installed, state = "not installed", "missing" if extra else "wrong"
-        if state == "ok" and not wanted.contains(installed, prereleases=True):
-            installed, state = f"{installed}, and {wanted} is needed", "wrong"
+            found, state = "not installed", "missing" if extra else "wrong"
+        if state == "ok" and not wanted.contains(found, prereleases=True):
+            found, state = f"{found}, and {wanted} is needed", "wrong"
         remedy = "" if state == "ok" else install_command(extra[1] if extra else "")
-        found.append(Finding(part, name, state, installed, remedy))
-    return found
+        findings.append(Finding(part, name, state, found, remedy))
+    return findings
 
 
 def _torch() -> Finding:
+    if not installed("torch"):
+        return Finding("works", "torch", "missing", "not installed", install_command("train"))
     try:
         import torch
     except (ImportError, OSError) as error:
@@ -436,6 +438,8 @@ def _native() -> Finding:
 
 def _drawing() -> Finding:
     """Check whether MuJoCo can draw off screen, which only its cameras need."""
+    if not installed("mujoco"):
+        return Finding("works", "pictures", "missing", "no MuJoCo", install_command("train"))
     command = [sys.executable, "-c", DRAWS]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=DRAWS_S)

@@ -25,6 +25,7 @@ from restock.cli.start.outcomes import Document, errors
 from restock.cli.start.stages import Stage
 from restock.errors import ExitCode, RestockError, visible
 from restock.files import read_json, write_text
+from restock.process import expect_installed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -91,6 +92,7 @@ class Work:
                 remedy="choose another --out",
             )
         if not plan:
+            expect_installed("the way to a policy", "torch", "mujoco", "altair")
             (out / FOLDER).mkdir(parents=True, exist_ok=True)
             self._keep()
 
