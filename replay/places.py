@@ -32,6 +32,7 @@ def open_place(
     only_store: bool = False,
     opened: Callable[[Store], None] = lambda store: None,
     lost: Callable[[str], None] = lambda loss: None,
+    confined: bool = False,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Yield a connection with the views of a store, a run or a panel, or the topics of recordings.
 
@@ -45,6 +46,7 @@ def open_place(
         only_store: take nothing but a store.
         opened: called with the store before it is queried: `Store.verify` verifies its files.
         lost: called with each loss of recordings: damage, or messages of a topic that was read.
+        confined: let queries read no files but those of the place.
 
     Raises:
         RecordingError: a file that is no recording, or a folder without one that can be opened.
@@ -60,6 +62,8 @@ def open_place(
             _add_all(store.bare, beside)
             for schema, path in (beside or {}).items():
                 _refuse_of_another_store(store, schema, path)
+            if confined:
+                _confine(store.bare, place.folder)
             yield store.bare
         return
     place.expect_both_tables()
@@ -80,6 +84,8 @@ def open_place(
         else:
             topics = _topics(connection, path, lost, remedy=place.remedy_if_absent())
         _add_all(connection, beside)
+        if confined:
+            _confine(connection, None if topics else path)
         yield connection
         del topics  # its tables are made on demand as long as it is there
 
@@ -102,6 +108,16 @@ def _topics(
             remedy=remedy,
         ) from error
     return Topics(connection, path, lost)
+
+
+def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None:
+    """Let the connection read no file and no Python object but those of a folder."""
+    folders = [] if folder is None else [str(folder), str(folder.absolute())]
+    listed = ", ".join("'" + one.replace("'", "''") + "'" for one in folders)
+    connection.execute(
+        f"SET allowed_directories = [{listed}]; SET enable_external_access = false;"
+        " SET python_enable_replacements = false"
+    )
 
 
 def add_computed_tables(store: Store) -> None:

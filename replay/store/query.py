@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from difflib import get_close_matches
 from functools import partial
@@ -36,12 +36,17 @@ _PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
 
 
 def query(
-    connection: duckdb.DuckDBPyConnection, text: str, *, where: str, alone: bool = False
+    connection: duckdb.DuckDBPyConnection,
+    text: str,
+    *,
+    where: str,
+    alone: bool = False,
+    only_select: bool = False,
 ) -> duckdb.DuckDBPyRelation:
     """Run one query, the last of several statements.
 
     Set `alone` if nothing else uses the connection afterwards. Then a last statement that returns
-    no rows is refused.
+    no rows is refused. With `only_select`, so is any statement that is not a SELECT.
 
     Raises:
         StoreError: a file of the store is damaged or missing.
@@ -54,7 +59,7 @@ def query(
     if not statements:
         raise QueryError("the query is empty", where=where, remedy='try "FROM columns"')
     for statement in statements:
-        if not _reads(connection, statement):
+        if not _reads(connection, statement, {"SELECT"} if only_select else _ALLOWED):
             kind = statement.type.name
             if kind == "MULTI":
                 kind = statement.query.split(maxsplit=1)[0].upper()
@@ -90,10 +95,12 @@ def query(
     return relation
 
 
-def _reads(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> bool:
+def _reads(
+    connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement, allowed: Collection[str]
+) -> bool:
     """Return whether a statement leaves files and the store's views as they are."""
     if statement.type.name != "EXPLAIN":
-        return statement.type.name in _ALLOWED or _pivots(statement)
+        return statement.type.name in allowed or _pivots(statement)
     explained = _EXPLAIN.sub("", statement.query, count=1)
     try:
         return all(
@@ -157,6 +164,7 @@ def fetch(
     where: str,
     at_most: int | None = None,
     alone: bool = False,
+    only_select: bool = False,
 ) -> tuple[list[str], list[tuple[Any, ...]], int]:
     """Return column names, the first `at_most` rows and the number of rows; Ctrl-C stops it.
 
@@ -168,7 +176,7 @@ def fetch(
     """
 
     def run() -> tuple[list[str], list[tuple[Any, ...]], int]:
-        relation = query(connection, text, where=where, alone=alone)
+        relation = query(connection, text, where=where, alone=alone, only_select=only_select)
         try:
             if at_most is None:
                 rows = values(relation)

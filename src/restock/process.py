@@ -150,6 +150,7 @@ EXTRAS = {
     **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
     **dict.fromkeys(("h5py", "minari", "stable_baselines3", "tianshou"), "libraries"),
     **dict.fromkeys(("wandb", "mlflow"), "track"),
+    "mcp": "mcp",
     "ray": "ray",
 }
 

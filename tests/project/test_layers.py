@@ -94,7 +94,7 @@ MAY_IMPORT = {
         " train/judge train/run train/twin/calibration train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/store",
-    "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
+    "cli": "ingest/live ingest/profile ingest/steps ingest/task replay replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/decoding ingest/profile ingest/propose"
         " ingest/steps ingest/store ingest/task replay replay/export"

@@ -99,7 +99,8 @@ with quotas for rare conditions, and fine-tunes a DQN in a MuJoCo twin.
 
 {_listed(VERBS)}
 
-`restock VERB --help` explains a verb. `restock-node` runs an exported policy on a robot.
+`restock VERB --help` explains a verb. `restock-node` runs an exported policy on a robot;
+`restock-mcp` answers an assistant's questions.
 
 Exit codes: 0 done, 1 an audit failed or a comparison was refused, 2 any other failure: wrong
 usage, bad input, a file that cannot be read or written, 3 written but data was lost or skipped,
@@ -131,6 +132,12 @@ def run_node(argv: Sequence[str] | None = None) -> int:
     """Run one command line of `restock-node`; return the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     return _guarded(lambda given: _run("node", "restock-node", _without_ros(given)), args)
+
+
+def run_mcp(argv: Sequence[str] | None = None) -> int:
+    """Run one command line of `restock-mcp`; return the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    return _guarded(lambda given: _run("mcp", "restock-mcp", given), args)
 
 
 def _guarded(run: Callable[[list[str]], int], args: list[str]) -> int:
