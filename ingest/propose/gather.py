@@ -59,6 +59,7 @@ from restock.ingest.propose.roles import (
     Kind,
     Roles,
     other_robots_topics,
+    own_bumpers,
     sort_own_first,
     topics_for,
     usable_topics,
@@ -176,6 +177,11 @@ def gather(
         return [fit for _, fit in sort_own_first(recording, [(fit[0].name, fit) for fit in found])]
 
     roles = {role: fitting(kinds) for role, kinds in KINDS.items()}
+    if not roles["bumper"]:
+        own = own_bumpers(recording, topics)
+        roles["bumper"] = [
+            fit for _, fit in sort_own_first(recording, [(one[0].name, one) for one in own])
+        ]
     unmeasured: dict[str, str] = {}
     for role, key in MEASURED.items():
         roles[role], unmeasured[role] = _measured(recording, roles[role], key)

@@ -28,7 +28,14 @@ from restock.ingest.propose.proposal_lines import (
     profile_lines,
     steered_by,
 )
-from restock.ingest.propose.roles import REQUIRED, Kind, clouds_alone, robots_in, several_commands
+from restock.ingest.propose.roles import (
+    REQUIRED,
+    Kind,
+    clouds_alone,
+    robots_in,
+    several_commands,
+    unread_bumpers,
+)
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
@@ -160,6 +167,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
+    if not seen.roles["bumper"]:
+        advice += [Advice("inputs.bumper", line) for line in unread_bumpers(recording)]
     if clouds := clouds_alone(recording, seen.roles):
         advice.append(Advice("inputs.scan", clouds))
     if reported := lidar_guess(seen.footprint):

@@ -390,6 +390,32 @@ def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
     return set(paths) <= set(recording.leaves(topic.name))
 
 
+FLAGS = {"bool", "uint8", "int8", "byte", "char"}
+MAX_FLAGS = 8
+
+
+def own_bumpers(recording: Recording, topics: dict[str, TopicInfo]) -> list[tuple[TopicInfo, Kind]]:
+    """Return bumpers of a robot's own type: named so, and nothing but flags in their messages."""
+    found = []
+    for topic in topics.values():
+        leaves = [one for one in recording.fields(topic.name) if not one.path.startswith("header.")]
+        flags = all(one.kind in FLAGS and not one.dims for one in leaves)
+        if "bump" in topic.name.lower() and flags and 0 < len(leaves) <= MAX_FLAGS:
+            fields = {"pressed": " or ".join(one.path for one in leaves)}
+            found.append((topic, Kind(topic.type, fields)))
+    return found
+
+
+def unread_bumpers(recording: Recording) -> list[str]:
+    """Say of each topic that is named as a bumper and cannot be read what to do."""
+    return [
+        f"a topic {name} of unknown type {topic.type} is there: give its definition, --definitions"
+        " FOLDER (PACKAGE/msg/NAME.msg)"
+        for name, topic in recording.topics.items()
+        if "bump" in name.lower() and "unknown type" in (topic.skipped or "")
+    ]
+
+
 def topics_for(
     recording: Recording, topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
 ) -> list[tuple[TopicInfo, Kind]]:

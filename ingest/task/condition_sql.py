@@ -46,6 +46,8 @@ _GROWING = {
     "bitstring",
 }
 _MORE_ROWS = {"unnest", "unlist"}
+_OF_X = {"lag", "lead", "first_value", "last_value", "nth_value", "ntile"}
+_WINDOWED = {*_OF_X, "row_number", "rank", "dense_rank", "rank_dense", "percent_rank", "cume_dist"}
 # Of a zone that is given, or fixed as it is here.
 _OF_ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
@@ -144,6 +146,9 @@ def _refuse(part: dict[str, Any], timing: str) -> str | None:
         return f"{part['function_name']}() can use unlimited memory: it is not allowed here"
     if kind == "FUNCTION" and part["function_name"].lower() in _MORE_ROWS:
         return f"{part['function_name']}() makes several rows of one: it is not allowed here"
+    if kind == "FUNCTION" and part["function_name"].lower() in _WINDOWED:
+        name = part["function_name"].lower()
+        return f"{name}() needs a window: write `{name}({'x' * (name in _OF_X)}) OVER episode`"
     if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _outside():
         return f"{part['function_name']}() reads data other than the steps: it is not allowed here"
     if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _outside():

@@ -173,6 +173,7 @@ class Body(Checked, frozen=True):
 # different code are never mixed unseen.
 TASK_CODE_VERSION = 2
 
+MAX_PERIOD_S = 10.0
 SLIP_MPS = 0.15  # wheels against the world: slip, of a robot of 1 m/s or faster
 
 
@@ -211,6 +212,11 @@ class Task(Checked, frozen=True):
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
             raise ValueError("actions must start with the stop action [0, 0]")
+        if self.control_period_s > MAX_PERIOD_S:
+            raise ValueError(
+                f"control_period_s is in seconds, at most {MAX_PERIOD_S:g}, got"
+                f" {self.control_period_s:g}: is that milliseconds?"
+            )
         if self.sectors % 2 or self.sectors == 2:
             raise ValueError(f"sectors must be even and 4 or more, or 0, got {self.sectors}")
         if self.range_max_m <= self.range_min_m:

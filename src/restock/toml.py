@@ -27,6 +27,7 @@ T = TypeVar("T")
 _STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # a step of a message's path, and the rest
 
 
+MAX_NAMED = 12  # keys of a table that a message lists
 MAX_DEPTH = 64  # nested tables and arrays
 _DEEP_KEY = re.compile(rf"""(?<![\w"'.-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_DEPTH},}}""")
 
@@ -122,8 +123,8 @@ def typed(
         return msgspec.convert(_plain(document), kind)
     except msgspec.ValidationError as error:
         what = _in_words(str(error), document, kind, prefix)
-        if meant := _key_meant(str(error), document, kind, prefix):
-            remedy = f"did you mean `{meant}`?" + (f" {remedy}" if remedy else "")
+        if meant := _keys_meant(str(error), document, kind, prefix):
+            remedy = meant + (f" {remedy}" if remedy else "")
         raise ConfigError(what, where=where, remedy=remedy) from error
 
 
@@ -271,8 +272,8 @@ def _parted(message: str) -> tuple[str, str]:
     return what, path.rstrip("`")
 
 
-def _key_meant(message: str, document: Any, kind: Any, prefix: str) -> str | None:
-    """Return the key that is nearest to an unknown one, if one is near."""
+def _keys_meant(message: str, document: Any, kind: Any, prefix: str) -> str | None:
+    """Name the key that is nearest to an unknown one, or all that there are; None if many."""
     what, path = _parted(message)
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.S)
     if unknown is None:
@@ -283,8 +284,10 @@ def _key_meant(message: str, document: Any, kind: Any, prefix: str) -> str | Non
     for place, _, _ in _places(kinds.type_info(kind), document, path):
         if isinstance(place, kinds.StructType):
             known |= {field.encode_name for field in place.fields} | {place.tag_field or ""}
-    near = get_close_matches(unknown[1], known, n=1)
-    return _join(prefix, path, near[0]) if near else None
+    if near := get_close_matches(unknown[1], known, n=1):
+        return f"did you mean `{_join(prefix, path, near[0])}`?"
+    known -= {""}
+    return f"there are {', '.join(sorted(known))}." if len(known) <= MAX_NAMED else None
 
 
 def _choices(kind: Any, document: Any, path: str) -> Iterator[str]:

@@ -124,6 +124,25 @@ def test_a_robots_own_types_are_read_by_their_definitions(tmp_path: Path) -> Non
     assert "--definitions" in recording["topics"]["/accel"]["skipped"]
 
 
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_a_bumper_of_an_unknown_type_is_asked_for_and_proposed(tmp_path, capsys) -> None:
+    message = tmp_path / "definitions" / "neato2_interfaces" / "msg" / "Bump.msg"
+    message.parent.mkdir(parents=True)
+    message.write_text(BUMP + "uint8 right_side\n")
+    bag = SHARED / "fleet-neato" / "2024-danpark" / "drive_square"
+    words = ["profile", "new", str(bag), "--hindsight-goals", "--out"]
+    cli.main([*words, str(tmp_path / "without.toml")])
+    asked = "a topic /bump of unknown type neato2_interfaces/msg/Bump is there: give its definition"
+    assert asked in capsys.readouterr().err
+    with_type = ["--definitions", str(message.parents[2])]
+    cli.main([*words, str(tmp_path / "with.toml"), *with_type])
+    assert asked not in capsys.readouterr().err
+    bumper = load_profile(str(tmp_path / "with.toml")).inputs.bumper
+    assert bumper is not None
+    pressed = "left_front or left_side or right_front or right_side"
+    assert (bumper.topic, bumper.fields["pressed"]) == ("/bump", pressed)
+
+
 def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("text.mcap").write_text("text\n")

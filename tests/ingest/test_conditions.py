@@ -309,6 +309,7 @@ REFUSED = {
     "COLUMNS(*) > 1": "it contains *",
     "$1": "it contains a parameter",
     "max(clearance_m) OVER () > 1": "would see other episodes",
+    "lag(clearance_m) > 1": "write `lag(x) OVER episode`",
     "lead(bumped) OVER episode": 'set timing = "post"',
     "max(bumped) OVER (episode ROWS BETWEEN 1 PRECEDING AND 1 FOLLOWING)": "at CURRENT ROW",
     "lag(bumped, -1) OVER episode": "give lag() a constant number",

@@ -51,6 +51,7 @@ def test_the_hash_is_the_same_in_another_process():
         ('topic = "/scan"', "topic = 3", "`inputs.scan.topic`: Expected `str`, got `int`"),
         ("sectors = 36", "sectors = 5", "task.sectors must be even and 4 or more, or 0, got 5"),
         ("sectors = 36", "sectors = 0", "`task.sectors` is 0 (a robot without a lidar)"),
+        ("control_period_s = 0.2", "control_period_s = 200", "is in seconds, at most 10, got 200"),
         ("control_period_s = 0.2", "control_period_s = 0", "task.control_period_s must be above 0"),
         ("time_limit_steps = 240", "time_limit_steps = 0", "time_limit_steps must be at least 1"),
         ("range_min_m = 0.05", "range_min_m = 4.5", "range_max_m must be above range_min_m"),

@@ -15,6 +15,7 @@ from msgspec import Meta, inspect
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
+from restock.ingest.task.task import Rewards
 from restock.replay.mixture.mixture import Mixture
 from restock.toml import Checked, parse_toml, read_toml, toml_value, typed
 from restock.train.dqn.config import TrainConfig
@@ -114,7 +115,9 @@ def test_a_file_and_python_refuse_a_value_in_the_same_words(values, message):
 def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         typed(values, Config, where="config.toml", remedy="see the docs")
-    assert str(refused.value) == f"config.toml: {message}\n  see the docs"
+    what, remedy = str(refused.value).split("\n  ")
+    assert what == f"config.toml: {message}"
+    assert remedy.endswith("see the docs")
     assert refused.value.where == "config.toml"
 
 
@@ -134,6 +137,12 @@ def test_an_unknown_key_names_the_one_that_was_likely_meant(values, kind, meant)
         with pytest.raises(ConfigError, match="unknown key") as refused:
             typed(values, kind, where="config.toml", remedy=remedy)
         assert refused.value.remedy == f"did you mean `{meant}`?{rest}"
+
+
+def test_an_unknown_reward_lists_those_there_are() -> None:
+    with pytest.raises(ConfigError, match="there are action_change, bump, goal, ") as refused:
+        typed({"energy": -1.0}, Rewards, where="p.toml", prefix="task.rewards")
+    assert refused.value.what == "unknown key `task.rewards.energy`"
 
 
 def misspelt(kind: inspect.Type) -> Iterator[tuple[Any, set[str]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, LabelError, quoted
+from restock.errors import ConfigError, ExitCode, LabelError, counted, quoted
 
 if TYPE_CHECKING:
     from restock.ingest.relabel import Corrected, Relabelled
@@ -136,6 +137,17 @@ class LabelCommand:
         live = store.live()
         carried = {row["profile"]: row["profile_toml"] for row in live.to_pylist()}
         given = load_profile(self.profile) if self.profile is not None else None
+        others = [
+            row
+            for row in live.to_pylist()
+            if given and row["profile"] == given.name and row["task_hash"] != given.task.hash
+        ]
+        if others:
+            sys.stderr.write(
+                f"note: {counted(len(others), 'recording')} of the store have another [task] than"
+                f" {self.profile}: only labels change here; for observations and rewards ingest"
+                " again\n"
+            )
 
         def conditions_of(name: str) -> Sequence[Condition]:
             if given is not None and given.name == name:
