@@ -139,6 +139,8 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "eval --save-as-baseline": "export the policy (--to onnx): `restock gate` takes the file",
     "export --license": "write `license: ID` at the top of the card, README.md",
     "export --panel": "give the panel after the store: restock export STORE PANEL",
+    "coverage gaps --no-audits": "it is --thresholds none now",
+    "twin layout --png": "give the picture to --out, too: --out floor.toml --out floor.png",
     "coverage gaps --by": "leave it out: a cell is a condition, zone, action and robot",
     "gate --junit": "it is always RUN/gate/junit.xml",
     "ingest --engine": 'from Python: ingest_all(paths, job, engine="ray")',

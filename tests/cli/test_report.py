@@ -328,7 +328,7 @@ def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path
         ),
         (["sql", store, "--export", f"{store}/views.sql"], f"the store {store}"),
         (["coverage", "gaps", store, "--missions-out", f"{store}/m.toml"], f"the store {store}"),
-        (["twin", "layout", "--png", f"{run}/floor.png"], f"the run {run}"),
+        (["twin", "layout", "--out", f"{run}/floor.png"], f"the run {run}"),
         (["twin", "fit", store, "--out", f"{store}/fitted.toml"], f"the store {store}"),
     ):
         assert cli.main(words) == 2

@@ -198,7 +198,7 @@ def test_mix_and_gaps_say_the_same_hours(text, tmp_path, capsys):
     store = str(write_store(tmp_path / "store", [recording_transitions(n) for n in (1, 2, 3)]))
     (tmp_path / "mine.toml").write_text(f"max_replays_per_row = 40\nshortfall = 'shrink'\n{text}")
     chosen = (store, "--mixture", str(tmp_path / "mine.toml"))
-    in_gaps = ["coverage", "gaps", *chosen, "--unit", "hours", "--no-audits"]
+    in_gaps = ["coverage", "gaps", *chosen, "--unit", "hours", "--thresholds", "none"]
     assert main(["mix", *chosen, "--dry-run", "--json"]) == 0
     mixed = json.loads(capsys.readouterr().out)["strata"]
     assert main([*in_gaps, "--json"]) == 0
@@ -304,7 +304,7 @@ def test_the_list_is_a_file_that_reads_back(store, tmp_path, capsys):
     read = read_missions(out)
     assert [order.missions for order in read.missions] == [o["missions"] for o in plan["orders"]]
     assert read.store.endswith("store@2")
-    none = ["coverage", "gaps", str(store), "--no-audits", "--mixture", "uniform"]
+    none = ["coverage", "gaps", str(store), "--thresholds", "none", "--mixture", "uniform"]
     for words, problem in (
         ([*args, "--missions-out", str(out)], "already there"),
         ([*none, "--missions-out", str(tmp_path / "none.toml")], "there are no gaps"),

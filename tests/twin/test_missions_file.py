@@ -141,7 +141,7 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(tmp_path, capsys):
     run("twin", "record", "--out", str(tmp_path / "first.mcap"), *first)
     assert main(["ingest", str(tmp_path / "first.mcap"), "--store", store]) == 0
     capsys.readouterr()
-    gaps = ["coverage", "gaps", store, "--mixture", str(requested), "--no-audits"]
+    gaps = ["coverage", "gaps", store, "--mixture", str(requested), "--thresholds", "none"]
     before = run(*gaps, "--missions-out", str(tmp_path / "next.toml"))
     missing = {gap["cell"]: gap for gap in before["gaps"]}  # type: ignore[attr-defined]
     assert "wheel_slip" in missing

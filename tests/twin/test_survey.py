@@ -155,9 +155,9 @@ def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, capsys):
     poses = lap(origin)[:-30]  # not the whole way round
     bag = write_bag(tmp_path / "bag", poses=poses, grid=OccupancyGrid(hall(), CELL_M, origin))
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.toml")]
-    assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.txt")]) == 2
-    assert "'a.txt' does not end in .png" in capsys.readouterr().err
-    assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.png")]) == 0
+    assert main([*arguments, "--footprint", "0.6x0.5", "--out", str(tmp_path / "a.txt")]) == 2
+    assert "'a.txt' does not end in .toml, .yaml or .png" in capsys.readouterr().err
+    assert main([*arguments, "--footprint", "0.6x0.5", "--out", str(tmp_path / "a.png")]) == 0
     shown = capsys.readouterr().out
     assert re.search(r"map_origin +-2\.8, 2\.2, ", shown)
     assert re.search(r"one_way_rules +0$", shown, re.MULTILINE)

@@ -103,7 +103,7 @@ class InfoCommand:
 
         choose_definitions(self.definitions)
         entries: list[dict[str, Any]] = []
-        code = ExitCode.OK
+        code, refused = ExitCode.OK, 0
         for name in paths:
             try:
                 found = recordings_in(name)
@@ -123,13 +123,17 @@ class InfoCommand:
                         )
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")
-                    code = ExitCode.USAGE
+                    code, refused = ExitCode.USAGE, refused + 1
                     continue
                 if entry["damage"] and code == ExitCode.OK:
                     code = ExitCode.LOSSY
                 entries.append(entry)
                 if not self.json:
                     _print(entry)
+        if len(entries) > 1 and not self.json:
+            from restock.cli.data.night import info_total
+
+            output.print_text(info_total(entries, refused))
         return code, entries
 
 

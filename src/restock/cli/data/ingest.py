@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
@@ -21,6 +21,7 @@ from restock.errors import (
 )
 
 if TYPE_CHECKING:
+    from restock.ingest.batch import IngestJob
     from restock.ingest.pipeline import IngestResult
 
 
@@ -64,6 +65,13 @@ class IngestCommand:
     definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
+    verbose: bool = False
+    """Print of many recordings what is printed of one: topics, signals, labels, what was dropped
+    and why. By default that is a line each, and a total."""
+    watch: tuple[str, ...] | None = None
+    """Go on until it is interrupted, and take each recording that arrives in the folders once it is
+    complete; then print coverage and audits, a line of log an event. A COMMAND after it, in quotes,
+    is run after new recordings, with what is new as JSON on its standard input. Put it last."""
     workers: int = 1
     """How many processes read recordings at the same time."""
     json: bool = False
@@ -88,6 +96,7 @@ class IngestCommand:
         profile = load_profile(self.profile)  # before what is slow to import: it may not be there
 
         from restock.cli import output
+        from restock.cli.data.night import Night
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.decoding.definitions import choose_definitions
         from restock.ingest.store.writer import StoreWriter, fold_if_many
@@ -98,8 +107,11 @@ class IngestCommand:
             StoreWriter(store).reach()
         chosen = choose_definitions(self.definitions)
         job = IngestJob(*(profile, store, self.force, self.salvage, chosen, self.repeated, tags))
+        if self.watch is not None:
+            self._watch(job)
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
+        night = Night(paths) if len(paths) > 1 and not (self.verbose or self.json) else None
         lossy = False
         with output.progress("ingest", len(paths)) as advance:
             for path, result in ingest_all(paths, job, workers=self.workers, watch=advance.part):
@@ -109,20 +121,37 @@ class IngestCommand:
                     if isinstance(result, StoreError):  # which names the store alone
                         reported = f"{visible(str(path))}: was not added: {reported}"
                     failures.append({"path": str(path), "status": "failed", "error": reported})
-                    sys.stderr.write(f"restock: {reported}\n")
+                    said = night.refuse(path, result) if night is not None else reported
+                    sys.stderr.write(f"restock: {said}\n")
                     continue
                 lossy |= result.lossy
                 outcomes.append(as_json(result))
-                if not self.json:
+                if night is not None:
+                    output.print_text(night.add(result))
+                elif not self.json:
                     show(result)
         if store is not None and outcomes:
             StoreWriter(store).clean()
             fold_if_many(StoreWriter(store))
+        if night is not None:
+            output.print_text(night.total())
         if self.json:
             output.print_json({"recordings": outcomes + failures})
         if not outcomes:
             return ExitCode.USAGE
         return ExitCode.LOSSY if failures or lossy else ExitCode.OK
+
+    def _watch(self, job: IngestJob) -> NoReturn:
+        if job.store is None or self.force or len(self.watch or ()) > 1:
+            raise ConfigError(
+                "takes one command, in quotes, or none, and neither --dry-run nor --force",
+                where="--watch",
+                remedy="restock ingest FOLDER --store STORE --watch",
+            )
+        from restock.cli.data.watch import Watch
+
+        hook = self.watch[0] if self.watch else None
+        Watch(self.paths, job, hook, self.workers, self.json).run()
 
     def _recordings(self) -> tuple[list[Path], list[dict[str, Any]]]:
         """Return the recordings of all paths, each once, and the paths that have none."""

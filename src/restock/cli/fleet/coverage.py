@@ -145,11 +145,9 @@ class GapsCommand:
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """The mixture whose planned draws say how much is needed of each stratum. See
     docs/mixture.md."""
-    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE|none")] = None
     """A TOML file with thresholds of audits that replace the shipped ones, as for `restock
-    audit`."""
-    no_audits: bool = False
-    """Use only the needs of the mixture, not those of the audits."""
+    audit`; `none`: use only the needs of the mixture, not those of the audits."""
     min_rows: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Also ask for at least this many rows of every cell."""
     unit: Literal["missions", "hours"] | None = None
@@ -173,7 +171,9 @@ class GapsCommand:
         if self.min_rows < 0:
             raise ConfigError(f"must be 0 or more, got {self.min_rows}", where="--min-rows")
         mixture = load_mixture(self.mixture)
-        thresholds = None if self.no_audits else load_thresholds(self.thresholds)
+        thresholds = None
+        if str(self.thresholds) != "none":
+            thresholds = load_thresholds(self.thresholds)
         if self.missions_out is not None:
             refuse_existing(self.missions_out)
         expect_file_place(self.missions_out, "--missions-out")

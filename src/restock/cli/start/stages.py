@@ -209,7 +209,7 @@ def _floor(to: Settings, made: Path, title: str, given: Sequence[str]) -> Stage:
     return Stage(
         made.stem,
         title,
-        [*words, "--out", str(made), "--png", str(picture)],
+        [*words, "--out", str(made), "--out", str(picture)],
         reads=own_file(to.map),
         writes=(made, picture),
         outcome=outcomes.floor,

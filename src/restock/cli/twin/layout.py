@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from restock.train.twin.floors.layout import Warehouse
     from restock.train.twin.survey.survey import Surveyed
 
+MAPS = (".yaml", ".yml")
+
 
 @dataclass
 class LayoutCommand:
@@ -25,8 +27,8 @@ class LayoutCommand:
     the recording. --out writes the floor as TOML, for `restock train --set env.layouts=FILE.toml`,
     or as map.yaml with a PGM. See docs/layouts.md.
 
-        restock twin layout map.yaml --out hall.toml --png hall.png
-        restock twin layout --from drive.mcap --out floor.toml --png floor.png
+        restock twin layout map.yaml --out hall.toml --out hall.png
+        restock twin layout --from drive.mcap --out floor.toml --out floor.png
     """
 
     floor: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[FLOOR]")] = None
@@ -51,11 +53,9 @@ class LayoutCommand:
     definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
-    out: Path | None = None
-    """Write the floor to this file: FILE.toml, or map.yaml (and map.pgm beside it). Existing files
-    are not overwritten."""
-    png: Path | None = None
-    """Draw the floor from above, into this PNG file."""
+    out: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = ()
+    """Write the floor to this file: FILE.toml, or map.yaml (and map.pgm beside it), or draw it from
+    above: FILE.png. May be given several times. Existing files are not overwritten."""
     zones: Path | None = None
     """With --from: write the zones of the floor to this file, as [[zone]] tables for a profile, in
     the map frame."""
@@ -72,8 +72,7 @@ class LayoutCommand:
         from restock.train.twin.survey.picture import write_picture
         from restock.train.twin.survey.survey import profile_zones
 
-        maps = self.out is not None and self.out.suffix in (".yaml", ".yml")
-        written = self._to_write(maps)
+        written = self._to_write()
         floor, surveyed = self._floor()
         facts = describe_floor(floor)
         remarks: list[str] = []
@@ -82,12 +81,15 @@ class LayoutCommand:
                 surveyed.notes.append("no mission fits on this floor: the robot moved too little")
             facts = {**surveyed.facts(), **facts, "notes": surveyed.notes}
             remarks = [f"made from {surveyed.source}", *surveyed.notes]
-        if self.out is not None:
-            write_map(floor, self.out) if maps else write_floor(floor, self.out, remarks)
-        if self.png is not None and surveyed is not None:
-            write_picture(surveyed, self.png)
-        elif self.png is not None:
-            write_png(self.png, draw_floor(floor))
+        for path in self.out:
+            if path.suffix in MAPS:
+                write_map(floor, path)
+            elif path.suffix == ".toml":
+                write_floor(floor, path, remarks)
+            elif surveyed is not None:
+                write_picture(surveyed, path)
+            else:
+                write_png(path, draw_floor(floor))
         if self.zones is not None:
             write_text(self.zones, profile_zones(floor), exclusive=True)
         if self.json:
@@ -98,22 +100,17 @@ class LayoutCommand:
             output.say(f"written: {', '.join(map(str, written))}")
         return 0
 
-    def _to_write(self, maps: bool) -> list[Path]:
+    def _to_write(self) -> list[Path]:
         from restock.files import expect_file_place
 
-        if self.out is not None and not maps and self.out.suffix != ".toml":
-            raise RestockError(f"{self.out.name!r} ends in neither .toml nor .yaml", where="--out")
-        if self.png is not None and self.png.suffix.lower() != ".png":
-            raise RestockError(
-                f"{self.png.name!r} does not end in .png",
-                where="--png",
-                remedy="a PNG is all that it writes: give FILE.png",
-            )
-        written = [path for path in (self.out, self.png, self.zones) if path is not None]
-        if maps and self.out is not None:
-            written.append(self.out.with_suffix(".pgm"))
-        for option, path in (("--out", self.out), ("--png", self.png), ("--zones", self.zones)):
-            expect_file_place(path, option)
+        for path in self.out:
+            if path.suffix not in (*MAPS, ".toml", ".png"):
+                what = f"{path.name!r} does not end in .toml, .yaml or .png"
+                raise RestockError(what, where="--out")
+            expect_file_place(path, "--out")
+        expect_file_place(self.zones, "--zones")
+        written = [*self.out, *([self.zones] if self.zones is not None else [])]
+        written += [path.with_suffix(".pgm") for path in self.out if path.suffix in MAPS]
         for path in written:
             if path.exists():
                 raise RestockError(

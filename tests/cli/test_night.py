@@ -1,0 +1,84 @@
+"""A fleet's night: a line for each recording, and one total, whose figures are those of --json."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from support.driven_robot import cut_bag, write_bags
+from support.paths import SHARED
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import recordings_in
+
+
+def totals(recordings: list[dict]) -> tuple[int, int, Counter]:
+    labels = Counter[str]()
+    for one in recordings:
+        labels.update({k: v for k, v in one.get("conditions", {}).items() if k != "nominal"})
+    done = [one for one in recordings if one["status"] != "failed"]
+    dropped = sum(drop["count"] for one in done for drop in one["drops"])
+    return sum(one["transitions"] for one in done), dropped, +labels
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_bags(tmp_path_factory.mktemp("bags"), 3)
+    cut_bag(folder / "cut")
+    return folder
+
+
+def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, capsys):
+    assert main(["ingest", str(bags), "--dry-run", "--json"]) == 3
+    rows, dropped, labels = totals(json.loads(capsys.readouterr().out)["recordings"])
+    assert main(["ingest", str(bags), "--store", str(tmp_path / "s")]) == 3
+    out, err = capsys.readouterr()
+    *lines, total = out.splitlines()
+    assert [line.split(":")[0] for line in lines] == [f"written   drive{n}" for n in range(3)]
+    assert err.startswith("restock: refused   cut: ")
+    assert len(err.splitlines()) == 1
+    assert total.startswith("total: 4 recordings (written 3, refused 1); ")
+    parts = total.split("; ")
+    assert f"{rows:,} rows" in parts
+    assert f"{dropped:,} ticks dropped" in parts
+    assert all(f"{name} {number:,}" in total for name, number in labels.items())
+
+    assert main(["ingest", str(bags), "--store", str(tmp_path / "s"), "--salvage"]) == 3
+    out = capsys.readouterr().out
+    assert "cut: " in out
+    assert "total: 4 recordings (written 1, unchanged 3); " in out
+    assert "lost data 1" in out.splitlines()[-1]
+
+
+def test_one_recording_and_verbose_say_everything(bags, tmp_path, capsys):
+    main(["ingest", str(bags / "drive0"), "--dry-run"])
+    one = capsys.readouterr().out
+    assert "episodes ended by: " in one
+    main(["ingest", str(bags), "--dry-run", "--verbose"])
+    every = capsys.readouterr()
+    assert one in every.out
+    assert "--salvage" in every.err
+
+
+def test_info_of_a_folder_ends_with_its_totals(bags, capsys):
+    assert main(["info", str(bags), "--json"]) == 2
+    found = json.loads(capsys.readouterr().out)["recordings"]
+    assert main(["info", str(bags)]) == 2
+    total, topics = capsys.readouterr().out.splitlines()[-2:]
+    assert total.startswith("total: 4 recordings; ")
+    assert f"; {sum(one['messages'] for one in found):,} messages; 0 damaged; 1 refused" in total
+    assert set.intersection(*(set(one["topics"]) for one in found)) == set(
+        topics.removeprefix("topics of all: ").partition(" (")[0].split(", ")
+    )
+
+
+@pytest.mark.skipif(not (SHARED / "fleet-neato").is_dir(), reason="no fleet-neato")
+def test_eleven_recordings_of_strangers_are_twelve_lines(tmp_path, capsys):
+    fleet, profile = SHARED / "fleet-neato", tmp_path / "neato.toml"
+    main(["profile", "new", str(fleet), "--out", str(profile)])
+    capsys.readouterr()
+    words = ["ingest", str(fleet), "--profile", str(profile), "--store", str(tmp_path / "s")]
+    assert main(words) == 3
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) + len(err.splitlines()) == len(recordings_in(fleet)) + 1
+    assert "2023-replayed/mac_take_2_bag: 159 rows, 0.8 min, repeats another" in out
