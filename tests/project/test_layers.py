@@ -61,7 +61,7 @@ MAY_IMPORT = {
     ),
     "train/judge": (
         "train dqn evaluation feed run twin/calibration"
-        " twin/missions twin/env twin/physics replay/fleet replay/panel replay/store"
+        " twin/missions twin/env twin/floors twin/physics replay/fleet replay/panel replay/store"
         " ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (

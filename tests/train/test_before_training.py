@@ -27,6 +27,7 @@ from restock.stats import ConfidenceInterval
 from restock.train.judge import before_training
 from restock.train.judge.answers import ACTION_TURN, GAIN, RELATIONS, Answer
 from restock.train.judge.before_training import (
+    OpenedRows,
     RowDiagnosis,
     diagnose_rows,
     drive_twin,
@@ -35,7 +36,7 @@ from restock.train.judge.before_training import (
 )
 from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
-from restock.train.judge.fed_rows import FedRows, judged
+from restock.train.judge.fed_rows import FedRows, judged, over_parts
 from restock.train.judge.row_checks import values
 from restock.train.twin.calibration.twin_gap import (
     TrustLimits,
@@ -45,6 +46,7 @@ from restock.train.twin.calibration.twin_gap import (
     write_gap,
 )
 from restock.train.twin.env.drivers import RandomPolicy
+from restock.train.twin.floors.floors import floors_of
 
 Plant = Callable[[FedRows], FedRows]
 
@@ -239,6 +241,83 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(kind, tagged, part, lo
     assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
 
 
+def test_a_wheel_radius_off_in_one_robot_is_named(logs, twin):
+    """Check that 8 % of one robot's wheels are found: two sensors of one motion must agree."""
+    robot = np.array([f"r{one}" for one in logs.episode % 3])
+    fleet = replace(logs, recording=robot, robot=robot)
+    made = [logs.observation.copy(), logs.next_observation.copy()]
+    for held in made:
+        held[robot == "r1", logs.task.observation_names.index("wheel_speed")] *= 0.92
+    worn = replace(fleet, observation=made[0], next_observation=made[1])
+    found = diagnose_rows(worn, twin, files={"r1": "monday.mcap"})
+    (one,) = [one for one in found.findings if one.cause == "SENSOR_SCALED"]
+    assert (
+        "in 1 of 3 robots (robot r1: monday.mcap): the scale of the logs' wheels (speed) is 0.92"
+        in one.text
+    )
+    assert one.evidence == ("gain: speed of the pose to the wheels, r1",)
+
+
+def test_a_check_in_many_parts_is_corrected_for_their_number():
+    interval = ConfidenceInterval(1.2, 1.09, 1.31)
+    row = judged("gain: x", "", "ratio", interval, logs=1.2, twin=1.0, most=1.08, logs_rows=9)
+    sound = judged("gain: x", "", "ratio", ConfidenceInterval(1.0, 0.9, 1.1), logs=1.0, twin=1.0,
+                   most=1.08, logs_rows=9)  # fmt: skip
+    assert over_parts([[row]])[0][0].off
+    among = over_parts([[row], *[[sound]] * 19])
+    assert [one[0].status for one in among] == ["undecided", *["ok"] * 19]
+
+
+@pytest.fixture(scope="module")
+def tuesday(tmp_path_factory: pytest.TempPathFactory) -> OpenedRows:
+    """Return logged rows with their poses, on the twin's own floor."""
+    store = tmp_path_factory.mktemp("tuesday") / "store"
+    ingest(
+        ROOT / "sample_logs/amr_tuesday", load_profile("warehouse_amr"), store=StoreWriter(store)
+    )
+    return open_rows(store)
+
+
+def test_racks_elsewhere_than_on_the_twins_floor_are_named(tuesday):
+    def judged_on(floor: str, east_m: float) -> RowDiagnosis:
+        assert tuesday.rows.pose is not None
+        moved = replace(tuesday.rows, pose=tuesday.rows.pose + np.array([east_m, 0.0, 0.0]))
+        return diagnose_rows(moved, None, floors=floors_of(floor))
+
+    assert judged_on("default", 0.0).findings == []
+    (found,) = judged_on("default", 1.0).findings
+    assert found.cause == "FLOOR_MOVED"
+    assert "the lidar sees racks 1.0 m east of where 'default' has them" in found.text
+    other = judged_on("generated:10", 0.0)
+    assert other.findings == []
+    (row,) = [row for row in other.not_run if row.check == "floor"]
+    assert "these logs are of another floor" in row.note
+
+
+def test_goals_of_other_missions_are_no_scale_of_the_plan(tuesday):
+    rows = tuesday.rows
+    place = rows.task.observation_names.index("goal_distance")
+    made = [rows.observation.copy(), rows.next_observation.copy()]
+    for held in made:  # the robot drives away from them
+        held[rows.episode % 2 == 0, place] = 0.95 - held[rows.episode % 2 == 0, place]
+    found = diagnose_rows(replace(rows, observation=made[0], next_observation=made[1]), None)
+    assert "GOALS_OF_OTHERS" in {one.cause for one in found.findings}
+    assert not any("plan is" in one.text for one in found.findings)
+    (one,) = [one for one in found.findings if one.cause == "GOALS_OF_OTHERS"]
+    assert re.search(r"in [3-6]\d% of the missions the robot drives and its goal", one.text)
+
+
+@pytest.mark.parametrize("failed", [0.0, 1.0])
+def test_conditions_from_failures_alone_are_named(logs, failed):
+    """Check the selection bias of near collisions that are kept only if they ended badly."""
+    near = logs.episode % 3 == 0
+    held = np.empty(len(logs), object)
+    held[:] = [({"near_collision"} if one else set(), {"closing_traffic"}) for one in near]
+    rows = replace(logs, held=held, success=np.where(near, 1.0 - failed, 1.0))
+    causes = [one.cause for one in diagnose_rows(rows, None).findings]
+    assert causes == (["CHOSEN_ON_OUTCOME"] if failed else [])
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("logged", ["ice", "random driver"])
 def test_ice_and_aimless_driving_are_no_faults(twin, logged, monkeypatch):
@@ -350,7 +429,7 @@ def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None
     opened = open_rows(tmp_path / "other")
     off = [row.check for row in opened.comparisons if row.off]
     assert off == ["labels: blocked_aisle", "terminations"]
-    found = diagnose_rows(opened.rows, None, "there is none", more=opened.comparisons).findings
+    found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
 
 
@@ -367,7 +446,7 @@ def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> Non
     _rewrite(panel, condition=["blocked_aisle"] * len(meta))
     opened = open_rows(panel.path)
     assert _is_in_order(opened.rows)
-    found = diagnose_rows(opened.rows, None, "there is none", more=opened.comparisons).findings
+    found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
     (finding,) = [one for one in found if one.cause.startswith("LABELS_")]
     assert finding.cause == "LABELS_CHANGED"
     assert "nominal 100%" in finding.text

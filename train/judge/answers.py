@@ -8,7 +8,7 @@ comes to when held: which of the twin's actions is that?
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,10 +17,14 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.stats import ConfidenceInterval, cluster_counts, for_few_clusters, percentiles
-from restock.train.judge.fed_rows import Comparison, FedRows, judged, not_run
+from restock.train.judge.fed_rows import Comparison, FedRows, judged, not_run, shares_compared
 
 RESAMPLES = 200
+_ANSWERS = 0.4  # of what should follow; less is none
+_SURELY = 10.0  # times the noise: what moves in a mission, for its answer to be known
 MIN_CLUSTERS = 5
+MIN_BESIDE = 4  # robots or recordings, for one to be the odd one out
+_ALIKE = 0.75  # of the others, for what they agree on to be the measure
 _RIDGE = 1e-4  # of the mean diagonal: lags that the rows do not tell apart
 
 
@@ -36,6 +40,19 @@ class Response:
     gains: F64  # (R,)
     delays: F64  # (R,)
     unexplained_draws: F64  # (R,)
+    offset: float  # of y where x is 0
+    offsets: F64  # (R,)
+    kernel: F64  # (L,)
+    moments: F64  # (C, L + 1, L + 1) of each cluster, of x and y
+
+    def strayed(self, kernel: F64) -> tuple[int, int]:
+        """Count the clusters that surely do not answer by `kernel`, of those that move enough."""
+        xx, xy = self.moments[:, :-1, :-1], self.moments[:, :-1, -1]
+        moved = np.einsum("i,cij,j->c", kernel, xx, kernel)
+        gain = (xy @ kernel) / np.maximum(moved, 1e-12)
+        noise = self.unexplained * self.moments[:, -1, -1].sum() / self.rows
+        sure = moved > _SURELY**2 * max(noise, 1e-12)
+        return int((gain < _ANSWERS)[sure].sum()), int(sure.sum())
 
 
 def fit_response(
@@ -51,6 +68,8 @@ def fit_response(
     clusters = int(place.max(initial=-1)) + 1
     if clusters < MIN_CLUSTERS or not (y**2).sum() or not (x**2).sum():
         return None
+    sums = np.stack([np.bincount(place, column, clusters) for column in (*x.T, y)], axis=1)
+    count = np.bincount(place, minlength=clusters)
     joint = np.concatenate([x, y[:, None]], axis=1)
     width = joint.shape[1]
     moments = np.stack(
@@ -72,9 +91,12 @@ def fit_response(
     delay = (h * lags).sum(axis=1) / safe
     left = yy - 2 * (h * xy).sum(axis=1) + np.einsum("ri,rij,rj->r", h, xx, h)
     unexplained = np.clip(left / np.maximum(yy, 1e-12), 0.0, None)
+    mean = (counts @ sums) / np.maximum(counts @ count, 1)[:, None]
+    offset = mean[:, -1] - (h * mean[:, :-1]).sum(axis=1)
     return Response(
         len(y), clusters, float(gain[0]), float(delay[0]), float(unexplained[0]),
-        gain[1:], delay[1:], unexplained[1:],
+        gain[1:], delay[1:], unexplained[1:], float(offset[0]), offset[1:],
+        h[0], moments.reshape(-1, width, width),
     )  # fmt: skip
 
 
@@ -126,6 +148,11 @@ _MIN_EPISODES = 5  # of a recording that is judged by itself
 _NEAR_STEPS = 5
 _FAR = 0.97  # of the lidar's range: nothing was seen
 SlipLeftOut = Literal["episodes", "rows", "none"]
+GAIN = 1.2  # of logs over the twin's, or its inverse: robots answer differently
+ALIKE = 1.05  # of two sensors that measure one motion
+BESIDE = 1.02  # the same beside the other robots' or recordings'
+BIAS_RADPS, TURN_RADPS = 0.02, 0.06  # of a turn by one sensor where another, or an action, has none
+STRAYED = 0.05  # of the missions
 
 
 @dataclass(frozen=True)
@@ -138,6 +165,8 @@ class Relation:
     lags: Ints
     of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
     gain: float | None = 1.0  # by definition, where there is no twin to ask
+    most: float = GAIN  # times the twin's gain, or its inverse
+    offset: float = math.inf  # most of y where x is 0, less the twin's, in y's unit
 
     def fit(
         self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
@@ -264,13 +293,15 @@ RELATIONS = (
     Relation("speed of the pose to the action", ACTION_SPEED, POSE, COMMANDS,
              lambda rows: (rows.command()[:, 0], rows.after("localised_speed"))),
     Relation("yaw rate of the gyroscope to the action", ACTION_TURN, GYROSCOPE, COMMANDS,
-             lambda rows: (rows.command()[:, 1], rows.after("gyro_yaw_rate"))),
+             lambda rows: (rows.command()[:, 1], rows.after("gyro_yaw_rate")), offset=TURN_RADPS),
     Relation("yaw rate of the wheels to the action", ACTION_TURN, WHEEL_TURN, COMMANDS,
-             lambda rows: (rows.command()[:, 1], _wheel_turn(rows))),
+             lambda rows: (rows.command()[:, 1], _wheel_turn(rows)), offset=TURN_RADPS),
     Relation("speed of the pose to the wheels", WHEEL_SPEED, POSE, SENSORS,
-             lambda rows: (rows.after("wheel_speed"), rows.after("localised_speed"))),
+             lambda rows: (rows.after("wheel_speed"), rows.after("localised_speed")),
+             most=ALIKE),
     Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
-             lambda rows: (rows.after("gyro_yaw_rate"), _wheel_turn(rows))),
+             lambda rows: (rows.after("gyro_yaw_rate"), _wheel_turn(rows)),
+             most=ALIKE, offset=BIAS_RADPS),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
              lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
@@ -284,7 +315,6 @@ RELATIONS = (
 )  # fmt: skip
 
 
-GAIN = 1.2  # of logs over the twin's, or its inverse
 NOISY_GAIN = 2.0  # of relations that are no measurement of the same thing
 DELAY_STEPS = 0.6
 LATEST_STEPS = 2.0  # without a twin: how late a robot may answer to its commands
@@ -350,7 +380,9 @@ def _answer(
     if expected is None:
         return _by_definition(relation, found, what)
     most, most_left = (
-        (GAIN, UNEXPLAINED) if relation.gain is not None else (NOISY_GAIN, NOISY_UNEXPLAINED)
+        (relation.most, UNEXPLAINED)
+        if relation.gain is not None
+        else (NOISY_GAIN, NOISY_UNEXPLAINED)
     )
     fewer = min(found.clusters, expected.clusters)
     gain = ratio_of(found.gains, expected.gains, (found.gain, expected.gain), fewer)
@@ -369,6 +401,12 @@ def _answer(
         ("unexplained", "difference", left, found.unexplained, expected.unexplained, -1.0,
          most_left),
     ]  # fmt: skip
+    if math.isfinite(relation.offset):
+        bias = difference_of(
+            found.offsets, expected.offsets, (found.offset, expected.offset), fewer
+        )
+        compared.append(("offset", "difference", bias, found.offset, expected.offset,
+                         -relation.offset, relation.offset))  # fmt: skip
     made = [
         judged(
             f"{figure}: {name}", what, measure, interval, logs=of_logs, twin=of_twin,
@@ -376,7 +414,42 @@ def _answer(
         )
         for figure, measure, interval, of_logs, of_twin, low, high in compared
     ]  # fmt: skip
+    made.append(
+        shares_compared(
+            f"missions: {name}", "mission without the answer of the " + name,
+            found.strayed(expected.kernel), expected.strayed(expected.kernel), -1.0, STRAYED,
+        )
+    )  # fmt: skip
     return Answer(relation, tuple(made), gain.value, delay.value if timed else 0.0)
+
+
+def beside_others(answers: Sequence[Answer]) -> list[Answer]:
+    """Compare one relation of two sensors in several robots: each with the middle of the others.
+
+    Robots of a fleet differ less from each other than from the twin.
+    """
+    gains = [next((row for row in one.comparisons if row.check.startswith("gain")), None)
+             for one in answers]  # fmt: skip
+    known = [row for row in gains if row is not None and row.effect is not None]
+    if answers[0].relation.most != ALIKE or len(known) < MIN_BESIDE:
+        return list(answers)
+    made = []
+    for one, row in zip(answers, gains, strict=True):
+        others = [other.effect for other in known if other is not row]
+        middle = float(np.median(np.array(others, np.float64)))
+        alike = np.mean(
+            [1 / BESIDE <= (other or 0.0) / (middle or 1.0) <= BESIDE for other in others]
+        )
+        if alike < _ALIKE or row is None or None in (row.effect, row.low, row.high):
+            made.append(one)  # the others do not agree: it may be they
+            continue
+        at = [(value or 0.0) / middle for value in (row.effect, row.low, row.high)]
+        beside = judged(
+            f"gain beside others: {one.relation.name}", row.what, "ratio", ConfidenceInterval(*at),
+            logs=row.effect, twin=middle, least=1 / BESIDE, most=BESIDE, logs_rows=row.logs_rows,
+        )  # fmt: skip
+        made.append(replace(one, comparisons=(*one.comparisons, beside), gain=at[0]))
+    return made
 
 
 def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
@@ -390,7 +463,7 @@ def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
     delay = interval_of(found.delay, found.delays, found.clusters)
     made = [
         judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,
-               least=1 / GAIN, most=GAIN, logs_rows=found.rows),
+               least=1 / relation.most, most=relation.most, logs_rows=found.rows),
     ]  # fmt: skip
     if abs(gain.value) > _KNOWN_GAIN:
         made.append(

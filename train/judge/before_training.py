@@ -9,7 +9,7 @@ that need none still run, and the others say why they did not.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -29,9 +29,25 @@ from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
 from restock.train.evaluation.ope import EssGate
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.judge.answers import Answer, TwinFits, answers, permuted_actions
+from restock.train.judge.answers import (
+    Answer,
+    TwinFits,
+    answers,
+    beside_others,
+    permuted_actions,
+)
 from restock.train.judge.causes import Finding, findings
-from restock.train.judge.fed_rows import Comparison, FedRows, Status, not_run, of_panel, of_store
+from restock.train.judge.fed_rows import (
+    Comparison,
+    FedRows,
+    Flags,
+    Status,
+    not_run,
+    of_panel,
+    of_store,
+    over_parts,
+)
+from restock.train.judge.mission_checks import mission_checks, with_missions
 from restock.train.judge.row_checks import fed_labels, outcomes, row_order, stored, values
 from restock.train.run.run_profile import carried_profile, profile_of_panel
 from restock.train.twin.calibration.logged_steps import logged_steps
@@ -47,6 +63,8 @@ from restock.train.twin.calibration.twin_gap import (
 )
 from restock.train.twin.env.drivers import Handover, Operator, PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.floors import floors_of
+from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.perturbation import Perturbation
 
@@ -87,41 +105,48 @@ _SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wro
 _NAMED = 3
 
 
-def unlike_recordings(
-    logs: FedRows, twin: FedRows | None, seed: int = 0
-) -> tuple[list[Finding], list[Comparison]]:
-    """Return what is wrong in only some recordings, and the comparisons that show it."""
+@dataclass(frozen=True)
+class Part:
+    """Rows that are judged by themselves: all of them, or those of a robot or a recording."""
+
+    name: str  # "" of all rows
+    kind: str  # robots, recordings, …
+    rows: FedRows
+
+
+def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
+    """Return all rows, then each robot's and each recording's, if several have enough rows."""
+    parts = [Part("", "", logs)]
     recordings = len(np.unique(logs.recording))
     if recordings < 2:
-        return [], []
+        return parts, None
     part, kind = _parts(logs)
-    names, rows = np.unique(part, return_counts=True)
-    chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= MIN_ROWS).sum(), MOST)]
+    robots = np.char.add("robot ", logs.robot)
+    levels = [(part, kind)]
+    if len(np.unique(logs.robot)) > 1 and (logs.robot != "").all() and kind != "robots":
+        levels.insert(0, (robots, "robots"))
+        if len(np.unique(part)) == len(np.unique(robots)):  # a recording each
+            levels.pop()
+    compared = []
+    for names_of, each in levels:
+        names, rows = np.unique(names_of, return_counts=True)
+        chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= MIN_ROWS).sum(), MOST)]
+        if len(chosen) > 1:
+            parts += [Part(name, each, logs.take(names_of == name)) for name in chosen.tolist()]
+            inside = np.unique(logs.recording[np.isin(names_of, chosen)])
+            compared.append(
+                f"{len(chosen)} {each} with {MIN_ROWS} rows were compared: {len(inside)} of"
+                f" {recordings} recordings"
+            )
     what = f"each of the {kind} by itself"
-    if len(chosen) < 2:
-        return [], [
-            not_run(RECORDINGS_CHECK, what, f"there are no two {kind} with {MIN_ROWS} rows")
-        ]
-    found: dict[str, list[tuple[str, Finding]]] = {}  # by cause
-    off: list[Comparison] = []
-    of_twin: TwinFits = {}  # the same for every recording
-    for name in chosen.tolist():
-        rows_of = logs.take(part == name)
-        own = [_named(one, name) for one in answers(rows_of, twin, seed, of_twin)]
-        for one in findings(own, [], [], logs.task):
-            found.setdefault(one.cause, []).append((name, one))
-        off += [row for one in own for row in one.comparisons if row.off]
-    some = list(found.values())
-    if any(len(each) > _SOME * len(chosen) for each in some):
-        some = []
-    inside = np.isin(part, chosen)
-    compared = Comparison(
-        RECORDINGS_CHECK, what, "recordings", "off" if some else "ok",
-        logs_rows=int(inside.sum()),
-        note=f"{len(chosen)} {kind} with {MIN_ROWS} rows were compared:"
-        f" {len(np.unique(logs.recording[inside]))} of {recordings} recordings",
+    if not compared:
+        reason = f"there are no two {kind} with {MIN_ROWS} rows"
+        return parts, not_run(RECORDINGS_CHECK, what, reason)
+    rows_compared = sum(len(one.rows) for one in parts[1:] if one.kind == parts[1].kind)
+    return parts, Comparison(
+        RECORDINGS_CHECK, what, "recordings", "ok", logs_rows=rows_compared,
+        note="; ".join(compared),
     )  # fmt: skip
-    return [_joined(each, len(chosen), kind) for each in some], [compared, *(off if some else [])]
 
 
 def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
@@ -157,24 +182,54 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
     return np.asarray(named[place], np.str_)
 
 
-def _named(answer: Answer, recording: str) -> Answer:
-    """Return the answer with the recording in the names of its comparisons."""
-    rows = (replace(row, check=f"{row.check}, {recording}") for row in answer.comparisons)
-    return replace(answer, comparisons=tuple(rows))
+def _of_parts(
+    parts: Sequence[Part], each: Sequence[Sequence[Finding]], files: Mapping[str, str]
+) -> tuple[list[Finding], list[Finding]]:
+    """Return each finding once: those of some robots or recordings, and those of all rows."""
+    found = list(each[0])
+    kinds = {one.kind: sum(other.kind == one.kind for other in parts) for one in parts[1:]}
+    by_cause: dict[tuple[str, str], list[tuple[Part, Finding]]] = {}
+    for part, of_part in zip(parts[1:], each[1:], strict=True):
+        for one in of_part:
+            by_cause.setdefault((one.cause, part.kind), []).append((part, one))
+    of_some: list[Finding] = []
+    for (cause, kind), some in by_cause.items():
+        if any(cause == one.cause for one in of_some):
+            continue  # said of the robot already
+        if len(some) > _SOME * kinds[kind]:
+            if not any(cause == one.cause for one in found):
+                found.append(replace(some[0][1], text=f"in all {kind}: {some[0][1].text}"))
+        else:
+            of_some.append(_joined(some, kinds[kind], files))
+    explained = {check.partition(", ")[0] for one in of_some for check in one.evidence}
+    return of_some, [one for one in found if explained.isdisjoint(one.evidence)]
 
 
-def _joined(each: Sequence[tuple[str, Finding]], compared: int, kind: str) -> Finding:
+def _joined(
+    each: Sequence[tuple[Part, Finding]], compared: int, files: Mapping[str, str]
+) -> Finding:
     """Join the findings of several parts into one, in the words of the first."""
-    names = ", ".join(name for name, _ in each[:_NAMED])
+    names = ", ".join(_called(part, files) for part, _ in each[:_NAMED])
     more = f" and {len(each) - _NAMED} more" if len(each) > _NAMED else ""
-    first = each[0][1]
+    first, kind = each[0][1], each[0][0].kind
     return replace(
         first,
         text=f"in {len(each)} of {compared} {kind} ({names}{more}): {first.text}",
-        remedy="for their recordings alone (the store's `recordings` view has the files and tags):"
-        f" {first.remedy}",
-        evidence=tuple(check for _, one in each for check in one.evidence),
+        remedy=f"for these {kind} alone: {first.remedy}",
+        evidence=tuple(f"{check}, {part.name}" for part, one in each for check in one.evidence),
     )
+
+
+def _called(part: Part, files: Mapping[str, str]) -> str:
+    """Return a part's name, with the files of its recordings."""
+    recordings = np.unique(part.rows.recording).tolist()
+    names = [files.get(one, one) for one in recordings[:_NAMED]]
+    if part.name in recordings:
+        return files.get(part.name, part.name)
+    if not part.name.startswith("robot ") or not set(recordings) <= files.keys():
+        return part.name
+    more = f" and {len(recordings) - _NAMED} more" if len(recordings) > _NAMED else ""
+    return f"{part.name}: {', '.join(names)}{more}"
 
 
 ROBOTS = 24
@@ -189,6 +244,7 @@ def drive_twin(
     *,
     robot: Robot | None = None,
     perturbation: Perturbation | None = None,
+    layouts: str = DEFAULT,
     seed: int = 0,
     robots: int = ROBOTS,
     steps: int = STEPS,
@@ -202,7 +258,7 @@ def drive_twin(
     """
     env = WarehouseVectorEnv(
         robots, conditions=dict.fromkeys(KINDS, 1.0), perturbation=perturbation, seed=seed,
-        nthread=0, task=task, robot=robot,
+        nthread=0, task=task, robot=robot, layouts=layouts,
     )  # fmt: skip
     table = np.asarray(task.actions, np.float64)
     driver = Handover(
@@ -324,8 +380,14 @@ class OpenedRows(NamedTuple):
 
     rows: FedRows
     profile: Profile
-    comparisons: list[Comparison]  # with the signals of their store
+    checks: list[Comparison | Flags]  # with the signals of their store
     folders: list[Path]  # of the store and the panel: where a measured gap may be
+    files: dict[str, str]  # recording -> its file's name
+
+    @property
+    def comparisons(self) -> list[Comparison]:
+        """Return the checks of all rows."""
+        return [one.of(self.rows) if isinstance(one, Flags) else one for one in self.checks]
 
 
 def diagnose_before_training(
@@ -334,6 +396,7 @@ def diagnose_before_training(
     profile: Profile | None = None,
     twin: bool = True,
     perturbation: Perturbation | None = None,
+    layouts: str = DEFAULT,
     task_hash: str | None = None,
     run: Path | str | None = None,
     seed: int = 0,
@@ -344,6 +407,7 @@ def diagnose_before_training(
         profile: whose task and conditions the twin is driven with; None: that of the rows.
         twin: False: only the checks that need none.
         perturbation: of the twin, as `restock twin fit` finds it; None: the nominal one.
+        layouts: the floors that the twin drives on, as `env.layouts`.
         task_hash: whose rows, where a store has several tasks.
         run: the run that was fed these rows, whose measured gap counts first.
 
@@ -355,8 +419,14 @@ def diagnose_before_training(
     begun = time.perf_counter()
     opened = open_rows(Path(path), profile, task_hash)
     own = opened.profile
-    fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not requested")
-    diagnosis = diagnose_rows(opened.rows, fresh, reason, seed=seed, more=opened.comparisons)
+    floors = floors_of(layouts)
+    fresh, reason = (
+        _drive(own, perturbation, layouts, seed) if twin else (None, "it was not requested")
+    )
+    diagnosis = diagnose_rows(
+        opened.rows, fresh, reason, seed=seed, more=opened.checks, files=opened.files,
+        floors=floors if twin else (),
+    )  # fmt: skip
     places = [*([Path(run)] if run is not None else []), *opened.folders]
     diagnosis = replace(diagnosis, comparisons=[*diagnosis.comparisons, *gap_evidence(places)])
     diagnosis.about.update(
@@ -366,27 +436,83 @@ def diagnose_before_training(
     return diagnosis
 
 
+@dataclass(frozen=True)
+class _Checked:
+    """All checks of a part's rows."""
+
+    answers: list[Answer]
+    permuted: list[tuple[Comparison, int]]
+    others: list[Comparison]
+
+    @classmethod
+    def of(
+        cls, rows: FedRows, twin: FedRows | None, seed: int, of_twin: TwinFits,
+        more: Sequence[Comparison | Flags], floors: Sequence[Warehouse],
+    ) -> _Checked:  # fmt: skip
+        elsewhere = [one.of(rows) if isinstance(one, Flags) else one for one in more]
+        return cls(
+            answers(rows, twin, seed, of_twin),
+            list(permuted_actions(rows, twin)),
+            [
+                *outcomes(rows, twin, seed),
+                *row_order(rows),
+                *values(rows, twin, seed),
+                *mission_checks(rows, twin, floors),
+                *elsewhere,
+            ],
+        )
+
+    @property
+    def comparisons(self) -> list[Comparison]:
+        of_relations = [row for one in self.answers for row in one.comparisons]
+        return [*of_relations, *(row for row, _ in self.permuted), *self.others]
+
+    def corrected(self, comparisons: Sequence[Comparison]) -> _Checked:
+        """Return the same with these comparisons, in the order of `comparisons`."""
+        left = iter(comparisons)
+        return _Checked(
+            [replace(one, comparisons=tuple(next(left) for _ in one.comparisons))
+             for one in self.answers],
+            [(next(left), other) for _, other in self.permuted],
+            list(left),
+        )  # fmt: skip
+
+    def findings(self, task: Task) -> list[Finding]:
+        return findings(self.answers, self.permuted, self.others, task)
+
+
 def diagnose_rows(
     rows: FedRows, twin: FedRows | None, reason: str = "", *, seed: int = 0,
-    more: Sequence[Comparison] = (),
+    more: Sequence[Comparison | Flags] = (), floors: Sequence[Warehouse] = (),
+    files: Mapping[str, str] | None = None,
 ) -> RowDiagnosis:  # fmt: skip
-    """Diagnose opened rows.
+    """Diagnose opened rows, all of them and each robot's and recording's.
 
-    `reason` says why there are no rows of a twin. `more` are comparisons made elsewhere, which
-    count alike.
+    `reason` says why there are no rows of a twin. `more` are checks made elsewhere, which count
+    alike. `floors` are those that the twin drives on; `files` names recordings.
     """
-    compared = answers(rows, twin, seed)
-    permuted = list(permuted_actions(rows, twin))
-    others = [*outcomes(rows, twin, seed), *row_order(rows), *values(rows, twin, seed), *more]
-    found = findings(compared, permuted, others, rows.task)
-    comparisons = [row for one in compared for row in one.comparisons]
-    of_relations = {row.check for row in comparisons}
-    comparisons += [row for row, _ in permuted] + others
-    of_robots = [one for one in found if not of_relations.isdisjoint(one.evidence)]
-    if of_robots or not found:  # else the rows are at fault, whichever robot's they are
-        own, unlike = unlike_recordings(rows, twin, seed)
-        comparisons += unlike
-        found = [one for one in found if not own or one not in of_robots] + own
+    parts, compared = parts_of(rows)
+    of_twin: TwinFits = {}  # the same for every part
+    checked = [_Checked.of(part.rows, twin, seed, of_twin, more, floors) for part in parts]
+    for kind in {part.kind for part in parts[1:]}:
+        inside = [place for place, part in enumerate(parts) if part.kind == kind]
+        beside = zip(*(checked[place].answers for place in inside), strict=True)
+        for place, own in zip(inside, zip(*map(beside_others, beside), strict=True), strict=True):
+            checked[place] = replace(checked[place], answers=list(own))
+    checked = [
+        one.corrected(comparisons)
+        for one, comparisons in zip(
+            checked, over_parts([one.comparisons for one in checked]), strict=True
+        )
+    ]
+    some, whole = _of_parts(parts, [one.findings(rows.task) for one in checked], files or {})
+    found = some + whole
+    comparisons = list(checked[0].comparisons)
+    for part, one in zip(parts[1:], checked[1:], strict=True):
+        comparisons += [replace(row, check=f"{row.check}, {part.name}")
+                        for row in one.comparisons if row.off]  # fmt: skip
+    if compared is not None:
+        comparisons.append(replace(compared, status="off" if some else compared.status))
     if twin is None:
         comparisons.append(not_run("twin", "rows of the twin", reason))
     verdict: Verdict = "BUFFER" if found else "HEALTHY"
@@ -415,21 +541,23 @@ def open_rows(
         store_path, version = Path(panel.header.store), panel.store_version
         if version < 0 or not is_store(store_path):
             reason = f"the panel's store is no longer at {store_path}"
-            missing = [
+            missing: list[Comparison | Flags] = [
                 not_run("fed labels", "labels against the store's", reason),
                 not_run("labels", "labels by stored signals", reason),
             ]
-            return OpenedRows(rows, _checked(own, rows, path), missing, [path])
+            return OpenedRows(rows, _checked(own, rows, path), missing, [path], {})
         with Store(store_path, version=version) as store:
             own = _checked(own, rows, path)
             compared = [*fed_labels(store, rows), *_of_store(store, rows, own)]
-            return OpenedRows(rows, own, compared, [store_path, path])
+            rows = with_missions(store, rows)
+            return OpenedRows(rows, own, compared, [store_path, path], _files(store))
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
             rows = of_store(store, chosen)
             own = _checked(profile or _profile_of_store(store, chosen), rows, path)
-            return OpenedRows(rows, own, _of_store(store, rows, own), [path])
+            compared = _of_store(store, rows, own)
+            return OpenedRows(with_missions(store, rows), own, compared, [path], _files(store))
     raise RunError(
         "is not a run, a panel or a store" if path.exists() else "does not exist",
         where=str(path),
@@ -448,7 +576,13 @@ def _checked(own: Profile, rows: FedRows, path: Path) -> Profile:
     )
 
 
-def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison]:
+def _files(store: Store) -> dict[str, str]:
+    """Return the name of each recording's file."""
+    found = store.connection.sql("SELECT recording_id, source_file FROM recordings").fetchall()
+    return {str(name): Path(path).name for name, path in found}
+
+
+def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison | Flags]:
     return list(stored(store, rows, profile, _conditions(profile)))
 
 
@@ -464,11 +598,14 @@ def _profile_of_store(store: Store, task_hash: str) -> Profile:
 
 
 def _drive(
-    profile: Profile, perturbation: Perturbation | None, seed: int
+    profile: Profile, perturbation: Perturbation | None, layouts: str, seed: int
 ) -> tuple[FedRows | None, str]:
     task, robot, conditions = profile.task, profile.robot, _conditions(profile)
     try:
-        return drive_twin(task, conditions, robot=robot, perturbation=perturbation, seed=seed), ""
+        rows = drive_twin(
+            task, conditions, robot=robot, perturbation=perturbation, layouts=layouts, seed=seed
+        )
+        return rows, ""
     except RestockError as error:  # no such robot in the twin: the other checks still say much
         return None, f"the twin cannot be driven with this profile: {error.what}"
 

@@ -27,6 +27,7 @@ from restock.train.judge.answers import (
     Answer,
 )
 from restock.train.judge.fed_rows import Comparison
+from restock.train.judge.mission_checks import CHOSEN
 
 GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
 _KEYS = {  # where a profile says what fills it
@@ -44,6 +45,7 @@ _KEYS = {  # where a profile says what fills it
 }
 VALUES = "VALUES_UNLIKE_TWIN"
 _ARRIVAL = ("terminated at the goal", "goal reward")
+GOALS = "GOALS_OF_OTHERS"
 FOLLOW_FROM = {  # checks that are off because an end is
     GYROSCOPE: ("range: gyro_yaw_rate", "spread: gyro_yaw_rate", "lidar scale"),
     **dict.fromkeys(
@@ -53,7 +55,7 @@ FOLLOW_FROM = {  # checks that are off because an end is
     POSE: (
         *("range: localised_speed", "spread: localised_speed", "range: lateral_speed"),
         *("spread: lateral_speed", "range: goal_distance", "spread: goal_distance", *_ARRIVAL),
-        "lidar scale",
+        *("lidar scale", "goals come nearer", "floor"),
     ),
     PLAN: ("range: goal_distance", "spread: goal_distance", *_ARRIVAL),
     ACCELEROMETER: ("range: accel_x", "spread: accel_x"),
@@ -117,6 +119,8 @@ def findings(
         found = [_permuted(moved, task)]
     if found:
         ends = {end: off for end, off in ends.items() if end not in actions}
+    if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
+        ends.pop(PLAN, None)  # of another goal, not of another scale
     follow = {check for end in ends for check in FOLLOW_FROM.get(end, ())}
     of_rows = [one for one in of_rows if one not in found and not set(one.evidence) <= follow]
     found += [_of_end(end, off, task) for end, off in ends.items()]
@@ -196,7 +200,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
             f"change the sign of {key} in the profile (or its frame of reference)",
             evidence,
         )
-    if scale > 0 and not 1 / GAIN <= scale <= GAIN:
+    if scale > 0 and scale != 1 and not _is_shift(scale, delay):
         unit = next((name for (low, high), name in _UNITS if low <= scale <= high), "")
         unit = unit or next(
             (f"the inverse of {name}" for (low, high), name in _UNITS if low <= 1 / scale <= high),
@@ -223,6 +227,25 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
             f"{'late' if late else 'early'} compared with the other signals{slower}",
             f"check the stamps of {key}: `restock info --clocks` shows each topic's clock; use "
             "the time of measurement, or correct the offset",
+            evidence,
+        )
+    if biases := [row for one in off for row in one.comparisons
+                  if row.off and row.check.startswith("offset")]:  # fmt: skip
+        return Finding(
+            "SENSOR_BIASED",
+            f"the logs' {end} differs by {abs(biases[0].effect or 0.0):.2g} rad/s from the other"
+            " signals also where these show no turn: a bias",
+            f"calibrate the sensor, or correct the zero of {key}",
+            evidence,
+        )
+    if some := [row for one in off for row in one.comparisons
+                if row.off and row.check.startswith("missions")]:  # fmt: skip
+        return Finding(
+            "ACTIONS_MIXED" if is_action else "SENSOR_MIXED",
+            f"in {some[0].logs:.0%} of the missions the logs' {end} does not follow the other"
+            f" signals ({some[0].twin:.0%} in the twin): its sign is opposite there, or it stands"
+            " still, or belongs to other rows",
+            f"check missions one by one: {key} may be right in some and wrong in others",
             evidence,
         )
     return Finding(
@@ -276,7 +299,7 @@ def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Findi
 def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
     """Return findings of checks that imply their cause; the first one claims a check."""
     left = {row.check: row for row in off}
-    found = []
+    found: list[Finding] = []
     for kind in KINDS:
         beside = not kind.beside or any(check in left for check in kind.beside)
         if kind.checks[0] in left and beside:
@@ -292,6 +315,19 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
             )
             found.append(Finding(cause, f"{text} {shares}", remedy, used))
             left = {name: row for name, row in left.items() if name not in used}
+    for name in [one for one in left if one.startswith(CHOSEN)]:
+        row, condition = left.pop(name), name.removeprefix(CHOSEN)
+        found.append(
+            Finding(
+                "CHOSEN_ON_OUTCOME",
+                f"{condition} comes from failures: {row.twin:.0%} of its missions succeed, and"
+                f" {row.logs:.0%} of the others that met the same situations: missions that handled"
+                " it well are missing, or not called so",
+                f"keep missions with {condition} that went well, or draw by situation:"
+                ' [each_condition] kind = "exposure" in the mixture',
+                (name,),
+            )
+        )
     found += [
         Finding(
             VALUES,
@@ -406,6 +442,22 @@ KINDS = (
         ("terminations",),
         "{terminations.logs:.0%} of the logs' terminations do not agree with their signals",
         "ingest the logs again with this profile",
+    ),
+    Kind(
+        GOALS,
+        ("goals come nearer",),
+        "in {goals_come_nearer.logs:.0%} of the missions the robot drives and its goal comes no "
+        "nearer ({goals_come_nearer.twin:.0%} in the twin): these goals and plans belong to other "
+        "missions",
+        "check which goal is in force when a mission begins: the stamps and the order of "
+        "[inputs.goal] and [inputs.plan]",
+    ),
+    Kind(
+        "FLOOR_MOVED",
+        ("floor",),
+        "the lidar sees racks {floor.note}",
+        "correct the origin of the map or of the layout (`map_origin`), or make the floor from "
+        "these logs: `restock twin layout --from STORE --out FLOOR.toml`, and set env.layouts",
     ),
     Kind(
         "EPISODES_REPEATED",

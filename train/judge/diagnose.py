@@ -45,6 +45,7 @@ from restock.train.loop import train
 from restock.train.prepare import prepare_new
 from restock.train.run.run import Run, check_free
 from restock.train.run.run_profile import profile_of_run, run_panel
+from restock.train.twin.floors.layout import DEFAULT
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
 WINDOWS = 3  # the last, that figures are the median of
@@ -253,7 +254,11 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
         twin = given.base if isinstance(given, Schedule) else given
         profile = profile_of_run(run)
         found = diagnose_before_training(
-            Path(path), profile=profile, perturbation=twin, run=run.path
+            Path(path),
+            profile=profile,
+            perturbation=twin,
+            run=run.path,
+            layouts=env.get("layouts", DEFAULT),
         )
         return found, ""
     except RestockError as error:  # a run may be read where its panel is not

@@ -8,8 +8,10 @@ actions, rewards and ends, by the task's own names. So a panel can be judged who
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
@@ -22,9 +24,10 @@ from restock.ingest.task.task import Task, nearness_of
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
-from restock.stats import ConfidenceInterval, wilson
+from restock.stats import ConfidenceInterval, holm, wilson
 
 Status = Literal["ok", "off", "undecided", "not run"]
+TAIL = 0.025  # of a 95 % interval
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Comparison:
     logs_rows: int = 0
     twin_rows: int = 0
     note: str = ""
+    p: float = 1.0  # one-sided, of a value this far beyond the allowed range
 
     @property
     def off(self) -> bool:
@@ -81,8 +85,42 @@ def judged(
         check, what, measure, status, logs, twin,
         interval.value, interval.low, interval.high,
         None if math.isinf(least) else least, None if math.isinf(most) else most,
-        logs_rows, twin_rows, note,
+        logs_rows, twin_rows, note, _beyond(interval, least, most),
     )  # fmt: skip
+
+
+def _beyond(interval: ConfidenceInterval, least: float, most: float) -> float:
+    """Return the one-sided p of the nearest allowed value, by the interval's width."""
+    value = interval.value
+    if value > most:
+        by, half = value - most, value - interval.low
+    elif value < least:
+        by, half = least - value, interval.high - value
+    else:
+        return 1.0
+    z = by / half * NormalDist().inv_cdf(0.975) if half > 0 else math.inf
+    return 1.0 if math.isnan(z) else NormalDist().cdf(-z)
+
+
+def over_parts(parts: Sequence[Sequence[Comparison]]) -> list[list[Comparison]]:
+    """Correct each check for the number of parts (robots, recordings) that it is made in.
+
+    By Holm's method: the chance that a check is off in any part of sound logs is that of one test.
+    """
+    by_check: dict[str, list[float]] = {}
+    for one in parts:
+        for row in one:
+            by_check.setdefault(row.check, []).append(row.p)
+    adjusted = {check: iter(holm(p)) for check, p in by_check.items()}
+    return [
+        [
+            replace(row, status="undecided")
+            if next(adjusted[row.check]) > TAIL and row.off
+            else row
+            for row in one
+        ]
+        for one in parts
+    ]
 
 
 def not_run(check: str, what: str, reason: str) -> Comparison:
@@ -123,6 +161,26 @@ def shares_compared(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Flags:
+    """A check of rows one by one: which of those that it looks at are off."""
+
+    check: str
+    what: str
+    transition_id: Ints  # (M,)
+    off: Bools  # (M,)
+    most: float
+    note: str = ""
+
+    def of(self, rows: FedRows) -> Comparison:
+        """Judge the share of these rows that is off."""
+        inside = np.isin(self.transition_id, rows.transition_id)
+        found = int(self.off[inside].sum())
+        return share_judged(
+            self.check, self.what, found, int(inside.sum()), self.most, note=self.note
+        )
+
+
 _COLUMNS = (
     *("transition_id", "episode_id", "step_index", "recording_id", "robot", "logged_ns"),
     *("condition", "action", "reward", "terminated", "truncated", "observation"),
@@ -151,6 +209,10 @@ class FedRows:
     logged_ns: Ints  # (N,)
     condition: NDArray[np.str_]  # (N,)
     transition_id: Ints  # (N,)
+    # Of a store, if it is at hand:
+    pose: F64 | None = None  # (N, 3) on the map: x and y in m, heading in rad
+    success: F64 | None = None  # (N,) of the row's episode; NaN is unknown
+    held: NDArray[np.object_] | None = None  # (N,) lists of conditions and exposures
     left_out: dict[str, int] = field(default_factory=dict)  # rows, by reason
 
     def __len__(self) -> int:

@@ -31,6 +31,7 @@ from restock.train.judge.fed_rows import (
     MAX_ROWS,
     Comparison,
     FedRows,
+    Flags,
     judged,
     not_run,
     share_judged,
@@ -38,7 +39,7 @@ from restock.train.judge.fed_rows import (
 )
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
-MOST = 0.02  # of the rows
+MOST = 0.005  # of the rows: by definition none is
 _EQUAL = 1e-4
 _MIN_STEPS = 10  # of an episode, for its repetition to be no accident
 
@@ -120,8 +121,8 @@ def _differ(first: F32, second: F32) -> Bools:
     return np.asarray((np.abs(first - second) > _EQUAL).any(axis=1), np.bool_)
 
 
-SCALE = 1.2
-OTHER = 0.1  # of the rows
+SCALE = 1.05
+OTHER = 0.05  # of the rows
 LOST = 0.05  # of the ends
 _JUMP_M = 0.9  # a plan was replaced
 _TOUCHING_M = 0.05
@@ -389,12 +390,12 @@ _ENDS = "termination of the row does not agree with its signals"
 
 def stored(
     store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
-) -> Iterator[Comparison]:
+) -> Iterator[Comparison | Flags]:
     """Check commands, labels and terminations, in whole recordings of about 40,000 rows.
 
     `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
     """
-    yield _far_commands(store, rows.task.hash)
+    yield _far_commands(store, rows)
     recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
     if not recordings:
         for check, what in (("labels", _LABELS), ("terminations", _ENDS)):
@@ -406,31 +407,35 @@ def stored(
     yield _terminations(steps, rows)
 
 
-def fed_labels(store: Store, rows: FedRows) -> Iterator[Comparison]:
+def fed_labels(store: Store, rows: FedRows) -> Iterator[Flags]:
     """Check, per condition, the panel's labels against those of its store."""
     fed = pa.table({"transition_id": rows.transition_id, "fed": rows.condition})
     with passed_in(store.connection, fed=fed):
         found = store.connection.sql(
-            "WITH labels AS (SELECT fed, coalesce(primary_condition, '') AS stored"
-            " FROM fed JOIN transitions USING (transition_id) WHERE task_hash = ?)"
-            " SELECT name, count(*) FILTER (fed <> stored), count(*)"
-            " FROM (SELECT fed AS name, fed, stored FROM labels UNION ALL"
-            " SELECT stored, fed, stored FROM labels WHERE fed <> stored)"
-            " GROUP BY ALL ORDER BY ALL",
+            "SELECT transition_id, fed, coalesce(primary_condition, '') AS stored"
+            " FROM fed JOIN transitions USING (transition_id) WHERE task_hash = ?",
             params=[rows.task.hash],
-        ).fetchall()
-    for name, differ, either in found:
-        yield share_judged(f"fed labels: {name}", _FED, differ, either, DIFFERENT)
+        ).fetchnumpy()
+    names, kept = (np.asarray(found[name]).astype(np.str_) for name in ("fed", "stored"))
+    for name in sorted({*names, *kept}):
+        either = (names == name) | (kept == name)
+        yield Flags(
+            f"fed labels: {name}", _FED, found["transition_id"][either],
+            (names != kept)[either], DIFFERENT,
+        )  # fmt: skip
 
 
-def _far_commands(store: Store, task_hash: str) -> Comparison:
-    ((far, count),) = store.connection.sql(
-        "SELECT count(*) FILTER (action_residual > ?), count(action_residual) FROM transitions"
-        " WHERE task_hash = ?",
-        params=[FAR, task_hash],
-    ).fetchall()
+def _far_commands(store: Store, rows: FedRows) -> Flags:
+    fed = pa.table({"transition_id": rows.transition_id})
+    with passed_in(store.connection, fed=fed):
+        found = store.connection.sql(
+            "SELECT transition_id, action_residual FROM fed JOIN transitions USING (transition_id)"
+            " WHERE task_hash = ? AND action_residual IS NOT NULL",
+            params=[rows.task.hash],
+        ).fetchnumpy()
     what = "command is far from the action that represents it"
-    return share_judged("far commands", what, far, count, COARSE)
+    off = np.asarray(found["action_residual"] > FAR, np.bool_)
+    return Flags("far commands", what, found["transition_id"], off, COARSE)
 
 
 def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
@@ -463,7 +468,7 @@ def _whole(steps: LoggedSteps) -> Bools:
 
 def _labels(
     steps: LoggedSteps, whole: Bools, conditions: Sequence[Condition], note: str
-) -> Iterator[Comparison]:
+) -> Iterator[Comparison | Flags]:
     if not whole.any():
         yield not_run("labels", _LABELS, "no episode is stored whole")
         return
@@ -490,17 +495,19 @@ def _labels(
     for name, holds in again.items():
         now = holds[is_row][back]
         before = steps.conditions.get(name, np.zeros(len(steps), np.bool_))[kept]
-        either = int((now | before).sum())
-        yield share_judged(
-            f"labels: {name}", _LABELS, int((now != before).sum()), either, DIFFERENT, note=note
-        )
+        either = now | before
+        yield Flags(
+            f"labels: {name}", _LABELS, steps.transition_id[kept][either],
+            (now != before)[either], DIFFERENT, note,
+        )  # fmt: skip
 
 
-def _terminations(steps: LoggedSteps, rows: FedRows) -> Comparison:
+def _terminations(steps: LoggedSteps, rows: FedRows) -> Flags:
     place = {number: index for index, number in enumerate(rows.transition_id.tolist())}
     at = np.array([place.get(number, -1) for number in steps.transition_id.tolist()], np.int64)
     known = steps.followed & (at >= 0)
     again = terminated(steps.task, rows_of(steps.after, np.flatnonzero(known)))
     stored_ends = rows.terminated[at[known]]
-    either = int((again | stored_ends).sum())
-    return share_judged("terminations", _ENDS, int((again != stored_ends).sum()), either, DIFFERENT)
+    either = again | stored_ends
+    off = (again != stored_ends)[either]
+    return Flags("terminations", _ENDS, steps.transition_id[known][either], off, DIFFERENT)

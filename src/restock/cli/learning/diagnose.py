@@ -24,10 +24,11 @@ class DiagnoseCommand:
     evidence and an experiment that would confirm it. The figures are from the last three
     evaluations; most of the runs must agree. Faulty rows in the panel change HEALTHY to BUFFER.
 
-    Of a panel or a store, before training, the rows are compared with fresh rows from the twin and
-    with the task's definitions. Do the actions explain the motion? Do
-    rewards and episode ends follow the task? Do the rows follow from one another? This finds
-    systematic errors that no figure of a run shows, and prints the rows that are the evidence.
+    Of a panel or a store, before training, the rows of each robot and recording are compared with
+    fresh rows from the twin and with the task's definitions. Do the actions explain the motion? Do
+    rewards and episode ends follow the task? Do the rows follow from one another? Do goals come
+    nearer, and are the racks where the twin has them? This finds systematic errors that no figure
+    of a run shows, and prints the rows that are the evidence.
 
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """
@@ -35,7 +36,8 @@ class DiagnoseCommand:
     places: Annotated[
         tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")
     ]
-    """Runs of one method (seeds); or one panel or store, whose rows are diagnosed."""
+    """Runs of one method (seeds); or one panel or store, whose rows are diagnosed, and the floors
+    that the twin drives on, as for env.layouts (FLOOR.toml, map.yaml, generated:train)."""
     profile: str | None = None
     """Of a panel or store: the profile with which the rows were ingested. Default: the one stored
     with them."""
@@ -62,8 +64,10 @@ class DiagnoseCommand:
         if not self.places:
             raise ConfigError("needs a run, a panel or a store", where="restock diagnose")
         first, *others = self.places
-        if not others and not (first / "config.json").is_file():
-            return self._before_training(first)
+        if not (first / "config.json").is_file() and not any(
+            (one / "config.json").is_file() for one in others
+        ):
+            return self._before_training(first, ",".join(map(str, others)))
         refuse(
             self,
             ("profile", "perturbation"),
@@ -99,12 +103,13 @@ class DiagnoseCommand:
         failed = self.check and diagnosis.cause != "HEALTHY"
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
-    def _before_training(self, path: Path) -> int:
+    def _before_training(self, path: Path, layouts: str) -> int:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json
         from restock.errors import ExitCode
         from restock.ingest.profile.profile import load_profile
         from restock.train.judge.before_training import diagnose_before_training
+        from restock.train.twin.floors.layout import DEFAULT
         from restock.train.twin.physics.perturbation import load_perturbation
 
         refuse(self, ("confirm",), "applies only to a run", remedy="leave it out")
@@ -112,6 +117,7 @@ class DiagnoseCommand:
             path,
             profile=None if self.profile is None else load_profile(self.profile),
             twin=self.twin,
+            layouts=layouts or DEFAULT,
             perturbation=None
             if self.perturbation is None
             else load_perturbation(self.perturbation),
