@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from glob import has_magic
 from importlib import resources
 from pathlib import Path
+from typing import Self
 
 import duckdb
 import msgspec
@@ -17,8 +18,9 @@ import pyarrow.parquet as pq
 from restock.errors import RecordingError, RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
-from restock.replay.store.definitions import definitions
+from restock.replay.store.definitions import definitions, install_named
 from restock.replay.store.parquet_views import REMAKE, read_parquet
+from restock.replay.store.query import query
 from restock.replay.store.store import Store, is_store, set_memory_limit
 
 RUN_CONFIG = "config.json"
@@ -110,13 +112,90 @@ def _topics(
     return Topics(connection, path, lost)
 
 
+# Table of a place -> what its rows say of conditions, and what there is to see first.
+_COVERAGE = {
+    "rows": "SELECT condition, count(*) AS rows FROM rows GROUP BY ALL ORDER BY ALL",
+    "replay_audit": "SELECT condition, count(*) AS sampled FROM replay_audit GROUP BY ALL ORDER BY"
+    " ALL",
+}
+_OVERVIEW = {"topics": "FROM topics", "strata": "FROM strata"}
+
+
+class Place:
+    """A run, a panel or recordings, open for reading. Close it, or use it as a context manager.
+
+    Args:
+        path: a run's or a panel's folder; a recording, a folder of recordings, or a glob.
+
+    `lost` lists what recordings have lost: damage, and messages of topics that were read.
+
+    Raises:
+        StoreError: there is nothing that can be queried.
+        RecordingError: as `open_place` does.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path, self.lost = Path(path), list[str]()
+        self._opened = ExitStack()
+        place = open_place(path, lost=self.lost.append)
+        self._connection = self._opened.enter_context(place)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Place {self.path}>"
+
+    def close(self) -> None:
+        """Close its files."""
+        self._opened.close()
+
+    def sql(self, text: str) -> duckdb.DuckDBPyRelation:
+        """Return the result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
+
+        Raises:
+            QueryError: DuckDB's message, or the query would write.
+        """
+        return query(self._connection, text, where=str(self.path))
+
+    def coverage(self) -> duckdb.DuckDBPyRelation:
+        """Return the rows of each condition: of a panel the packed ones, of a run the sampled ones.
+
+        Raises:
+            StoreError: it has no labels, as a recording has none.
+        """
+        text = self._first(_COVERAGE)
+        if text is None:
+            raise StoreError(
+                "it has no labels of conditions",
+                where=str(self.path),
+                remedy="`restock ingest RECORDINGS --store STORE` labels them, in a store",
+            )
+        return self.sql(text)
+
+    def show(self) -> None:
+        """Print what it holds: the topics of recordings, or the strata of a panel or a run."""
+        text = self._first(_OVERVIEW) or "FROM columns"
+        self.sql(text).show()
+
+    def _first(self, questions: Mapping[str, str]) -> str | None:
+        """Return the first question about a table that is there."""
+        install_named(self._connection, " ".join(questions))
+        found = self._connection.sql("SHOW TABLES").fetchall()
+        names = {name for (name,) in found}
+        return next((text for table, text in questions.items() if table in names), None)
+
+
 def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None:
     """Let the connection read no file and no Python object but those of a folder."""
     folders = [] if folder is None else [str(folder), str(folder.absolute())]
     listed = ", ".join("'" + one.replace("'", "''") + "'" for one in folders)
     connection.execute(
         f"SET allowed_directories = [{listed}]; SET enable_external_access = false;"
-        " SET python_enable_replacements = false"
+        " SET python_enable_replacements = false; SET enable_progress_bar = false"
     )
 
 

@@ -231,6 +231,14 @@ class Store:
                 remedy="open a Store in each thread",
             ) from error
 
+    def coverage(self) -> duckdb.DuckDBPyRelation:
+        """Return how many rows, episodes and recordings hold each condition."""
+        return self.sql("FROM coverage_by_condition")
+
+    def show(self) -> None:
+        """Print its coverage."""
+        self.coverage().show()
+
     def add_tables(self, names: tuple[str, ...], install: Callable[[Store], None]) -> None:
         """Call `install` with this store before the first query that contains one of `names`."""
         self._definitions.computed[names] = partial(install, self)

@@ -16,6 +16,7 @@ from restock.errors import RestockError
 from restock.process import when_imported
 
 if TYPE_CHECKING:
+    from pathlib import Path
     from types import ModuleType
 
     from restock import ingest as ingest
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from restock import report as report
     from restock import train as train
     from restock import twin as twin
+    from restock.replay.places import Place
     from restock.replay.store.store import Store
 
     __version__: str
@@ -43,17 +45,26 @@ def _register() -> None:
 when_imported("gymnasium", _register)
 
 
-def open(store: str, *, version: int | str | None = None) -> Store:
-    """Open a store of transitions for reading: `restock.open("store").sql("FROM coverage")`.
+def open(path: str | Path, *, version: int | str | None = None) -> Store | Place:
+    """Open a store, a run, a panel or recordings: `restock.open("store").sql("FROM coverage")`.
 
-    `version` opens it as it was: a version's number, or an ISO 8601 time. So does `"store@12"`.
+    Each has `.sql(query)`, `.coverage()` and `.show()`; a folder of recordings and a glob are
+    recordings, too. `version` opens a store as it was: a version's number, or an ISO 8601 time. So
+    does `"store@12"`.
     """
-    from restock.ingest.store.version import parse_version
-    from restock.replay.places import add_computed_tables
-    from restock.replay.store.store import Store
+    from glob import has_magic
 
+    from restock.ingest.store.location import Location
+    from restock.ingest.store.version import parse_version
+    from restock.replay.places import Place, add_computed_tables
+    from restock.replay.store.store import Store, is_store
+
+    place = Location.of(path)
+    other = place.folder is not None and (place.folder.exists() or has_magic(str(path)))
+    if version is None and place.version is None and other and not is_store(place):
+        return Place(path)
     moment = parse_version(version) if isinstance(version, str) else version
-    opened = Store(store, version=moment)
+    opened = Store(path, version=moment)
     add_computed_tables(opened)
     return opened
 

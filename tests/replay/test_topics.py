@@ -12,10 +12,13 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from support.bag_samples import TOPICS, write_bag
+from support.panels import panel_of
 from support.paths import SHARED
 
+import restock
 from restock import cli
 from restock.ingest.containers.recording import Recording
+from restock.replay.mixture.mixture import load_mixture
 
 BAGS = [
     "turtlebot3-sim-humble/rosbag_0.db3",
@@ -200,3 +203,23 @@ def test_a_topic_that_cannot_be_decoded_is_refused(tmp_path, capsys):
         writer.finish()
     assert cli.main(["sql", str(tmp_path / "a.mcap"), 'FROM "/own"']) == 2
     assert "/own cannot be decoded" in capsys.readouterr().err
+
+
+def test_python_opens_a_recording_a_panel_and_a_store_alike(store_path, tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag")
+    panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "panel").path
+    for place, shown in ((bag, "/odom"), (panel, "logs"), (store_path, "wheel_slip")):
+        with restock.open(place) as opened:
+            opened.show()
+            assert shown in capsys.readouterr().out
+            assert opened.sql("SELECT 1").fetchall() == [(1,)]
+            if place != bag:
+                assert {"nominal", "wheel_slip"} <= {row[0] for row in opened.coverage().fetchall()}
+    with restock.open(bag) as opened:
+        table = opened.sql("SELECT ranges FROM scan").to_arrow_table()
+        assert len(table) == 20
+        assert opened.lost == []
+        with pytest.raises(restock.RestockError, match="has no labels"):
+            opened.coverage()
+    with pytest.raises(restock.RestockError, match="no such store"):
+        restock.open(tmp_path / "nowhere")
