@@ -30,6 +30,7 @@ from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.task import Signals, nearest_action, observe
+from restock.ingest.task.tracks import Tracker
 
 _DELAYS = 200  # of each topic, of which the median counts
 _MINUTES = 10  # over which drift is looked for
@@ -234,6 +235,7 @@ class LiveObserver:
         self._command: _Message | None = None  # the first since the last tick, or the last before
         self._ticked = True
         self._before_ns: int | None = None
+        self._tracker = Tracker(self.task) if self.task.tracks else None
 
     @property
     def topics(self) -> dict[str, str]:
@@ -296,7 +298,7 @@ class LiveObserver:
         segment = ClockSegment(samples, ClockMap.constant(offset_ns))
         at = [np.array(ticks, np.int64)]
         filling = Filling(AlignedInputs(self.profile, inputs, [segment], at))
-        signals = filling.fill()
+        signals = filling.fill(self._tracker)
         last = len(ticks) - 1
         before = last - int(filling.follows[last])
         now, then = (

@@ -288,7 +288,17 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
 
 
 def without_lidar(profile: Profile) -> Profile:
-    """Return the profile of the same robot without a lidar: without scans and sectors."""
+    """Return the profile of the same robot without a lidar: without scans and sectors.
+
+    Raises:
+        ConfigError: its task asks for tracks.
+    """
+    if profile.task.tracks:
+        raise ConfigError(
+            "`task.tracks` asks for tracks, which are made from lidar scans, and there are none",
+            where=f"profile {profile.name!r}",
+            remedy="leave `tracks` out of [task], or give the robot's scans in [inputs.scan]",
+        )
     return msgspec.structs.replace(
         profile,
         inputs=msgspec.structs.replace(profile.inputs, **dict.fromkeys(SCANS)),

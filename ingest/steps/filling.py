@@ -23,10 +23,19 @@ from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.frames import motion_at
-from restock.ingest.steps.needs import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction
+from restock.ingest.steps.needs import (
+    BEAMS,
+    BLIND,
+    CLOSE,
+    FINE,
+    SECTORS,
+    UNAIMED,
+    scan_reduction,
+)
 from restock.ingest.task.hindsight import missions
 from restock.ingest.task.schema import Perturbed
 from restock.ingest.task.surroundings import (
+    MOTION,
     PLAN_PARTS,
     SCANNED,
     RouteView,
@@ -38,7 +47,15 @@ from restock.ingest.task.surroundings import (
     view_route,
     with_unseen,
 )
-from restock.ingest.task.task import Signals, Task, clearance_ahead, localised_velocity
+from restock.ingest.task.task import (
+    TRACK_SIGNALS,
+    Signals,
+    Task,
+    clearance_ahead,
+    localised_velocity,
+)
+from restock.ingest.task.tracks import SECTORS as FINE_SECTORS
+from restock.ingest.task.tracks import Tracker
 
 # A number beyond this, in any unit that a signal has, is a fault: of a position, a store's float32
 # could not tell centimetres apart.
@@ -173,11 +190,17 @@ class Filling:
         self.signals: Signals = {"stamp_ns": self.tick_ns}
         self.routing = Routing.none(len(self.tick_ns))
         self.located = np.zeros(len(self.tick_ns), np.bool_)  # the pose is known
+        self.scan_m = np.zeros((0, FINE_SECTORS))  # of each tick, if tracks are asked for
+        self.scan_stamp_ns = np.zeros(len(self.tick_ns), np.int64)
         self.notes: list[str] = []
         self.stand_ins: dict[str, str] = {}  # of inputs none of whose messages has an estimate
 
-    def fill(self) -> Signals:
-        """Compute every signal; the attributes then hold what else is known of the ticks."""
+    def fill(self, tracker: Tracker | None = None) -> Signals:
+        """Compute every signal; the attributes then hold what else is known of the ticks.
+
+        `tracker` knows the ticks before the last one, as a running robot's does; only the last one
+        then has tracks.
+        """
         self._numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
         )
@@ -227,7 +250,27 @@ class Filling:
             for rows in _chunks(len(before))
         ]
         signals["came_nearer_m"] = np.concatenate([np.zeros(0), *came])
+        if self.task.tracks:
+            signals |= self._tracks(signals, tracker)
         return signals
+
+    def _tracks(self, signals: Signals, tracker: Tracker | None) -> Signals:
+        """Track who moves, tick by tick; anew where one does not follow the tick before."""
+        count, one = len(self.tick_ns), np.array([0])
+        ticks = range(count) if tracker is None else range(count - 1, count)
+        tracker = tracker or Tracker(self.task)
+        found = {name: np.full((count, self.task.tracks or 0), np.nan) for name in TRACK_SIGNALS}
+        odometry = {name: signals[name] for name in (*MOTION, "wheel_speed_mps")}
+        for tick in ticks:
+            now = {name: column[[tick]] for name, column in odometry.items()}
+            scan = self.scan_m[[tick]], self.scan_stamp_ns[[tick]]
+            if self.follows[tick]:
+                tracks = tracker.update(now, *scan)
+            else:
+                tracks = tracker.begin(one, now, *scan)
+            for name, values in tracks.items():
+                found[name][tick] = values[0]
+        return found
 
     @property
     def follows(self) -> Bools:
@@ -378,6 +421,8 @@ class Filling:
         """
         count = len(self.tick_ns)
         sectors = np.full((count, self.task.sectors), np.nan)
+        if self.task.tracks:
+            self.scan_m = np.full((count, FINE_SECTORS), np.inf)
         if "scan" not in self.inputs.by_name and self.task.lidar:
             self._mark_invalid(np.ones(count, np.bool_), "scan: not yet received")
         for name, source in self.profile.inputs.scans.items():
@@ -409,6 +454,10 @@ class Filling:
             bad[fresh] = np.asarray(fields[flag])[rows]
             self._mark_invalid(bad, f"{name}: {reason}")
         sectors[fresh] = np.fmin(sectors[fresh], np.asarray(fields[SECTORS])[rows])
+        if self.task.tracks:
+            self.scan_m[fresh] = np.minimum(self.scan_m[fresh], np.asarray(fields[FINE])[rows])
+            stamp_ns = self.tick_ns - latest.age_ns
+            self.scan_stamp_ns[fresh] = np.maximum(self.scan_stamp_ns, stamp_ns)[fresh]
 
     def _bumper(self) -> None:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]

@@ -40,6 +40,8 @@ from restock.ingest.steps.custom_columns import custom_reduction
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.task.surroundings import MovedMap, SectorMap
 from restock.ingest.task.task import Task
+from restock.ingest.task.tracks import SECTORS as FINE_SECTORS
+from restock.ingest.task.tracks import Lidar
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf
@@ -397,6 +399,7 @@ def _children(recording: Recording, topic: str) -> Iterator[str]:
 
 # What is made of a scan, beside the message's own fields (whose names hold no space).
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
+FINE = "nearest return of each fine sector"  # (N, FINE_SECTORS) float64, m; if tracks are asked for
 BEAMS = "number of beams"  # (N,) int64
 CLOSE = "whether a beam is too close to be measured"  # (N,) bool: -inf (REP 117)
 BLIND = "whether no beam has a valid range"  # (N,) bool; inf is one: nothing was hit
@@ -408,7 +411,7 @@ _TURNS_RAD = 4 * np.pi  # angles beyond two turns are not in radians
 
 
 def scan_reduction(task: Task, source: Input) -> Reduction:
-    """Build the reduction of an input's scans to SECTORS, BEAMS, CLOSE, BLIND and UNAIMED.
+    """Build the reduction of an input's scans to SECTORS, BEAMS, CLOSE, BLIND, UNAIMED and FINE.
 
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
@@ -439,7 +442,7 @@ class _ScanReducer:
         self.task, self.source = task, source
         fields = source.fields
         self.paths = [fields[key] for key in ("ranges_m", *angle_keys(fields))]
-        self._maps: dict[tuple[float, float, int], SectorMap | MovedMap] = {}
+        self._maps: dict[tuple[float, float, int], tuple[SectorMap | MovedMap, Lidar]] = {}
 
     def __call__(self, fields: Fields) -> dict[str, FieldColumn]:
         ranges = fields[self.paths[0]]
@@ -450,6 +453,7 @@ class _ScanReducer:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
         first, increment = beam_angles(self.source, first, last, beams)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
+        fine = np.full((len(beams), FINE_SECTORS if self.task.tracks else 0), np.inf)
         close, blind = np.zeros((2, len(beams)), np.bool_)
         with np.errstate(invalid="ignore", over="ignore"):
             angles = np.maximum(np.abs(first), np.abs(first + increment * (beams - 1)))
@@ -457,17 +461,19 @@ class _ScanReducer:
         unaimed |= (beams > 1) & (increment == 0)
         geometry = np.stack([first, increment, np.where(unaimed, 0, beams)], axis=1)
         if len(geometry) and (geometry == geometry[0]).all():
-            self._fill(clearance, close, blind, ranges, None, geometry[0])
+            self._fill(clearance, fine, close, blind, ranges, None, geometry[0])
         else:
             kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
             for index, one in enumerate(kinds):
                 rows = np.flatnonzero(kind == index)
-                self._fill(clearance, close, blind, ranges, rows, one)
-        return {SECTORS: clearance, BEAMS: beams, CLOSE: close, BLIND: blind, UNAIMED: unaimed}
+                self._fill(clearance, fine, close, blind, ranges, rows, one)
+        made = {SECTORS: clearance, BEAMS: beams, CLOSE: close, BLIND: blind, UNAIMED: unaimed}
+        return made | ({FINE: fine} if self.task.tracks else {})
 
     def _fill(
         self,
         clearance: NDArray[np.float64],
+        fine: NDArray[np.float64],
         close: NDArray[np.bool_],
         blind: NDArray[np.bool_],
         ranges: FieldColumn,
@@ -478,7 +484,7 @@ class _ScanReducer:
         first, increment, beams = float(geometry[0]), float(geometry[1]), int(geometry[2])
         if not beams:
             return
-        sectors, task = self._map(first, increment, beams), self.task
+        (sectors, lidar), task = self._map(first, increment, beams), self.task
         count = len(clearance) if rows is None else len(rows)
         some = max(_VALUES // beams, 1)
         for start in range(0, count, some):
@@ -493,6 +499,8 @@ class _ScanReducer:
             table = np.asarray(values).reshape(stop - start, beams)
             found = sectors.clearance(table, task.range_min_m, task.range_max_m)
             clearance[here] = found
+            if task.tracks:
+                fine[here] = lidar.scan(np.asarray(table, np.float64), task.range_min_m)
             close[here] = np.isneginf(table).any(axis=1)
             seen = (found < task.range_max_m).any(axis=1)  # False for NaN: no beam ends there
             free = np.flatnonzero(~seen | close[here])
@@ -501,21 +509,23 @@ class _ScanReducer:
                     table[free] >= task.range_min_m  # False for NaN
                 ).any(axis=1)
 
-    def _map(self, first: float, increment: float, beams: int) -> SectorMap | MovedMap:
+    def _map(
+        self, first: float, increment: float, beams: int
+    ) -> tuple[SectorMap | MovedMap, Lidar]:
         key = (first, increment, beams)
-        sectors = self._maps.get(key)
-        if sectors is None:
+        if key not in self._maps:
             if len(self._maps) >= _MAPS:
                 self._maps.clear()
             bearings = first + increment * np.arange(beams)
             count, body, at_m = self.task.sectors, self.task.body, self.source.lidar_at_m
             if at_m is None:
-                sectors = SectorMap.build(bearings, count, body)
+                turned = bearings + body.lidar_yaw_rad
+                self._maps[key] = SectorMap.build(bearings, count, body), Lidar(turned)
             else:
                 turned = bearings + (self.source.lidar_yaw_rad or 0.0)
-                sectors = MovedMap.build(turned, count, body, at_m)
-            self._maps[key] = sectors
-        return sectors
+                moved = MovedMap.build(turned, count, body, at_m)
+                self._maps[key] = moved, Lidar(turned, moved.from_m)
+        return self._maps[key]
 
     def _angle(self, fields: Fields, path: str) -> NDArray[np.float64]:
         column = fields[path]

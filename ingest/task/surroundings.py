@@ -262,8 +262,8 @@ FASTEST_MPS = 2.0  # that anybody walks: a return that comes faster was hidden b
 MIN_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
-_MOTION = (*("stamp_ns", "gyro_yaw_rate_radps"), *("localised_speed_mps", "localised_lateral_mps"))
-SCANNED = (*_MOTION, "sector_clearance_m")  # the signals that `came_nearer` takes
+MOTION = (*("stamp_ns", "gyro_yaw_rate_radps"), *("localised_speed_mps", "localised_lateral_mps"))
+SCANNED = (*MOTION, "sector_clearance_m")  # the signals that `came_nearer` takes
 _ROUNDING_M = 1e-6  # of a range that is the lidar's longest: nothing came back
 
 
@@ -343,7 +343,7 @@ def _motions(scans: Sequence[Signals]) -> F64:
 
     As x, y, cosine and sine of the turn, (steps - 1, 4, N).
     """
-    stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in _MOTION)
+    stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in MOTION)
     elapsed_s = (stamp_ns[:-1] - stamp_ns[1:]) * 1e-9
     turn = elapsed_s * (rate[:-1] + rate[1:]) / 2
     forward, left = elapsed_s * forward[:-1], elapsed_s * left[:-1]

@@ -93,6 +93,10 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("nav_yaw_rate_radps", "yaw rate that navigation proposes, or unknown", optional=True),
 )
 
+# Beside them, (K,) per step and not stored, if the task asks for K tracks (NaN: fewer are tracked):
+# places in the body frame, ground velocity along the body's axes, seconds since first seen.
+TRACK_SIGNALS = ("track_x_m", "track_y_m", "track_vx_mps", "track_vy_mps", "track_age_s")
+
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
 OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # rest on it
@@ -206,6 +210,8 @@ class Task(Checked, frozen=True):
     far_m: Annotated[float, Meta(gt=0)] = 2.2
     goal_radius_m: Annotated[float, Meta(gt=0)] = 0.4
     time_limit_steps: Annotated[int, Meta(ge=1)] = 240
+    # How many of those who move are observed, the nearest ones; left out, a task is as without it.
+    tracks: Annotated[int, Meta(ge=1, le=16)] | msgspec.UnsetType = msgspec.UNSET
     bump_terminates: bool = False  # a bump ends the episode (protective stop)
     rewards: Rewards = Rewards()
 
@@ -219,6 +225,8 @@ class Task(Checked, frozen=True):
             )
         if self.sectors % 2 or self.sectors == 2:
             raise ValueError(f"sectors must be even and 4 or more, or 0, got {self.sectors}")
+        if self.tracks and not self.sectors:
+            raise ValueError("tracks needs a lidar: leave it out, or name scans in [inputs.scan]")
         if self.range_max_m <= self.range_min_m:
             raise ValueError(
                 f"range_max_m must be above range_min_m, got {self.range_max_m:g} and"
@@ -242,11 +250,16 @@ class Task(Checked, frozen=True):
             *(f"clearance_{bearing:+.0f}deg" for bearing in bearings),
             *(f"closing_{bearing:+.0f}deg" for bearing in bearings),
             *("nav_known", "nav_speed", "nav_yaw_rate"),
+            *(
+                f"track_{entry}_{place}"
+                for entry in ("x", "y", "vx", "vy", "age", "known")
+                for place in range(self.tracks or 0)
+            ),
         ]
 
     @property
     def observation_size(self) -> int:
-        return 12 + len(self.actions) + 2 * self.sectors + 3
+        return 12 + len(self.actions) + 2 * self.sectors + 3 + 6 * (self.tracks or 0)
 
     @property
     def scaled_actions(self) -> NDArray[np.float64]:
@@ -322,7 +335,8 @@ class Mirror:
         at += len(table)
         for begin in (at, at + task.sectors):  # clearance and closing, from behind right to left
             source[begin : begin + task.sectors] = source[begin : begin + task.sectors][::-1]
-        sign = np.where(np.isin(names, _ODD), -1.0, 1.0).astype(np.float32)
+        odd = [name in _ODD or name.startswith(("track_y", "track_vy")) for name in names]
+        sign = np.where(odd, -1.0, 1.0).astype(np.float32)
         return cls(source, sign, opposite)
 
     def observation(self, observation: F32) -> F32:
@@ -365,6 +379,8 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
     one_hot = np.eye(len(task.actions))[previous_action]
     proposed = _proposed(task, now)
     parts = [scalars, one_hot, clearance, closing, proposed]
+    if task.tracks:
+        parts.append(_tracked(task, now))
     return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
@@ -467,6 +483,19 @@ def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
     known = np.isfinite(command).all(axis=-1, keepdims=True)
     scaled = np.clip(np.where(known, command, 0.0) / _fastest(task), -2.0, 2.0)
     return np.concatenate([known, scaled], axis=-1)
+
+
+def _tracked(task: Task, now: Signals) -> NDArray[np.float64]:
+    """Return the tracks' entries (N, 6 K); all 0 where there is none.
+
+    Places are in units of the lidar's range, up to twice that.
+    """
+    x, y, *rest = (now[name] for name in TRACK_SIGNALS)
+    known = np.isfinite(x)
+    near = [np.clip(place / task.range_max_m, -2.0, 2.0) for place in (x, y)]
+    speed = [np.clip(value, -3.0, 3.0) for value in rest[:2]]
+    entries = [*near, *speed, np.minimum(rest[2], 2.0) / 2.0]
+    return np.concatenate([*(np.where(known, entry, 0.0) for entry in entries), known], axis=-1)
 
 
 def proposal_reader(task: Task) -> tuple[F64, F64, F64]:

@@ -19,7 +19,7 @@ from restock.ingest.live.observer import LiveObserver
 from restock.ingest.live.pilot import Pilot, play
 from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.profile.tables import Frames
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
@@ -34,14 +34,37 @@ TASK = PROFILE.task
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return an exported policy that never learnt anything: which one it is does not matter."""
+    return exported(tmp_path_factory.mktemp("runs"))
+
+
+def exported(folder: Path, profile: str = "warehouse_amr") -> Path:
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     from restock.train.evaluation.onnx_policy import export_onnx
 
-    path = kept_run(tmp_path_factory.mktemp("runs") / "a")
-    out = path.parent / "policy.onnx"
-    export_onnx(path, out)
+    out = folder / "policy.onnx"
+    export_onnx(kept_run(folder / "a", profile=profile), out)
     return out
+
+
+@pytest.mark.long
+def test_live_tracks_equal_those_of_ingest(tmp_path):
+    text = profile_toml(PROFILE).replace("\n[task]\n", "\n[task]\ntracks = 3\n")
+    (tmp_path / "tracking.toml").write_text(text)
+    profile = load_profile(tmp_path / "tracking.toml")
+    policy = PolicyFile(exported(tmp_path, str(tmp_path / "tracking.toml")))
+    decisions = {one.log_time_ns: one.decision for one in play(Pilot(policy, None), BAG)}
+    ingest(BAG, profile, store=StoreWriter(tmp_path / "store"))
+    with Store(tmp_path / "store") as store:
+        rows = store.sql(
+            "SELECT observation, stamp_ns + clock_offset_ns AS log_time_ns FROM transitions"
+            " JOIN (SELECT ingest_id, clock_offset_ns FROM recordings) USING (ingest_id)"
+        ).to_arrow_table()
+    stored = np.stack(rows["observation"].to_pylist()).astype(np.float32)[:, -18:]
+    live = [decisions[at].observed.observation[-18:] for at in rows["log_time_ns"].to_pylist()]
+    assert stored[:, -3].sum() > 20  # steps with a track
+    # A running robot knows its clock's offset within microseconds.
+    np.testing.assert_allclose(np.stack(live), stored, atol=1e-4)
 
 
 @pytest.mark.long

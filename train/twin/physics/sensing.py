@@ -32,6 +32,8 @@ from restock.ingest.task.task import (
     localised_velocity,
     wrap_angle,
 )
+from restock.ingest.task.tracks import Lidar as FineLidar
+from restock.ingest.task.tracks import Tracker
 from restock.state import Stateful
 from restock.train.twin.physics.model import passed_over
 from restock.train.twin.physics.perturbation import Perturbation
@@ -48,13 +50,15 @@ _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 class Sensing(Stateful):
     """The sensors of N robots."""
 
-    STATE = ("ranges_m", "pose", "pose_stamp_ns", "true_clearance_m", "scanned")
+    STATE = ("ranges_m", "pose", "pose_stamp_ns", "true_clearance_m", "scanned", "tracker")
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation, self.task = simulation, task
         # Truth is told by the beams of the lidar that the twin has, also where the robot has none,
         # if these see everything.
         self.beams = SectorMap.build(simulation.bearings_rad, max(task.sectors, 4), task.body)
+        self._fine = FineLidar(simulation.bearings_rad + task.body.lidar_yaw_rad)
+        self.tracker = Tracker(task, simulation.num_envs) if task.tracks else None
         self._around = None if _sees_everything(simulation) else _Around(simulation)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
@@ -162,7 +166,7 @@ class Sensing(Stateful):
         }
 
     def add_motion(self, ids: Ints, signals: Signals, before: Signals | None = None) -> None:
-        """Add speeds from the last two localised poses, and how far others came nearer.
+        """Add speeds from the last two localised poses, how far others came nearer, and tracks.
 
         Signals are those of all robots. At the first step of an episode they are only those of
         `ids` (n,), without `before`: then speeds are the wheels', and nobody came nearer.
@@ -174,9 +178,24 @@ class Sensing(Stateful):
                 for name, column in scan.items():
                     column[ids] = signals[name]
             signals["came_nearer_m"] = came_nearer(self.task, signals, [signals])
+            self._track(ids, signals, begin=True)
             return
         signals["came_nearer_m"] = came_nearer(self.task, signals, self.scanned)
         self.scanned = [{name: signals[name].copy() for name in SCANNED}, *self.scanned[:-1]]
+        self._track(ids, signals)
+
+    def _track(self, ids: Ints, signals: Signals, *, begin: bool = False) -> None:
+        """Add the tracks of robots `ids` to their signals: all robots, unless episodes `begin`."""
+        if self.tracker is None:
+            return
+        scan_m = self._fine.scan(self.ranges_m[ids], self.task.range_min_m)
+        period_ns = round(self.task.control_period_s * 1e9)
+        step = (signals["stamp_ns"] - FIRST_STAMP_NS) // period_ns
+        stamp_ns = signals["stamp_ns"] - step % self._scan_every[ids] * period_ns
+        if begin:
+            signals |= self.tracker.begin(ids, signals, scan_m, stamp_ns)
+        else:
+            signals |= self.tracker.update(signals, scan_m, stamp_ns)
 
 
 class _Around:

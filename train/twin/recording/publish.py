@@ -70,6 +70,7 @@ DELAYS = {
     "/cmd_vel": Delay(0.2),
 }
 MAX_NETWORK_MS = 3.0
+TRAFFIC_HZ = 2.0  # while anyone moves
 
 
 Hertz = Annotated[float, Meta(gt=0, le=200)]
@@ -87,7 +88,6 @@ class Rates(Checked, frozen=True):
     bumper: Hertz = 10.0
     diagnostics: Hertz = 1.0
     plan: Hertz = 1.0  # and whenever it changes
-    traffic: Hertz = 2.0  # while anyone moves
 
     def check(self) -> None:
         if self.scan not in (5, 10):
@@ -293,7 +293,7 @@ class Robot:
     def _scene(self, drive: Drive) -> list[Message]:
         """Return the perturbation and markers as they are, and traffic on change, at its rate."""
         scene, at, start_ns = drive.scene, np.zeros(1), self._stamp(0.0)
-        due = np.diff(np.floor(drive.tick_s * self.rates.traffic + 1e-6), prepend=-1) > 0
+        due = np.diff(np.floor(drive.tick_s * TRAFFIC_HZ + 1e-6), prepend=-1) > 0
         due = due[: len(scene.traffic)]
         ticks = np.flatnonzero(due)
         places = scene.traffic[ticks]

@@ -1,0 +1,58 @@
+"""Tracks in the twin, where the truth is known: by the code that makes them from logs."""
+
+import msgspec
+import numpy as np
+
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import TRACK_SIGNALS
+from restock.train.evaluation.evaluate import fixed_episodes
+from restock.train.twin.env.drivers import Operator
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+TASK = msgspec.structs.replace(load_profile("warehouse_amr").task, tracks=2)
+
+
+def environment(kind: str) -> WarehouseVectorEnv:
+    env = WarehouseVectorEnv(4, task=TASK, seed=3)
+    env.set_episodes(fixed_episodes([kind], 40, 500))
+    env.reset(seed=3)
+    return env
+
+
+def test_tracks_are_of_people_who_walk():
+    env, driver = environment("near_collision"), Operator(epsilon=0.0)
+    traffic, off, speeds = env.simulation.traffic, [], []
+    for _ in range(120):
+        env.step(driver.choose(env))
+        x, y, vx, vy, _ = (env.signals[name] for name in TRACK_SIGNALS)
+        pose = env.simulation.middle(env.simulation.pose())
+        cos, sin = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
+        at = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + pose[:, None, :2]
+        gap = np.linalg.norm(at[:, :, None] - traffic.position_m[:, None], axis=-1).min(axis=2)
+        off += gap[np.isfinite(x)].tolist()
+        speeds += np.hypot(vx, vy)[np.isfinite(x)].tolist()
+    assert len(off) > 50
+    assert np.mean(np.array(off) < 0.5) > 0.8
+    assert np.percentile(speeds, 95) < 1.6
+
+
+def test_hardly_anything_is_tracked_where_nobody_walks():
+    env, driver, shown = environment("nominal"), Operator(epsilon=0.0), 0
+    for _ in range(150):
+        env.step(driver.choose(env))
+        shown += int(np.isfinite(env.signals["track_x_m"]).sum())
+    assert shown < 6
+
+
+def test_an_environment_continues_with_its_tracks():
+    one, other = environment("near_collision"), environment("near_collision")
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        one.step(rng.integers(0, 3, 4))
+    other.load_state_dict(one.state_dict())
+    for _ in range(15):
+        actions = rng.integers(0, 3, 4)
+        seen, *_ = one.step(actions)
+        again, *_ = other.step(actions)
+        np.testing.assert_array_equal(seen, again)
+    assert len(one.sensing.tracker.tracks)  # type: ignore[union-attr]
