@@ -102,3 +102,10 @@ def test_a_single_file_dqn_on_the_native_vector_environment() -> None:
     assert done["updates"] == (2400 - 600) / 4
     assert done["episodes"] >= 8
     assert done["loss"] >= 0
+
+
+@pytest.mark.long
+def test_a_single_file_dqn_on_logs_and_fresh_rows(panel: Path) -> None:
+    done = example("cleanrl_dqn").main(steps=96, num_envs=8, panel=str(panel), offline_updates=20)
+    assert done["updates"] == 20 + (96 - 24) / 4  # 24 steps are collected first
+    assert done["loss"] >= 0
