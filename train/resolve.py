@@ -32,7 +32,7 @@ from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturba
 
 
 def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """Fill in exploration, perturbation and missions, which the config may leave open."""
+    """Fill in exploration, members, perturbation and missions, which the config may leave open."""
     epsilon = config.epsilon
     if epsilon.start is None:
         learns_first = panel is not None and config.schedule.offline_updates > 0
@@ -43,7 +43,8 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
         env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
     if isinstance(env.missions, str):
         env = msgspec.structs.replace(env, missions=mission_orders(config))
-    return msgspec.structs.replace(config, epsilon=epsilon, env=env)
+    network = msgspec.structs.replace(config.network, members=config.members)
+    return msgspec.structs.replace(config, epsilon=epsilon, env=env, network=network)
 
 
 FIRST_GUESS = 800.0  # environment steps a second, of a budget in seconds, until it is measured
@@ -85,7 +86,7 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
     if teacher.source is None:
         source = "operator" if profile.task.goal == "route" else "none"
         teacher = msgspec.structs.replace(teacher, source=source)
-    refuse_untaught(teacher)
+    refuse_untaught(msgspec.structs.replace(config, teacher=teacher))
     if teacher.source == PLANNER and profile.inputs.nav_command is None:
         raise ConfigError(
             f"profile {profile.name} does not read what navigation proposes",
@@ -185,7 +186,7 @@ def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
         ConfigError: as the module says; names the setting.
     """
     _refuse_no_effect(config)
-    check_terms(config.loss, panel)
+    check_terms(config, panel)
     _refuse_too_large(config, task)
 
 

@@ -353,7 +353,7 @@ def open_session(
         exploration=np.random.default_rng([seed, 5]),
         executor=executor,
         logs=logs,
-        log_terms=LogTerms.of(config.loss, logs, learner.device),
+        log_terms=LogTerms.of(config, logs, learner.device),
         practice=Practice.of(
             config.practice,
             env,

@@ -19,6 +19,7 @@ from restock.ingest.task.task import nearest_action, proposal_reader
 from restock.train.dqn.behaviour import ProposalNetwork, make_policy
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
+from restock.train.dqn.network import members_of
 from restock.train.evaluation.policies import make_learner
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
@@ -60,9 +61,10 @@ def learner(margin: float, *, path: str | None = None) -> Learner:
 def values(one: Learner, q: list[float]) -> None:
     """Let Q be `q` (A,) in every state."""
     for network in (one.network, one.target_network, one.policy_network):
-        with torch.no_grad():
-            network.advantage.weight.zero_()
-            network.advantage.bias.copy_(tensor(q))
+        for member in members_of(network):
+            with torch.no_grad():
+                member.advantage.weight.zero_()
+                member.advantage.bias.copy_(tensor(q))
 
 
 def test_deviates_only_where_q_is_better_by_the_margin() -> None:
@@ -104,6 +106,30 @@ def test_with_constant_values_it_drives_as_the_planner_does() -> None:
         taken += found.tolist()
         observation, *_ = env.step(found)
     assert len(set(taken)) > 3
+
+
+@pytest.mark.parametrize("path", ["native", "autograd"])
+def test_each_member_learns_as_if_it_were_alone(path: str) -> None:
+    both = learner(0.3, path=path)
+    document = {"teacher": {"source": "planner", "margin": 0.3}}
+    document["network"] = {"hidden": [16], "members": 1}
+    alone = [make_learner(parse_config(document, where="test"), TASK, path=path) for _ in range(3)]
+    for one, member in zip(alone, members_of(both.network), strict=True):
+        for network in (one.network, one.target_network):
+            network.load_state_dict(member.state_dict())
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(5, 64, 2 * TASK.observation_size + 3)).astype(np.float32)
+    rows[:, :, -3] = rng.integers(len(TASK.actions), size=(5, 64))
+    for batch in torch.from_numpy(rows):
+        losses = [one.update(batch).td for one in alone]
+        td = both.update(batch).td
+        torch.testing.assert_close(td, torch.stack(losses).mean(dim=0))
+        for one in (both, *alone):
+            one.target.after(one.gradient_steps)
+    observation = torch.from_numpy(rows[0, :, : TASK.observation_size])
+    of_each = torch.stack([one.network(observation) for one in alone])
+    assert (of_each.std(dim=0) > 0).all()
+    torch.testing.assert_close(both.network(observation), of_each.mean(dim=0))
 
 
 def test_onnx_deviates_where_torch_does() -> None:

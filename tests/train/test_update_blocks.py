@@ -53,7 +53,7 @@ def trained(live: Session) -> Session:
 WAYS: dict[str, dict[str, Any]] = {
     "default": {},
     "every term": {
-        "loss": {"conservative": 0.5, "margin": 0.5, "margin_policies": ["operator"]},
+        "loss": {"conservative": 0.5, "margin": 0.5},
         "optimizer": {"learning_rate": 3e-3},
         "target": {"rule": "hard", "every": 13},
     },

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from restock.errors import ConfigError
-from restock.train.dqn.network import QNetwork
+from restock.train.dqn.network import Ensemble, QNetwork
 
 if TYPE_CHECKING:
     from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
@@ -182,11 +182,13 @@ def make_network(
     observation_size: int,
     actions: int,
     generator: torch.Generator | None = None,
-) -> QNetwork:
-    """Return the network of a run's algorithm."""
-    return make_algorithm(config.loss).make_network(
-        config.network, observation_size, actions, generator
-    )
+) -> QNetwork | Ensemble:
+    """Return the network of a run's algorithm, or an ensemble of them."""
+    make = make_algorithm(config.loss).make_network
+    members = [
+        make(config.network, observation_size, actions, generator) for _ in range(config.members)
+    ]
+    return members[0] if len(members) == 1 else Ensemble(members)
 
 
 def td_target(

@@ -31,6 +31,7 @@ from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import PLANNER, TeacherConfig, TrainConfig
 from restock.train.dqn.network import (
+    Ensemble,
     FlatAdam,
     FlatParameters,
     QNetwork,
@@ -76,7 +77,7 @@ class FilteredNetwork(nn.Module):
 
     ratio: Tensor
 
-    def __init__(self, values: QNetwork, behaviour: QNetwork, ratio: Tensor | None = None) -> None:
+    def __init__(self, values: QNetwork | Ensemble, behaviour: QNetwork, ratio: Tensor | None = None) -> None:
         super().__init__()
         self.values, self.behaviour = values, behaviour
         self.observation_size, self.actions = values.observation_size, values.actions
@@ -104,7 +105,7 @@ class ProposalNetwork(nn.Module):
     offset: Tensor  # (A,)
     lead: Tensor  # (D,), the margin where a proposal is known
 
-    def __init__(self, values: QNetwork, proposal: Proposal | None, margin: float) -> None:
+    def __init__(self, values: QNetwork | Ensemble, proposal: Proposal | None, margin: float) -> None:
         """`proposal` None: buffers wait for kept weights."""
         super().__init__()
         self.values = values
@@ -130,7 +131,7 @@ class ProposalNetwork(nn.Module):
         return q + self.preference(observation)
 
 
-PolicyNetwork = QNetwork | FilteredNetwork | ProposalNetwork
+PolicyNetwork = QNetwork | Ensemble | FilteredNetwork | ProposalNetwork
 
 
 def make_behaviour(
@@ -178,7 +179,7 @@ class Behaviour(Stateful):
         self.optimizer = FlatAdam(self.network, _LEARNING_RATE, compiled=path == "native")
         self._slow = FlatParameters(self.average, learns=False).values
         learns = self.optimizer
-        self._logits = differentiable(path, self.network, learns.values, learns.gradient)
+        (self._logits,) = differentiable(path, self.network, learns.values, learns.gradient)
         self.updates = 0
         self.ratio = torch.zeros((), device=device)  # shared with the networks that it filters
         self.move_to(0)

@@ -40,6 +40,9 @@ Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 class NetworkConfig(Checked, frozen=True):
     hidden: tuple[Count, ...] = (256, 256)  # widths of the layers
     layer_norm: bool = True
+    # So many learn side by side, and the mean of their values acts. None: three if the planner
+    # teaches, else one.
+    members: Count | None = None
 
     def check(self) -> None:
         if not self.hidden:
@@ -54,8 +57,7 @@ class LossConfig(Checked, frozen=True):
     huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
     # Weight of the CQL term on rows from logs, while offline; online it falls to 0, linearly.
     conservative: NonNegative = 0.1
-    margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
-    margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin
+    margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `teacher.policies`
 
 
 class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
@@ -136,7 +138,7 @@ class TeacherConfig(Checked, frozen=True):
     source: str | None = None
     margin: NonNegative = 0.2  # reward by which another action must be better than the planner's
     ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; or a schedule
-    policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
+    policies: tuple[str, ...] = ("operator",)  # whose logged rows are cloned, or have `loss.margin`
     # And rows of other drivers' episodes that reached their goal without one of `policies`: before
     # the first environment step, and for good where nobody is asked. None: where goals are logged
     # and nobody is asked in the twin.
@@ -235,6 +237,11 @@ class TrainConfig(Checked, frozen=True):
     evaluation: EvaluationConfig = EvaluationConfig()
     record: RecordConfig = RecordConfig()
 
+    @property
+    def members(self) -> int:
+        """Return how many networks learn side by side."""
+        return self.network.members or (3 if self.teacher.source == PLANNER else 1)
+
     def check(self) -> None:
         capacity, waiting = self.replay.ring_capacity, self.env.num_envs * self.loss.n_step
         if capacity != "auto" and capacity < waiting:
@@ -244,15 +251,19 @@ class TrainConfig(Checked, frozen=True):
             )
 
 
-def has_effect(source: str | None, key: str) -> bool:
-    """Return whether a teacher of this source has the setting `teacher.<key>`."""
+def has_effect(config: TrainConfig, key: str) -> bool:
+    """Return whether the teacher of this config has the setting `teacher.<key>`."""
+    if key == "policies" and config.loss.margin:
+        return True
+    source = config.teacher.source
     return source != "none" and (key == "margin") == (source == PLANNER)
 
 
-def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
+def refuse_untaught(config: TrainConfig, *, within: str = "") -> None:
     """Raise ConfigError where a setting of the teacher is given that its source does not have."""
-    source = teacher.source
-    if idle := [key for key in changed(teacher, source=source) if not has_effect(source, key)]:
+    source = config.teacher.source
+    given = changed(config.teacher, source=source)
+    if idle := [key for key in given if not has_effect(config, key)]:
         named = "not given" if source is None else f'"{source}"'
         raise ConfigError(
             f"has no effect where teacher.source is {named}",

@@ -7,7 +7,7 @@ that the config, metrics and checkpoints of a run all carry.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.state import Stateful
-from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm
+from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm, make_network
 from restock.train.dqn.behaviour import (
     Behaviour,
     FilteredNetwork,
@@ -35,6 +35,7 @@ from restock.train.dqn.network import (
     averaging_rate,
     clone,
     differentiable,
+    members_of,
     update_path,
 )
 
@@ -83,12 +84,8 @@ class Learner(Stateful):
         """
         self.device = open_device(config.device)
         self.algorithm = make_algorithm(config.loss)
-        self.network = self.algorithm.make_network(
-            config.network,
-            observation_size,
-            actions,
-            generator=torch.Generator().manual_seed(config.seed),
-        ).to(self.device)
+        generator = torch.Generator().manual_seed(config.seed)
+        self.network = make_network(config, observation_size, actions, generator).to(self.device)
         self.target_network = clone(self.network)
         self.policy_network = clone(self.network)
         self.path = path or update_path(config.device, config.threads)
@@ -194,11 +191,14 @@ class Learner(Stateful):
         return [*self.optimizer.moved, self._policy, self._slow, *slow]
 
     def _fill_gradient(self, rows: Tensor, terms: Terms) -> Loss:
-        self._online.zero_grad(set_to_none=False)
-        loss = self.algorithm.loss(self._online, self._target, self._batch(rows, terms))
-        descended = loss.value if loss.penalty is None else loss.value + loss.penalty
-        descended.backward()  # type: ignore[no-untyped-call]
-        return Loss(loss.value.detach(), loss.td, loss.q)
+        batch, losses = self._batch(rows, terms), []
+        for online, target in zip(self._online, self._target, strict=True):
+            online.zero_grad(set_to_none=False)
+            loss = self.algorithm.loss(online, target, batch)
+            descended = loss.value if loss.penalty is None else loss.value + loss.penalty
+            descended.backward()  # type: ignore[no-untyped-call]
+            losses.append(Loss(loss.value.detach(), loss.td, loss.q))
+        return mean_loss(losses)
 
     def _batch(self, rows: Tensor, terms: Terms) -> TrainingBatch:
         parts = unpack(rows, self.network.observation_size)
@@ -227,12 +227,21 @@ class Learner(Stateful):
         """
         batch = self._batch(rows, Terms(None, 0, 0.0, None))
         slow = self.network if online else self.target_network
-        td = self.algorithm.loss(self.network, slow, batch).td
+        pairs = zip(members_of(self.network), members_of(slow), strict=True)
+        td = mean_loss([self.algorithm.loss(*pair, batch) for pair in pairs]).td
         return td, self.network(batch.observation), self.target_network(batch.observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the best action (N,) of each observation (N, D), with the teacher's preference."""
         return greedy_actions(self._acting, observation)
+
+
+def mean_loss(losses: Sequence[Loss]) -> Loss:
+    """Return the mean over the members of an ensemble, part by part, without the penalty."""
+    if len(losses) == 1:
+        return losses[0]
+    parts = zip(*((loss.value, loss.td, loss.q) for loss in losses), strict=True)
+    return Loss(*(torch.stack(part).mean(dim=0) for part in parts))
 
 
 class TargetUpdate(Stateful):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import ClassVar, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -68,6 +68,30 @@ class QNetwork(nn.Module):
         return values
 
 
+class Ensemble(nn.Module):
+    """Networks that learn side by side from the same batches; the mean of their values acts.
+
+    Their errors differ, as they began differently, and an action that one of them overestimates is
+    rarely overestimated by all (arXiv:1611.01929).
+    """
+
+    def __init__(self, members: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+        self.observation_size: int = members[0].observation_size  # type: ignore[assignment]
+        self.actions: int = members[0].actions  # type: ignore[assignment]
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return action values (B, A)."""
+        values: Tensor = sum(member(observation) for member in self.members)
+        return values / len(self.members)
+
+
+def members_of(network: nn.Module) -> list[Any]:
+    """Return the networks of an ensemble; of any other network, itself."""
+    return list(network.members) if isinstance(network, Ensemble) else [network]
+
+
 def clone(network: N) -> N:
     """Return a copy that takes no gradients: the target network."""
     import copy
@@ -118,19 +142,23 @@ def update_path(device: str, threads: int = 1) -> UpdatePath:
 
 
 def differentiable(
-    path: UpdatePath, network: QNetwork, values: Tensor, gradient: Tensor | None = None
-) -> Differentiable:
-    """Return what a loss is computed with: a kernel, or the network itself.
+    path: UpdatePath, network: nn.Module, values: Tensor, gradient: Tensor | None = None
+) -> list[Differentiable]:
+    """Return what the loss of each member is computed with: a kernel, or the network itself.
 
     Args:
         path: which of both is wanted; only a plain `QNetwork` has a kernel.
-        network: its parameters are in `values`, by `FlatParameters`.
+        network: an ensemble, or its only member; its parameters are in `values`, by `FlatParameters`.
         values: all parameters.
         gradient: their gradients; None if the network does not learn.
     """
-    if path == "native" and type(network) is QNetwork:
-        return Kernel(network, values, gradient)
-    return network
+    members = members_of(network)
+    parts = values.chunk(len(members))  # members are alike, so their parameters are equally many
+    gradients = [None] * len(members) if gradient is None else gradient.chunk(len(members))
+    return [
+        Kernel(member, *flat) if path == "native" and type(member) is QNetwork else member
+        for member, *flat in zip(members, parts, gradients, strict=True)
+    ]
 
 
 class Kernel:

@@ -32,7 +32,7 @@ from restock.process import import_extra
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposalNetwork
-from restock.train.dqn.network import QNetwork
+from restock.train.dqn.network import Ensemble, QNetwork
 from restock.train.evaluation.evaluate import STUCK_RADIUS_M, STUCK_WINDOW_S
 from restock.train.evaluation.ope_dataset import panel_store
 from restock.train.evaluation.policies import load_agent
@@ -163,8 +163,17 @@ class _Graph:
         bias = self.constant(f"{name}.bias", _array(layer.bias))
         return self.node("Gemm", [inputs, weight, bias], name, transB=1)
 
-    def values(self, network: QNetwork, name: str) -> str:
-        """Add the nodes of one network's action values (N, A)."""
+    def values(self, network: nn.Module, name: str) -> str:
+        """Add the nodes of one network's action values (N, A), or of an ensemble's mean."""
+        if isinstance(network, Ensemble):
+            total, *others = [
+                self.values(member, f"{name}.{index}")
+                for index, member in enumerate(network.members)
+            ]
+            for index, values in enumerate(others):
+                total = self.node("Add", [total, values], f"{name}.sum.{index}")
+            count = self.constant(f"{name}.members", np.array(len(network.members), np.float32))
+            return self.node("Div", [total, count], f"{name}.mean")
         if type(network) is not QNetwork:  # of an algorithm with a network of its own
             raise ConfigError(
                 f"a {type(network).__name__} cannot be written as ONNX",

@@ -15,7 +15,7 @@ but the rows, `index_select` takes its place.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any, ClassVar
@@ -33,7 +33,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.sampler import Quotas
 from restock.state import Stateful
-from restock.train.dqn.config import LossConfig
+from restock.train.dqn.config import LossConfig, TrainConfig
 from restock.train.feed.logs import Coded, Logs
 
 _TRIED_WIDTHS = (1, 16, 189)  # floats: below, at and above what a vector register holds
@@ -240,19 +240,19 @@ class LogTerms:
     expert: Tensor | None  # (n,) bool: DQfD's margin applies
 
     @classmethod
-    def of(cls, loss: LossConfig, logs: Logs | None, device: torch.device) -> LogTerms:
-        """Make the terms of `loss` on these logs.
+    def of(cls, config: TrainConfig, logs: Logs | None, device: torch.device) -> LogTerms:
+        """Make the terms of the loss on these logs.
 
         Raises:
             ConfigError: it names a behaviour policy that they do not have, or there are no logs.
         """
         if logs is None:
-            _refuse_without_logs(loss)
+            _refuse_without_logs(config.loss)
             return cls(None)
-        expert = None
-        if loss.margin:
-            expert = torch.from_numpy(_expert(loss, logs.behaviour_policy)).to(device)
-        return cls(expert)
+        if not config.loss.margin:
+            return cls(None)
+        expert = _expert(config.teacher.policies, logs.behaviour_policy)
+        return cls(torch.from_numpy(expert).to(device))
 
     def expert_rows(self, log_rows: Ints) -> Tensor | None:
         """Return `expert` of some rows of the panel."""
@@ -261,12 +261,13 @@ class LogTerms:
         return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
 
 
-def check_terms(loss: LossConfig, panel: Panel | None) -> None:
+def check_terms(config: TrainConfig, panel: Panel | None) -> None:
     """Refuse what `LogTerms.of` would, from the panel's columns alone."""
     if panel is None:
-        _refuse_without_logs(loss)
-    elif loss.margin:
-        _refuse_unknown(loss, Coded.of(panel.meta["behaviour_policy"]).names)
+        _refuse_without_logs(config.loss)
+    elif config.loss.margin:
+        logged = Coded.of(panel.meta["behaviour_policy"]).names
+        _refuse_unknown(config.teacher.policies, logged)
 
 
 def _refuse_without_logs(loss: LossConfig) -> None:
@@ -277,17 +278,18 @@ def _refuse_without_logs(loss: LossConfig) -> None:
         )
 
 
-def _expert(loss: LossConfig, policy: Coded) -> Bools:
-    """Select the rows (n,) of `margin_policies`."""
-    _refuse_unknown(loss, policy.names)
-    return np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])
+def _expert(experts: Sequence[str], policy: Coded) -> Bools:
+    """Select the rows (n,) of these behaviour policies."""
+    _refuse_unknown(experts, policy.names)
+    return np.isin(policy.codes, [policy.names.index(name) for name in experts])
 
 
-def _refuse_unknown(loss: LossConfig, policies: list[str]) -> None:
-    for name in loss.margin_policies:
+def _refuse_unknown(experts: Sequence[str], policies: list[str]) -> None:
+    for name in experts:
         if name not in policies:
             raise ConfigError(
-                f"loss.margin_policies: the logs have no {name!r}",
+                f"loss.margin applies to rows of {name!r}, and the logs have none",
+                where="teacher.policies",
                 remedy=f"choose from what they have: {', '.join(dict.fromkeys(policies))}",
             )
 

@@ -337,7 +337,8 @@ def confirm(
         raise RunError(f"is {cause}: {what}", where=where, remedy=remedy)
     panel = run.document["panel"]
     given = config["teacher"]  # resolved, with settings that its source does not have
-    has = {"source", *(key for key in given if has_effect(given["source"], key))}
+    resolved = parse_config(config, where=where)
+    has = {"source", *(key for key in given if has_effect(resolved, key))}
     taught = {key: value for key, value in given.items() if key in has}
     settings = as_overrides(config | {"teacher": taught}) + changed
     prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)

@@ -187,7 +187,7 @@ def load_study(path: Path | str) -> Study:
         config = parse_config(apply_overrides({}, sets), where=str(path))
         _refuse_shared_episodes(arm, config.evaluation, study.evaluation, str(path))
         _refuse_without_updates(arm, config.schedule, str(path))
-        refuse_untaught(config.teacher, within=f"{path}: arm {arm.name!r}: ")
+        refuse_untaught(config, within=f"{path}: arm {arm.name!r}: ")
     return study
 
 
