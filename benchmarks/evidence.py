@@ -11,8 +11,8 @@ runs (docs/evidence.md):
     practice      the twin can make it: practice by success, quotas on the logs, both, neither
     archive       the first again, with the incidents in a store of their own, weighted back to the
                   day's rates; and against half of the logged rows from it, as kept
-    demonstrations  the first again, with as many of the operator's rows for uniform draws as for
-                  quotas; and with the planner's rows alone
+    demonstrations  the first again: uniform draws have as many of the operator's rows as quotas
+    planner-rows  the first again, with the planner's rows alone, so that no margin acts
     novelty       the first again, without the rule of one rare kind: a quota on what is novel
 
 Records what a question needs of the stand-in fleet (a day of hours, and for all but `practice` an
@@ -47,7 +47,16 @@ from restock.train.study.study import DONE, Study, StudyPlan, load_study
 from restock.train.study.study_run import findings, run_study
 
 HERE = Path(__file__).parent / "evidence"
-QUESTIONS = ("twin-nominal", "lead", "ring", "practice", "archive", "demonstrations", "novelty")
+QUESTIONS = (
+    "twin-nominal",
+    "lead",
+    "ring",
+    "practice",
+    "archive",
+    "demonstrations",
+    "planner-rows",
+    "novelty",
+)
 RATES = "odom=10,imu=10,scan=5,joint_states=5,amcl_pose=5,tf=5,bumper=5"
 RARE = ("wheel_slip", "blocked_aisle", "near_collision")
 

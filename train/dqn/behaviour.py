@@ -77,7 +77,9 @@ class FilteredNetwork(nn.Module):
 
     ratio: Tensor
 
-    def __init__(self, values: QNetwork | Ensemble, behaviour: QNetwork, ratio: Tensor | None = None) -> None:
+    def __init__(
+        self, values: QNetwork | Ensemble, behaviour: QNetwork, ratio: Tensor | None = None
+    ) -> None:
         super().__init__()
         self.values, self.behaviour = values, behaviour
         self.observation_size, self.actions = values.observation_size, values.actions
@@ -105,7 +107,9 @@ class ProposalNetwork(nn.Module):
     offset: Tensor  # (A,)
     lead: Tensor  # (D,), the margin where a proposal is known
 
-    def __init__(self, values: QNetwork | Ensemble, proposal: Proposal | None, margin: float) -> None:
+    def __init__(
+        self, values: QNetwork | Ensemble, proposal: Proposal | None, margin: float
+    ) -> None:
         """`proposal` None: buffers wait for kept weights."""
         super().__init__()
         self.values = values
