@@ -148,7 +148,7 @@ def differentiable(
 
     Args:
         path: which of both is wanted; only a plain `QNetwork` has a kernel.
-        network: an ensemble, or its only member; its parameters are in `values`, by `FlatParameters`.
+        network: one, or an ensemble; its parameters are in `values`, by `FlatParameters`.
         values: all parameters.
         gradient: their gradients; None if the network does not learn.
     """
