@@ -548,7 +548,10 @@ def open_rows(
             return OpenedRows(rows, _checked(own, rows, path), missing, [path], {})
         with Store(store_path, version=version) as store:
             own = _checked(own, rows, path)
-            compared = [*fed_labels(store, rows), *_of_store(store, rows, own)]
+            compared: list[Comparison | Flags] = [
+                *fed_labels(store, rows),
+                *_of_store(store, rows, own),
+            ]
             rows = with_missions(store, rows)
             return OpenedRows(rows, own, compared, [store_path, path], _files(store))
     if is_store(path):
