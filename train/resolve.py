@@ -32,7 +32,7 @@ from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturba
 
 
 def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """Fill in exploration, members, perturbation and missions, which the config may leave open."""
+    """Fill in exploration, perturbation and missions, which the config may leave open."""
     epsilon = config.epsilon
     if epsilon.start is None:
         learns_first = panel is not None and config.schedule.offline_updates > 0
@@ -43,8 +43,7 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
         env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
     if isinstance(env.missions, str):
         env = msgspec.structs.replace(env, missions=mission_orders(config))
-    network = msgspec.structs.replace(config.network, members=config.members)
-    return msgspec.structs.replace(config, epsilon=epsilon, env=env, network=network)
+    return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 
 FIRST_GUESS = 800.0  # environment steps a second, of a budget in seconds, until it is measured

@@ -29,7 +29,7 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 TASK = load_profile("warehouse_amr").task
 KNOWN = TASK.observation_names.index("nav_known")
-BY_PLANNER = {"teacher": {"source": "planner"}}
+BY_PLANNER = {"teacher": {"source": "planner"}, "network": {"members": 2}}
 
 
 def observed(command: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -53,8 +53,9 @@ def test_reads_the_action_nearest_to_the_proposal(seed: int) -> None:
     assert ((observation @ says) == known).all()
 
 
-def learner(margin: float, *, path: str | None = None) -> Learner:
-    document = {"teacher": {"source": "planner", "margin": margin}, "network": {"hidden": [16]}}
+def learner(margin: float, *, members: int = 3, path: str | None = None) -> Learner:
+    document = {"teacher": {"source": "planner", "margin": margin}}
+    document["network"] = {"hidden": [16], "members": members}
     return make_learner(parse_config(document, where="test"), TASK, path=path)
 
 
@@ -111,9 +112,7 @@ def test_with_constant_values_it_drives_as_the_planner_does() -> None:
 @pytest.mark.parametrize("path", ["native", "autograd"])
 def test_each_member_learns_as_if_it_were_alone(path: str) -> None:
     both = learner(0.3, path=path)
-    document = {"teacher": {"source": "planner", "margin": 0.3}}
-    document["network"] = {"hidden": [16], "members": 1}
-    alone = [make_learner(parse_config(document, where="test"), TASK, path=path) for _ in range(3)]
+    alone = [learner(0.3, members=1, path=path) for _ in range(3)]
     for one, member in zip(alone, members_of(both.network), strict=True):
         for network in (one.network, one.target_network):
             network.load_state_dict(member.state_dict())

@@ -186,7 +186,8 @@ def make_network(
     """Return the network of a run's algorithm, or an ensemble of them."""
     make = make_algorithm(config.loss).make_network
     members = [
-        make(config.network, observation_size, actions, generator) for _ in range(config.members)
+        make(config.network, observation_size, actions, generator)
+        for _ in range(config.network.members)
     ]
     return members[0] if len(members) == 1 else Ensemble(members)
 

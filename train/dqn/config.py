@@ -40,9 +40,7 @@ Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 class NetworkConfig(Checked, frozen=True):
     hidden: tuple[Count, ...] = (256, 256)  # widths of the layers
     layer_norm: bool = True
-    # So many learn side by side, and the mean of their values acts. None: three if the planner
-    # teaches, else one.
-    members: Count | None = None
+    members: Count = 1  # so many learn side by side, and the mean of their values acts
 
     def check(self) -> None:
         if not self.hidden:
@@ -236,11 +234,6 @@ class TrainConfig(Checked, frozen=True):
     practice: PracticeConfig = msgspec.field(default_factory=PracticeConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
     record: RecordConfig = RecordConfig()
-
-    @property
-    def members(self) -> int:
-        """Return how many networks learn side by side."""
-        return self.network.members or (3 if self.teacher.source == PLANNER else 1)
 
     def check(self) -> None:
         capacity, waiting = self.replay.ring_capacity, self.env.num_envs * self.loss.n_step
