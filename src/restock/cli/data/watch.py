@@ -75,8 +75,8 @@ class Watch:
         written: list[dict[str, Any]] = []
         known = 0
         for path, result in self._ingested(ready):
-            failed = isinstance(result, RestockError)
-            new = self.arrivals.take(path, result if failed else None, time.monotonic())
+            error = result if isinstance(result, RestockError) else None
+            new = self.arrivals.take(path, error, time.monotonic())
             if isinstance(result, RestockError):
                 if new:
                     event = "failed" if transient(result) else "refused"
