@@ -32,7 +32,7 @@ from restock.ingest.store.manifest import LabelScore
 from restock.ingest.task.conditions import let_values, shipped
 from restock.ingest.task.schema import signal_columns
 from restock.ingest.task.task import STORED_SIGNALS
-from restock.replay.review import LabelQuality, label_quality, reliability
+from restock.replay.review.quality import LabelQuality, label_quality, reliability
 from restock.replay.store.store import Store
 from restock.train.twin.recording.recorder import RecordingPlan, record
 

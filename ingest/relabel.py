@@ -251,7 +251,7 @@ def correct_store(
             raise StoreError(
                 f"recording {recording} was ingested again or removed in the meantime",
                 where=str(store.path),
-                remedy="list its events again with `restock store label STORE --review N`",
+                remedy="list its events again with `restock review STORE`",
             )
     outcomes: list[Corrected] = []
 

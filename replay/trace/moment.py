@@ -54,6 +54,11 @@ def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: i
         RecordingError: the recording does not fit the profile.
     """
     aligned = align_inputs(profile, read_topics(recording, profile, reduced=False))
+    return seen_of(aligned, low_ns, high_ns)
+
+
+def seen_of(aligned: AlignedInputs, low_ns: int, high_ns: int) -> Seen:
+    """Return what the ticks in [low_ns, high_ns] saw, of inputs that were read and aligned."""
     inside = [stamps[(stamps >= low_ns) & (stamps <= high_ns)] for stamps in aligned.ticks]
     aligned = replace(aligned, ticks=inside)
     stamps = np.concatenate(inside) if inside else np.zeros(0, np.int64)
@@ -170,22 +175,30 @@ class Moment:
         The observation holds clearances: with the body's reach that way they are ranges again.
         Empty where the robot has no lidar.
         """
-        task = self.task
-        if not task.lidar:
+        if not self.task.lidar:
             return []
-        names = task.observation_names
-        first = next(i for i, name in enumerate(names) if name.startswith("clearance_"))
-        near = self.observations[:, first : first + task.sectors].astype(np.float64)
-        width = 2 * np.pi / task.sectors
-        bearing: F64 = np.asarray((np.arange(task.sectors) + 0.5) * width - np.pi, np.float64)
-        clearance = np.asarray(near**2 * task.range_max_m, np.float64)
-        ranges = np.add(clearance, outline_reach(bearing, task.body))
-        ranges[clearance >= task.range_max_m * (1 - 1e-6)] = np.inf
+        bearing, ranges = sector_ranges(self.task, self.observations)
         stamps = self.column("stamp_ns")
         return [
-            SeenScan(int(stamp), row, float(bearing[0]), width)
+            SeenScan(int(stamp), row, float(bearing[0]), 2 * np.pi / self.task.sectors)
             for stamp, row in zip(stamps, ranges, strict=True)
         ]
+
+
+def sector_ranges(task: Task, observations: F32) -> tuple[F64, F64]:
+    """Return the bearing of each sector, (S,), and the ranges in N observations, (N, S); inf: free.
+
+    Both are as seen from the middle of the robot, whose lidar the task must have.
+    """
+    names = task.observation_names
+    first = next(i for i, name in enumerate(names) if name.startswith("clearance_"))
+    near = observations[:, first : first + task.sectors].astype(np.float64)
+    width = 2 * np.pi / task.sectors
+    bearing: F64 = np.asarray((np.arange(task.sectors) + 0.5) * width - np.pi, np.float64)
+    clearance = np.asarray(near**2 * task.range_max_m, np.float64)
+    ranges = np.add(clearance, outline_reach(bearing, task.body))
+    ranges[clearance >= task.range_max_m * (1 - 1e-6)] = np.inf
+    return bearing, ranges
 
 
 def find_moment(

@@ -322,10 +322,7 @@ def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path
         (["audit", store, "--junit", str(store_path / "x.xml")], f"the store {store}"),
         (["profile", "schema", "--out", store], f"the store {store}"),
         (["profile", "new", "a.mcap", "--out", f"{store}/p.toml"], f"the store {store}"),
-        (
-            ["store", "label", store, "--review", "3", "--out", f"{store}/l.csv"],
-            f"the store {store}",
-        ),
+        (["review", store, "--out", f"{store}/l.csv"], f"the store {store}"),
         (["sql", store, "--export", f"{store}/views.sql"], f"the store {store}"),
         (["coverage", "gaps", store, "--missions-out", f"{store}/m.toml"], f"the store {store}"),
         (["twin", "layout", "--out", f"{run}/floor.png"], f"the run {run}"),

@@ -86,7 +86,7 @@ def test_what_people_corrected_stays(part, third, tmp_path, capsys):
         "episode_id,condition,first_step,last_step,verdict\n"
         f"{first['recording_id']}/0,near_collision,0,3,yes\n"
     )
-    assert main(["store", "label", str(store), "--corrections", str(review)]) == 0
+    assert main(["review", str(store), str(review)]) == 0
     whole = ingested(capsys, third, "--salvage", "--store", store, "--repeated", "replace")
     (note,) = (note for note in whole["notes"] if "It stays" in note)
     assert "people corrected 1 label of it" in note

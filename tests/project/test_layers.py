@@ -41,6 +41,9 @@ MAY_IMPORT = {
         "replay panel store ingest/containers ingest/decoding ingest/profile ingest/steps"
         " ingest/store ingest/task"
     ),
+    "replay/review": (
+        "store trace ingest ingest/containers ingest/profile ingest/steps ingest/store ingest/task"
+    ),
     "replay/export": ("replay panel plan store ingest/steps ingest/profile ingest/task"),
     "train": (
         "dqn evaluation feed run twin/missions twin/env twin/floors twin/physics"
@@ -90,10 +93,10 @@ MAY_IMPORT = {
     "report": "look run fleet",
     "report/look": "train/twin/missions",
     "report/run": (
-        "look replay replay/panel replay/plan replay/sampling replay/store train/evaluation"
+        "look replay/panel replay/plan replay/review replay/sampling replay/store train/evaluation"
         " train/judge train/run train/twin/calibration train/twin/floors"
     ),
-    "report/fleet": "look replay/fleet replay/store",
+    "report/fleet": "look replay/fleet replay/review replay/store ingest/store",
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/decoding ingest/profile ingest/propose"
@@ -102,8 +105,8 @@ MAY_IMPORT = {
         " train/judge"
     ),
     "cli/fleet": (
-        "cli report ingest ingest/profile ingest/store ingest/task replay replay/fleet"
-        " replay/mixture replay/panel replay/store train/judge train/twin/missions"
+        "cli report report/fleet ingest ingest/profile ingest/store ingest/task replay replay/fleet"
+        " replay/review replay/mixture replay/panel replay/store train/judge train/twin/missions"
     ),
     "cli/learning": (
         "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace"

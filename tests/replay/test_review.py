@@ -1,6 +1,7 @@
 """Label review: doubtful events are listed with their moment, and verdicts are taken back."""
 
 import csv
+import io
 import json
 import re
 import shlex
@@ -18,13 +19,8 @@ from restock.ingest.relabel import correct_store
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import true_names
-from restock.replay.review import (
-    DoubtfulEvent,
-    doubtful_events,
-    read_verdicts,
-    review_csv,
-    review_rows,
-)
+from restock.replay.review.events import DoubtfulEvent, doubtful_events, review_csv, review_rows
+from restock.replay.review.verdicts import read_verdicts
 from restock.replay.store.store import Store
 
 HEADER = "episode_id,condition,first_step,last_step,value\n"
@@ -117,17 +113,14 @@ def test_doubtful_events_are_wrong_more_often(monday, tmp_path):
 
 def test_the_list_is_a_file_whose_commands_open_the_moment(monday, tmp_path, capsys):
     file = tmp_path / "my review.csv"
-    assert main(["store", "label", str(monday), "--review", "3", "--out", str(file)]) == 0
+    assert main(["review", str(monday), "--out", str(file)]) == 0
     shown, said = capsys.readouterr()
-    then = ["store", "label", str(monday), "--corrections", str(file)]
+    then = ["review", str(monday), str(file)]
     assert shlex.split(said.split("then run: restock ")[1]) == then
-    assert max(map(len, shown.splitlines())) <= 120  # what does not fit is a second table
     with file.open(newline="") as text:
         rows = list(csv.DictReader(text))
-    assert len(rows) == 3
-    for row in rows:
-        assert row["verdict"] == ""
-        assert row["condition"] in shown
+    assert f"{len(rows)} events" in shown
+    assert {row["verdict"] for row in rows} == {""}
     command = shlex.split(rows[0]["open"])
     assert command[0] == "restock"
     assert command[-2:] == ["--recording", str(MONDAY)]
@@ -137,7 +130,7 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(monday, tmp_path, cap
     assert traced["transition"]["step_index"] == int(rows[0]["first_step"])
     assert traced["messages"]
     # Verdicts may be in it: it is not written over.
-    assert main(["store", "label", str(monday), "--review", "3", "--out", str(file)]) == 2
+    assert main(["review", str(monday), "--out", str(file)]) == 2
     assert "may contain verdicts" in capsys.readouterr().err
 
 
@@ -147,16 +140,18 @@ def test_a_list_without_events_is_a_header_and_says_so(tmp_path, capsys):
     rows = replaced(rows, {name: [value] * len(rows) for name, value in nothing.items()})
     store, file = write_store(tmp_path / "store", [rows]), tmp_path / "review.csv"
     for more in ([], ["--json"]):
-        assert main(["store", "label", str(store), "--review", "3", "--out", str(file), *more]) == 0
-        shown = capsys.readouterr()
-        reported = " ".join((shown.err if more else shown.out).split())
-        assert "no uncertain event is left to review" in reported
-        assert f"{file} has only a header" in reported
-        assert not more or json.loads(shown.out) == []
+        assert main(["review", str(store), "--out", str(file), *more]) == 0
+        shown = capsys.readouterr().out
+        if more:
+            assert json.loads(shown)["events"] == 0
+        else:
+            assert "no uncertain event is left to review" in " ".join(shown.split())
         # As with verdicts that are all empty, there is nothing to take from it.
-        assert main(["store", "label", str(store), "--corrections", str(file)]) == 0
-        assert "contains no verdict" in " ".join(capsys.readouterr().out.split())
+        assert main(["review", str(store), str(file)]) == 0
+        assert "no verdict is new" in capsys.readouterr().out
         file.unlink()
+    assert main(["review", str(store)]) == 0  # nor is there a page to serve
+    assert "no uncertain event is left to review" in capsys.readouterr().out
 
 
 def fill(
@@ -183,7 +178,7 @@ def test_verdicts_change_the_labels_and_a_dry_run_does_not(reviewed, tmp_path, c
     first = events[long].first_step
     file = fill(small, events, tmp_path / "review.csv", {no: "No", long: f"{first}..{first}"})
     for dry in (["--dry-run"], []):
-        assert main(["store", "label", str(small), "--corrections", str(file), "--json", *dry]) == 0
+        assert main(["review", str(small), str(file), "--json", *dry]) == 0
         said = json.loads(capsys.readouterr().out)
         assert (said["verdicts"], said["without_verdict"]) == (2, len(events) - 2)
         assert (said["version"] is None) == bool(dry)
@@ -200,7 +195,7 @@ def test_verdicts_change_the_labels_and_a_dry_run_does_not(reviewed, tmp_path, c
             ).fetchall()
             length = event.last_step - event.first_step + 1
             assert [one for (one,) in held] == (begins + [False] * length)[:length]
-    assert main(["store", "label", str(small), "--corrections", str(file)]) == 0  # the same again
+    assert main(["review", str(small), str(file)]) == 0  # the same again
     assert "unchanged" in capsys.readouterr().out
 
 
@@ -223,7 +218,7 @@ def test_a_line_that_does_not_fit_is_named(reviewed, tmp_path, verdict, changed,
     with Store(small) as store, pytest.raises(LabelError, match=re.escape(problem)) as error:
         read_verdicts(file, store)
     assert error.value.remedy is not None
-    assert "--review N` lists events" in error.value.remedy
+    assert "--out FILE.csv` lists events" in error.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -258,19 +253,26 @@ def test_a_file_that_cannot_be_taken_is_refused(reviewed, tmp_path, text, proble
 
 def test_wrong_usage_writes_nothing(reviewed, capsys):
     before = sorted(reviewed[0].rglob("*"))
+    page = ["review", str(reviewed[0])]
+    label = ["store", "label", str(reviewed[0])]
     for words, problem in (
-        (
-            ["--review", "3", "--corrections", "x.csv"],
-            "--review cannot be combined with --corrections",
-        ),
-        (["--out", "x.csv"], "--out needs --review"),
-        (
-            ["--corrections", "x.csv", "--profile", "turtlebot3"],
-            "cannot be combined with --profile",
-        ),
-        (["--review", "0"], "must be 1 or more"),
-        (["--corrections", "gone.csv"], "gone.csv: cannot be read: No such file"),
+        ([*page, "x.csv", "--out", "y.csv"], "FILE cannot be combined with --out"),
+        ([*page, "--dry-run"], "--dry-run needs FILE"),
+        ([*page, "--out", "y.txt"], "'y.txt' must end in .html or .csv"),
+        ([*page, "gone.csv"], "gone.csv: cannot be read: No such file"),
+        ([*page, "gone.json"], "gone.json: cannot be read: No such file"),
+        ([*label, "--score", "--profile", "turtlebot3"], "cannot be combined with --profile"),
+        ([*label, "--review", "3"], "`restock review STORE` shows the events on a page"),
+        ([*label, "--corrections", "x.csv"], "give the file to `restock review STORE FILE`"),
     ):
-        assert main(["store", "label", str(reviewed[0]), *words]) == 2
+        assert main(words) == 2
         assert problem in " ".join(capsys.readouterr().err.split())
     assert sorted(reviewed[0].rglob("*")) == before
+
+
+def test_a_spreadsheet_runs_no_name_as_a_formula(reviewed):
+    rows = review_rows(reviewed[1][:1], "store")
+    hostile = "=cmd|' /C calc'!A0.mcap"
+    line = next(csv.DictReader(io.StringIO(review_csv([rows[0] | {"source_file": hostile}]))))
+    assert line["source_file"] == f"'{hostile}"
+    assert float(line["margin"]) == rows[0]["margin"]  # a number, even a negative one, stays

@@ -28,6 +28,7 @@ VERBS = {
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
     "sql": "query a store (or a run) in SQL",
+    "review": "look at labels one by one, on a page, and say whether they are right",
     "coverage": "how much of each condition a store holds; what is missing, different or changed",
     "audit": "check that the coverage is good enough and nothing got worse: exit 1 if not",
     "mix": "a pinned replay panel with quotas per stratum",
@@ -70,6 +71,7 @@ FOLDERS = {
     "fleet": (
         *("coverage", *(f"coverage {job}" for job in JOBS["coverage"])),
         *(f"store {job}" for job in JOBS["store"]),
+        "review",
     ),
     "learning": (
         *("train", "study", "eval", "gate", "compare", "diagnose", "trace", "report"),

@@ -376,8 +376,8 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
          "Conditions, labels or profiles with changed definitions",
          "if this was not intended, restore the old ones and ingest again", definitions),
         ("labels_changed", "warning", "Rows whose condition changed",
-         "`restock coverage diff` shows all of them; `restock store label STORE --review` lets a"
-         " person check labels", document["labels"]["changes"]),
+         "`restock coverage diff` shows all of them; `restock review STORE` lets a person"
+         " check labels", document["labels"]["changes"]),
         ("signals_shifted", "warning",
          "Signals whose mean over episodes shifted (false discovery rate 5 %)",
          "`restock coverage drift` shows which robot, week and part",

@@ -1,8 +1,7 @@
-"""`restock store label`: new conditions over stored signals, how good labels are, and verdicts."""
+"""`restock store label`: new conditions over stored signals, and how good labels are."""
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -11,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, LabelError, counted, quoted
+from restock.errors import ConfigError, ExitCode, counted
 
 if TYPE_CHECKING:
-    from restock.ingest.relabel import Corrected, Relabelled
+    from restock.ingest.relabel import Relabelled
     from restock.ingest.store.writer import StoreWriter
     from restock.ingest.task.conditions import Condition
-    from restock.replay.review import LabelQuality
+    from restock.replay.review.quality import LabelQuality
     from restock.stats import ConfidenceInterval
 
 
@@ -33,9 +32,7 @@ class LabelCommand:
     shipped profile of that name, or the copy in the store. Another profile gives other conditions
     to the recordings ingested with a profile of the same name.
 
-    With --review, nothing is labelled: it lists the events whose label is most uncertain, each with
-    its time, the command that opens it, and a column for a verdict. --corrections writes verdicts
-    to the store: they stay when recordings are labelled or ingested again. See docs/ingest.md.
+    Verdicts of people on labels (`restock review`) stay: they override the rules.
     """
 
     store: Annotated[Path, tyro.conf.Positional]
@@ -46,14 +43,6 @@ class LabelCommand:
     score: bool = False
     """Label nothing: compare the labels with the true conditions of simulated recordings, by step
     and by event, and print how reliable their probabilities are."""
-    review: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """List the N most uncertain events."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """With --review: write the events to this CSV file, in which you fill in the column
-    `verdict`."""
-    corrections: Annotated[str | None, tyro.conf.arg(metavar="FILE|none")] = None
-    """Write the verdicts of a CSV file (see docs/ingest.md) to the store; `none` removes all
-    corrections."""
     dry_run: bool = False
     """Do everything except writing, and print what would change."""
     json: bool = False
@@ -64,16 +53,11 @@ class LabelCommand:
         from restock.cli import output
         from restock.ingest.relabel import open_for_relabel, relabel_store
 
-        self._check_options()
         if self.score:
+            if self.profile is not None:
+                raise ConfigError("--score cannot be combined with --profile")
             return print_scores(self.store, json=self.json)
         store = open_for_relabel(self.store)
-        if self.review is not None:
-            return review(self.store, self.review, self.out, json=self.json)
-        if self.corrections is not None:
-            return correct(
-                store, self.store, self.corrections, dry_run=self.dry_run, json=self.json
-            )
         outcomes, version = relabel_store(
             store,
             self._conditions_of(store),
@@ -110,26 +94,6 @@ class LabelCommand:
         if version is not None:
             output.print_text(f"store version {version}")
         return ExitCode.OK
-
-    def _check_options(self) -> None:
-        """Raise ConfigError if options cannot be combined."""
-        given = {
-            "--score": self.score,
-            "--review": self.review is not None,
-            "--corrections": self.corrections is not None,
-            "--profile": self.profile is not None,
-            "--out": self.out is not None,
-        }
-        clashes = {
-            "--score": ("--review", "--corrections", "--profile"),
-            "--review": ("--corrections", "--profile"),
-            "--corrections": ("--out", "--profile"),
-        }
-        for option, others in clashes.items():
-            if clash := [name for name in others if given[option] and given[name]]:
-                raise ConfigError(f"{option} cannot be combined with {clash[0]}")
-        if self.out is not None and self.review is None:
-            raise ConfigError("--out needs --review N")
 
     def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
         from restock.ingest.profile.profile import load_profile, read_profile_toml
@@ -180,7 +144,7 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
 def print_scores(path: Path, *, json: bool) -> int:
     """Print precision and recall of each condition, and how reliable the probabilities are."""
     from restock.cli import output
-    from restock.replay.review import label_quality, reliability, reliability_rows
+    from restock.replay.review.quality import label_quality, reliability, reliability_rows
     from restock.replay.store.store import Store
 
     with Store(path) as store:
@@ -236,127 +200,3 @@ def _interval(share: ConfidenceInterval) -> str:
     if share.value != share.value:
         return "-"
     return f"{share.value:.2f} ({share.low:.2f} to {share.high:.2f})"
-
-
-NONE = "none"  # in place of a file: takes all corrections out
-
-
-def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
-    """List the most doubtful events, and write them to a file for verdicts."""
-    from restock.cli import output
-    from restock.files import expect_file_place, write_text
-    from restock.replay.review import doubtful_events, review_csv, review_rows
-    from restock.replay.store.store import Store
-
-    if most < 1:
-        raise LabelError(f"--review must be 1 or more, got {most}")
-    expect_file_place(out, "--out")
-    with Store(path) as store:
-        rows = review_rows(doubtful_events(store, most), str(path))
-    if out is not None:
-        try:
-            write_text(out, review_csv(rows), exclusive=True)
-        except FileExistsError:
-            raise LabelError(
-                "already exists, and may contain verdicts",
-                where=str(out),
-                remedy="choose another --out",
-            ) from None
-        except OSError as error:
-            raise LabelError(f"cannot be written: {error.strerror}", where=str(out)) from error
-    nothing = "no uncertain event is left to review"
-    if out is not None:
-        nothing += f": {out} has only a header"
-    if json:
-        output.print_json(rows)
-        if not rows:
-            output.say(nothing)
-        return ExitCode.OK
-    if not rows:
-        output.print_text(nothing)
-        return ExitCode.OK
-    output.print_parted(
-        [_review_line(row) for row in rows],
-        key=["condition", "restock trace STORE"],
-        title="events, the most uncertain first",
-    )
-    output.say(f"to see the first: {rows[0]['open']}")
-    output.say(
-        f"fill in the last column of {out} with yes, no or FIRST..LAST (the steps where the label "
-        f"is true), then run: restock store label {quoted(path)} --corrections {quoted(out)}"
-        if out is not None
-        else "--out FILE writes them to a CSV file with a column for verdicts"
-    )
-    return ExitCode.OK
-
-
-def _review_line(row: dict[str, Any]) -> dict[str, Any]:
-    """Return as much of a line as fits a terminal; the file has all of it."""
-    return {
-        "condition": row["condition"],
-        "labelled": row["labelled"],
-        "p": row["probability"],
-        "why": row["why"],
-        "recording": Path(row["source_file"]).name,
-        "from s": row["start_s"],
-        "to s": row["end_s"],
-        "log time": row["start_time"],
-        "episode": row["episode_id"].rpartition("/")[2],
-        "steps": f"{row['first_step']}..{row['last_step']}",
-        "restock trace STORE": row["event"] and shlex.split(row["open"])[3],
-    }
-
-
-def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: bool) -> int:
-    """Take a file's verdicts into the store, or all corrections out of it."""
-    from restock.cli import output
-    from restock.ingest.relabel import correct_store, remove_corrections
-    from restock.replay.review import read_verdicts
-    from restock.replay.store.store import Store
-
-    taken = left_open = 0
-    if file == NONE:
-        outcomes, version = remove_corrections(store, dry_run=dry_run)
-    else:
-        with Store(path) as opened:
-            verdicts = read_verdicts(Path(file), opened)
-        taken, left_open = verdicts.taken, verdicts.left_open
-        outcomes, version = correct_store(store, verdicts.given, dry_run=dry_run)
-    document = {
-        "version": version,
-        "dry_run": dry_run,
-        "verdicts": taken,
-        "without_verdict": left_open,
-        "recordings": [asdict(outcome) for outcome in outcomes],
-    }
-    if json:
-        output.print_json(document)
-        return ExitCode.OK
-    if not outcomes:
-        output.print_text(
-            "there are no corrections to remove" if file == NONE else f"{file} contains no verdict"
-        )
-        return ExitCode.OK
-    output.print_table(
-        [_correction(outcome, name) for outcome in outcomes for name in outcome.changed]
-    )
-    lines = [] if file == NONE else [f"{taken} verdicts, {left_open} lines without one"]
-    if dry_run:
-        lines.append("dry run: nothing was written")
-    else:
-        lines.append("unchanged" if version is None else f"store version {version}")
-    for line in lines:
-        output.print_text(line)
-    return ExitCode.OK
-
-
-def _correction(outcome: Corrected, name: str) -> dict[str, Any]:
-    changed = outcome.changed[name]
-    return {
-        "recording": outcome.source_file,
-        "labels": f"{outcome.before} -> {outcome.after}",
-        "condition": name,
-        "rows added": changed.added,
-        "removed": changed.removed,
-        "confirmed": changed.confirmed,
-    }

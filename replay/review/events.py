@@ -1,0 +1,191 @@
+"""Events of labels to review: those in doubt, and in which orders a person may go through them."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import shlex
+from dataclasses import asdict, dataclass, fields
+from datetime import datetime
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from restock.errors import StoreError
+from restock.replay.store.definitions import install_named
+from restock.replay.store.novelty import at_hand
+from restock.replay.store.parquet_views import passed_in
+from restock.replay.store.store import Store
+
+LIKELY = 0.2  # from this probability on, steps without a label may be a missed event
+EDGE_STEPS = 2  # what is so near to an event is its edge
+VERDICT = "verdict"
+
+
+@dataclass(frozen=True)
+class DoubtfulEvent:
+    """One event of a label, or steps that may be a missed one. Times are log time, UTC."""
+
+    event: str  # EPISODE/FIRST-LAST/CONDITION
+    condition: str
+    labelled: bool  # False: it may be missed
+    probability: float | None  # mean over its steps; None: the condition has no rule for it
+    margin: float  # log odds that the label is right, or what stands for them: doubtful near 0
+    why: str  # what the margin is made of: probability, length, gap in an event
+    recording: str
+    source_file: str
+    start_time: datetime
+    end_time: datetime
+    start_s: float  # seconds after the recording's first step
+    end_s: float
+    episode_id: str
+    first_step: int
+    last_step: int
+    transition_id: int  # of its first step
+
+
+_COLUMNS = [field.name for field in fields(DoubtfulEvent) if field.name != "transition_id"]
+_COLUMNS += ["open", VERDICT]  # of a review file
+
+
+def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
+    """Return the events with the most doubtful labels, the most doubtful first.
+
+    For a condition with a probability, these are events whose mean log odds support the label
+    least, and steps without the label that are likely enough to be a missed event. For other
+    conditions, they are the shortest events, and gaps of a step or two in one. Corrected events are
+    left out.
+
+    Raises:
+        StoreError: the store holds no labels to review.
+    """
+    text = (files("restock.replay.review") / "doubtful.sql").read_text(encoding="utf-8")
+    given = {"likely": LIKELY, "edge": EDGE_STEPS, "most": most}
+    install_named(store.connection, text)
+    relation = store.connection.sql(text, params=given)
+    events = [DoubtfulEvent(*row) for row in relation.fetchall()]
+    if not events and not store.connection.sql("FROM recordings LIMIT 1").fetchall():
+        raise StoreError("it holds no recording", where=str(store.path), remedy="ingest some")
+    return events
+
+
+def opened_by(event: DoubtfulEvent, store: str) -> str:
+    """Return the command that shows an event's first step.
+
+    It also shows the messages behind that step if the recording is there.
+    """
+    words = ["restock", "trace", store, str(event.transition_id)]
+    if Path(event.source_file).exists():
+        words += ["--recording", event.source_file]
+    return shlex.join(words)
+
+
+def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]:
+    """Return the lines of a review file, with a verdict to fill in."""
+    rows = []
+    for event in events:
+        row = asdict(event)
+        del row["transition_id"]
+        row["labelled"] = "yes" if event.labelled else "no"
+        for name, digits in (("probability", 3), ("margin", 2), ("start_s", 3), ("end_s", 3)):
+            row[name] = None if row[name] is None else round(row[name], digits)
+        for name in ("start_time", "end_time"):
+            row[name] = row[name].isoformat(sep=" ", timespec="milliseconds")
+        rows.append({**row, "open": opened_by(event, store), VERDICT: ""})
+    return rows
+
+
+def review_csv(rows: list[dict[str, Any]]) -> str:
+    """Return a review file."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _plain_cell(cell) for name, cell in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def _plain_cell(cell: Any) -> Any:
+    """Keep a spreadsheet from running a text, such as a file's name, as a formula."""
+    runs = isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{cell}" if runs else cell
+
+
+MAX_EVENTS = 5_000  # in a page
+_MORE = """
+SELECT event, any_value(r.robot) AS robot, max(novelty) AS novelty
+FROM asked
+LEFT JOIN (SELECT recording_id, tags['robot'] AS robot FROM recordings) AS r
+    ON r.recording_id = asked.recording
+{novelty}
+GROUP BY event
+"""
+_NOVELTY = """
+LEFT JOIN (
+    SELECT episode_id, step_index, novelty FROM transitions JOIN novelty USING (transition_id)
+) AS t ON t.episode_id = asked.episode_id AND t.step_index BETWEEN first_step AND last_step
+"""
+
+
+def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
+    """Return the events of a page, how many there are in all, and whether their novelty is known.
+
+    Each has what `DoubtfulEvent` has, its robot, week and novelty, and its place in a random order
+    of the labelled events (None: not labelled). That order is of the events' names alone, so the
+    first of it are a random sample, whatever their labels are. Of more than MAX_EVENTS a page has
+    those that come first in one of the orders.
+    """
+    events = doubtful_events(store)
+    measured = at_hand(store)
+    asked = pa.table(
+        {
+            name: [getattr(event, name) for event in events]
+            for name in ("event", "recording", "episode_id", "first_step", "last_step")
+        }
+    )
+    more: dict[str, tuple[Any, ...]] = {}
+    if events:
+        query = _MORE.format(novelty=_NOVELTY if measured else "")
+        if not measured:
+            query = query.replace("max(novelty)", "NULL::FLOAT")
+        # Both have to be there before the table is passed in.
+        store.sql("FROM recordings LIMIT 0")
+        store.sql(f"FROM {'novelty' if measured else 'transitions'} LIMIT 0").fetchall()
+        with passed_in(store.connection, asked=asked):
+            found = store.connection.sql(query).fetchall()
+        more = {event: rest for event, *rest in found}
+    shuffled = sorted(
+        (event.event for event in events if event.labelled),
+        key=lambda name: hashlib.blake2b(name.encode(), digest_size=16).digest(),
+    )
+    place = {name: number for number, name in enumerate(shuffled)}
+    rows = []
+    for doubt, event in enumerate(events):
+        robot, novelty = more[event.event]
+        year, week, _ = event.start_time.isocalendar()
+        rows.append(
+            {
+                **asdict(event),
+                "transition_id": str(event.transition_id),  # JavaScript's numbers are too short
+                "start_time": event.start_time.isoformat(sep=" ", timespec="seconds"),
+                "end_time": event.end_time.isoformat(sep=" ", timespec="seconds"),
+                "doubt": doubt,
+                "random": place.get(event.event),
+                "novelty": novelty,
+                "robot": robot or "",
+                "week": f"{year}-W{week:02}",
+            }
+        )
+    share = MAX_EVENTS // 3
+    kept = {
+        row["event"]
+        for order in (
+            rows,
+            sorted((r for r in rows if r["random"] is not None), key=lambda r: r["random"]),
+            sorted(rows, key=lambda row: -(row["novelty"] or 0.0)),
+        )
+        for row in (rows if len(rows) <= MAX_EVENTS else order[:share])
+    }
+    return [row for row in rows if row["event"] in kept], len(rows), measured

@@ -1,0 +1,211 @@
+"""`restock review`: a page on which people judge labels, and their verdicts into the store."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from restock.errors import ConfigError, ExitCode, LabelError, quoted
+
+if TYPE_CHECKING:
+    from restock.ingest.relabel import Corrected
+    from restock.ingest.store.location import Location
+    from restock.replay.review.journal import Written
+
+NONE = "none"  # in place of a file: takes all corrections out
+SPREADSHEET = ".csv"
+
+
+@dataclass
+class ReviewCommand:
+    """Look at labels one by one, and say whether they are right.
+
+    Serves a page on this machine only, and prints its address: the way driven, the plan, the scan,
+    speeds and clearance around each event, and what the rule saw. Each verdict is on the disk
+    (STORE/review.jsonl) as soon as its key is pressed. Ctrl-C, or the page's button, writes them
+    into the store, where the labels get a version of their own.
+
+    With --out, it writes one file instead: page.html opens without a server and saves verdicts as a
+    file; review.csv is a spreadsheet with a column for them. FILE takes either back. See
+    docs/ingest.md.
+    """
+
+    store: Annotated[Path, tyro.conf.Positional]
+    """The store's folder."""
+    file: Annotated[
+        str | None, tyro.conf.Positional, tyro.conf.arg(name="FILE|none", metavar="[FILE|none]")
+    ] = None
+    """Write the verdicts of this file into the store: verdicts.json of a page, or a .csv file;
+    `none` removes all corrections."""
+    out: Path | None = None
+    """Write the events to this new file, page.html or review.csv, instead of serving a page."""
+    dry_run: bool = False
+    """With FILE: do everything except writing, and print what would change."""
+    json: bool = False
+    """Print one JSON document: {"version", "verdicts", "recordings": [{"recording_id", …}]}; of a
+    page, its {"address"} or {"page"}."""
+
+    def run(self) -> int:
+        """Serve, write a file, or take one."""
+        from restock.ingest.store.location import Location
+
+        place = Location.of(self.store)
+        if self.file is not None and self.out is not None:
+            raise ConfigError("FILE cannot be combined with --out")
+        if self.dry_run and self.file is None:
+            raise ConfigError("--dry-run needs FILE")
+        if self.out is not None:
+            return self._write(place, self.out)
+        if self.file is not None:
+            return self._take(place, self.file)
+        return self._serve(place)
+
+    def _write(self, place: Location, out: Path) -> int:
+        from restock.cli import output
+        from restock.files import expect_file_place
+        from restock.replay.review.events import doubtful_events, review_csv, review_rows
+        from restock.replay.store.store import Store
+
+        expect_file_place(out, "--out")
+        if out.suffix not in (SPREADSHEET, ".html"):
+            raise ConfigError(
+                f"{out.name!r} must end in .html or .csv", where="--out", remedy="rename it"
+            )
+        if out.exists():
+            raise LabelError(
+                "already exists, and may contain verdicts",
+                where=str(out),
+                remedy="choose another --out",
+            )
+        with Store(place) as store:
+            if out.suffix == SPREADSHEET:
+                from restock.files import write_text
+
+                rows = review_rows(doubtful_events(store), str(self.store))
+                write_text(out, review_csv(rows), exclusive=True)
+                done: dict[str, Any] = {"page": str(out), "events": len(rows), "notes": []}
+                then = "fill in its last column with yes, no or FIRST..LAST (steps), then run:"
+                file = out
+            else:
+                from restock.report.fleet.review import write_review_page
+
+                with output.progress("reading what the page shows", None):
+                    done = write_review_page(store, out)
+                then = "open it in a browser, give verdicts and save them, then run:"
+                file = Path("verdicts.json")
+        if self.json:
+            output.print_json(done)
+            return ExitCode.OK
+        of = done.get("of", done["events"])
+        count = f"{done['events']} events" if of == done["events"] else f"{done['events']} of {of}"
+        output.print_text(f"{out}: {count}" if done["events"] else f"{out}: {NOTHING}")
+        for note in done["notes"]:
+            output.print_text(f"note: {note}")
+        if done["events"]:
+            output.say(f"{then} restock review {quoted(self.store)} {quoted(file)}")
+        return ExitCode.OK
+
+    def _take(self, place: Location, file: str) -> int:
+        from restock.ingest.relabel import correct_store, open_for_relabel, remove_corrections
+        from restock.replay.review.journal import Written, take_file
+        from restock.replay.review.verdicts import read_verdicts
+        from restock.replay.store.store import Store
+
+        store = open_for_relabel(self.store)
+        left_open = 0
+        if file == NONE:
+            written = Written(*remove_corrections(store, dry_run=self.dry_run))
+        elif Path(file).suffix == SPREADSHEET:
+            with Store(place) as opened:
+                verdicts = read_verdicts(file, opened)
+            left_open = verdicts.left_open
+            outcomes, version = correct_store(store, verdicts.given, dry_run=self.dry_run)
+            written = Written(outcomes, version, verdicts.taken)
+        else:
+            written = take_file(Path(file), place, dry_run=self.dry_run)
+        if self.json:
+            from restock.cli import output
+
+            more = {"dry_run": self.dry_run, "without_verdict": left_open}
+            output.print_json(written.document | more)
+            return ExitCode.OK
+        nothing = "there are no corrections to remove" if file == NONE else "no verdict is new"
+        print_written(written, nothing, left_open=left_open, dry_run=self.dry_run)
+        return ExitCode.OK
+
+    def _serve(self, place: Location) -> int:
+        from restock.cli import output
+        from restock.report.fleet.review_server import Review, Server
+
+        place.expect_newest()
+        if place.folder is None:
+            raise LabelError(
+                "verdicts are kept in the store's folder, and this store has none",
+                where=str(place),
+                remedy=f"review it in a file: `restock review {place} --out page.html`",
+            )
+        review = Review(place)
+        try:
+            if not review.data["events"]:
+                output.print_text(NOTHING)
+                return ExitCode.OK
+            if waiting := len(review.journal.counting()):
+                output.say(f"{waiting} verdicts of an earlier review wait in {review.journal.path}")
+            with Server(review, output.say) as server:
+                if self.json:
+                    output.print_json({"address": server.address, "events": review.data["total"]})
+                else:
+                    output.print_text(server.address)
+                    output.say("open this address; Ctrl-C writes the verdicts into the store")
+                sys.stdout.flush()
+                try:
+                    server.serve_forever(poll_interval=0.5)
+                except KeyboardInterrupt:
+                    output.say("")
+            written = review.write()
+        finally:
+            review.close()
+        if self.json:  # stdout has its one document already
+            output.say(f"{written.taken} verdicts are written, {len(written.held_back)} held back")
+        else:
+            print_written(written, "no verdict is new")
+        return ExitCode.OK
+
+
+NOTHING = "no uncertain event is left to review"
+
+
+def print_written(
+    written: Written, nothing: str, *, left_open: int = 0, dry_run: bool = False
+) -> None:
+    """Print what verdicts changed."""
+    from restock.cli import output
+
+    for why in written.held_back:
+        output.print_text(f"held back: {why}")
+    if not written.outcomes:
+        output.print_text(nothing)
+        return
+    output.print_table(
+        [_correction(outcome, name) for outcome in written.outcomes for name in outcome.changed]
+    )
+    if written.taken:
+        output.print_text(f"{written.taken} verdicts, {left_open} lines without one")
+    if dry_run:
+        output.print_text("dry run: nothing was written")
+    else:
+        version = written.version
+        output.print_text("unchanged" if version is None else f"store version {version}")
+
+
+def _correction(outcome: Corrected, name: str) -> dict[str, Any]:
+    return {
+        "recording": outcome.source_file,
+        "labels": f"{outcome.before} -> {outcome.after}",
+        "condition": name,
+        **{f"rows {key}": value for key, value in asdict(outcome.changed[name]).items()},
+    }

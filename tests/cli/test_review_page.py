@@ -1,0 +1,417 @@
+"""`restock review`: the page in a browser, its server, and what becomes of the verdicts."""
+
+import csv
+import http.client
+import json
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from support.browser import Browser, Tab
+from support.served_review import ServedReview
+from support.stores import manifest, one, recording_transitions
+
+from restock.cli import main
+from restock.errors import LabelError
+from restock.ingest.store.location import Location
+from restock.ingest.store.transitions import replaced
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.review.events import doubtful_events
+from restock.replay.review.journal import NAME, Entry, Journal
+from restock.replay.store.store import Store
+from restock.report.fleet import review_server
+from restock.report.fleet.review_server import PORT, Review, Server
+from restock.stats import wilson
+
+HOSTILE = "<img src=x onerror=window.hacked=1>"
+READY = "window.review && review.moment() && true"
+CORRECTIONS = (
+    "SELECT recording_id, condition, value, episode_index, first_ns, last_ns FROM corrections"
+    " ORDER BY ALL"
+)
+LABELS = "SELECT transition_id, conditions FROM transitions ORDER BY ALL"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("chromium")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("made") / "store"
+    for recording in (1, 2):
+        StoreWriter(path).write(*one(recording))
+    return path
+
+
+@pytest.fixture
+def store(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "store"))
+
+
+def rows(path: Path, query: str) -> list[tuple]:
+    with Store(path) as store:
+        return store.sql(query).fetchall()
+
+
+def press(tab: Tab, *keys: str) -> None:
+    """Press keys, and wait until the page has dealt with them."""
+    for key in keys:
+        tab.press(key)
+    tab.run("review.settled()")
+
+
+def opened(browser: Browser, address: str, **size: int) -> Tab:
+    tab = browser.open(address, **size)
+    tab.wait(READY)
+    return tab
+
+
+def by_csv(store: Path, verdicts: list[tuple[str, str, int, int, str]]) -> None:
+    """Give verdicts as a spreadsheet does: episode, condition, first and last step, verdict."""
+    file = store.parent / "same.csv"
+    with file.open("w", newline="") as out:
+        lines = csv.writer(out)
+        lines.writerow(["episode_id", "condition", "first_step", "last_step", "verdict"])
+        lines.writerows(verdicts)
+    assert main(["review", str(store), str(file)]) == 0
+
+
+def test_thirty_events_by_keys_equal_those_by_csv(browser, store, made, tmp_path):
+    same = Path(shutil.copytree(made, tmp_path / "same"))
+    with Store(store) as read:
+        known = {event.event: event for event in doubtful_events(read)}
+    verdicts = []
+    with ServedReview(store) as server:
+        tab = opened(browser, server.address)
+        for number in range(30):
+            event = known[tab.run("review.here()")]
+            place = (event.episode_id, event.condition, event.first_step, event.last_step)
+            if number % 5 == 4:  # it ends where the slider is, a step after it begins
+                press(tab, ".", "]", "y")
+                ends = sorted((event.first_step, event.first_step + 1))
+                whole = ends == [event.first_step, event.last_step]
+                said = "yes" if whole else f"{ends[0]}..{ends[1]}"
+            else:
+                said = "no" if number % 2 else "yes"
+                press(tab, said[0])
+            verdicts.append((*place, said))
+        assert "30 judged" in tab.text("#progress")
+        tab.close()
+        code, _ = server.end()
+    assert code == 0
+    by_csv(same, verdicts)
+    assert rows(store, CORRECTIONS) == rows(same, CORRECTIONS)
+    assert rows(store, LABELS) == rows(same, LABELS)
+    assert rows(store, LABELS) != rows(made, LABELS)
+
+
+def test_another_condition_a_mark_a_note_and_undo(browser, store, tmp_path):
+    with ServedReview(store) as server:
+        tab = opened(browser, server.address)
+        first = tab.run("review.here()")
+        condition = first.rpartition("/")[2]
+        press(tab, "c")
+        other = tab.text("#pick-names button").split(maxsplit=1)[1].replace(" ", "_")
+        press(tab, "1")
+        tab.wait(f"review.here() !== {json.dumps(first)} && review.moment()")
+        counting = Journal.of(Location.of(store)).counting()
+        said = {(one.condition, one.verdict) for one in counting}
+        assert said == {(condition, "no"), (other, "yes")}
+        press(tab, "u")
+        assert tab.run("review.here()") == first
+        assert Journal.of(Location.of(store)).counting() == []
+        tab.run("document.getElementById('note').value = 'a child with a ball'")
+        press(tab, "y")
+        (entry,) = Journal.of(Location.of(store)).counting()
+        assert (entry.note, entry.event, entry.verdict) == ("a child with a ball", first, "yes")
+        press(tab, "m", "1")
+        tab.wait("document.getElementById('kind').innerText === 'marked by you'")
+        press(tab, "y")
+        (mark,) = Journal.of(Location.of(store)).counting()[1:]
+        assert mark.verdict == "yes"
+        assert mark.last_step >= mark.first_step
+        tab.close()
+    found = rows(store, "SELECT condition, value FROM corrections")
+    assert (mark.condition, True) in found
+    assert (condition, True) in found
+
+
+def test_the_ends_of_an_event_can_be_dragged(browser, store):
+    with ServedReview(store) as server:
+        tab = opened(browser, server.address)
+        tab.run("document.querySelector('.handle').scrollIntoView({block: 'center'})")
+        box = "document.querySelector('.handle[data-end=\"1\"]').getBoundingClientRect()"
+        x, y = tab.run(f"[{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]")
+        before = tab.text("#yes")
+        tab.drag((x, y), (x + 80, y))
+        assert before.split() == ["Yes", "y"]
+        assert ".." in tab.text("#yes")
+        press(tab, "y")
+        (entry,) = Journal.of(Location.of(store)).counting()
+        assert int(entry.verdict.split("..")[1]) > entry.last_step
+        tab.close()
+
+
+def test_names_stay_text(browser, tmp_path):
+    table = replaced(recording_transitions(1), {"source_file": f"{HOSTILE}.mcap"})
+    path = tmp_path / "store"
+    StoreWriter(path).write(manifest(table, tags={"robot": HOSTILE}), table)
+    page = tmp_path / "page.html"
+    assert main(["review", str(path), "--out", str(page)]) == 0
+    with ServedReview(path) as server:
+        for address in (server.address, page.as_uri()):
+            tab = opened(browser, address)
+            assert HOSTILE in tab.text("#facts")
+            assert tab.run("window.hacked === undefined && !document.querySelector('img')")
+            tab.close()
+
+
+def test_a_killed_server_loses_nothing(browser, store, tmp_path):
+    server = ServedReview(store)
+    tab = opened(browser, server.address)
+    press(tab, *"yynyn")
+    server.kill()
+    with (store / NAME).open("ab") as journal:
+        journal.write(b'{"kind": "verdict", "id": "ha')  # a write that a crash cut short
+    press(tab, "y")
+    assert "The server does not answer: nothing was taken" in tab.text("#said")
+    tab.close()
+    with ServedReview(store) as again:
+        tab = opened(browser, again.address)
+        assert "5 judged" in tab.text("#progress")
+        press(tab, "n")
+        tab.close()
+        _, said = again.end()
+    assert "5 verdicts of an earlier review wait in" in said
+    assert "6 verdicts are written, 0 held back" in said
+    assert len(Journal.of(Location.of(store)).lines) == 7
+    assert Journal.of(Location.of(store)).counting() == []
+
+
+def test_two_people_and_two_servers_lose_no_verdict(browser, store):
+    with ServedReview(store) as one_server, ServedReview(store) as other_server:
+        anna, ben = opened(browser, one_server.address), opened(browser, other_server.address)
+        event = anna.run("review.here()")
+        assert ben.run("review.here()") == event  # as nobody has judged it
+        press(anna, "y")
+        press(ben, "n")
+        both = Journal.of(Location.of(store)).counting()
+        assert [one.verdict for one in both if one.event == event] == ["yes", "no"]
+        press(ben, "ArrowLeft")
+        anna.wait("!document.getElementById('conflicts').hidden")
+        anna.run("document.getElementById('conflicts').click()")
+        anna.wait(f"review.here() === {json.dumps(event)} && review.moment()")
+        assert "Conflict: you said yes" in anna.text("#verdict")
+        anna.run("document.getElementById('write').click()")
+        anna.wait("document.getElementById('said').innerText.includes('Held back')")
+        assert rows(store, "FROM corrections") == []
+        press(anna, "y")
+        (entry,) = (one for one in Journal.of(Location.of(store)).counting() if one.event == event)
+        assert entry.verdict == "yes"
+        anna.wait("document.getElementById('conflicts').hidden")
+        anna.close()
+        ben.close()
+    assert len(rows(store, "FROM corrections")) == 1
+
+
+def test_a_file_gives_the_verdicts_back(browser, store, made, tmp_path, capsys):
+    same, page = Path(shutil.copytree(made, tmp_path / "same")), tmp_path / "page.html"
+    assert main(["review", str(store), "--out", str(page)]) == 0
+    assert "open it in a browser" in capsys.readouterr().err
+    tab = opened(browser, page.as_uri())
+    first = tab.run("review.here()")
+    press(tab, "n", "y")
+    browser.call("Browser.setDownloadBehavior", behavior="allow", browserContextId=tab.context,
+                 downloadPath=str(tmp_path))  # fmt: skip
+    tab.run("document.getElementById('write').click()")
+    file = tmp_path / "verdicts.json"
+    tab.wait("document.getElementById('said').innerText.includes('Saved')")
+    tab.run("new Promise((done) => setTimeout(done, 500))")
+    tab.close()
+    saved = json.loads(file.read_text())
+    assert (saved[0]["event"], saved[0]["verdict"]) == (first, "no")
+    for dry in (["--dry-run"], []):
+        assert main(["review", str(store), str(file), "--json", *dry]) == 0
+        assert json.loads(capsys.readouterr().out)["verdicts"] == 2
+    assert main(["review", str(store), str(file)]) == 0  # the same again
+    assert "no verdict is new" in capsys.readouterr().out
+    names = ("episode_id", "condition", "first_step", "last_step", "verdict")
+    by_csv(same, [tuple(one[name] for name in names) for one in saved])
+    assert rows(store, LABELS) == rows(same, LABELS)
+
+
+@pytest.mark.parametrize("text", ["[{}]", "hello", '[{"kind": "verdict"}]', "[" * 99])
+def test_a_file_without_verdicts_is_refused(store, tmp_path, text, capsys):
+    file = tmp_path / "verdicts.json"
+    file.write_text(text)
+    assert main(["review", str(store), str(file)]) == 2
+    assert "verdict" in capsys.readouterr().err
+    assert not (store / NAME).exists()
+
+
+def test_precision_is_estimated_in_random_order(browser, store):
+    with ServedReview(store) as server:
+        tab = opened(browser, server.address)
+        assert tab.text("#estimate") == ""
+        tab.run(
+            "document.getElementById('order').value = 'random';"
+            "document.getElementById('order').dispatchEvent(new Event('change'))"
+        )
+        tab.wait(READY)
+        press(tab, *"yynyyyny")
+        low, high = wilson(6, 8)
+        assert f"6 of 8 labels are right: 0.75 (95 %: {low:.2f} to {high:.2f})" in tab.text(
+            "#estimate"
+        )
+        press(tab, "ArrowRight", "n")  # past one: it says so, and does not count what comes after
+        assert "6 of 8 labels" in tab.text("#estimate")
+        assert "1 after a skipped one" in tab.text("#estimate")
+        tab.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (768, 1024), (1440, 900)])
+def test_the_page_fits_a_phone_and_a_thumb(browser, store, width, height):
+    with ServedReview(store) as server:
+        tab = opened(browser, server.address, width=width, height=height)
+        assert tab.run("document.documentElement.scrollWidth") <= width
+        sizes = tab.run(
+            "[...document.querySelectorAll('nav button')].map((b) => b.getBoundingClientRect())"
+            ".map((box) => [box.width, box.height, box.bottom])"
+        )
+        assert all(wide >= 44 and high >= 44 and low <= height for wide, high, low in sizes)
+        first = tab.run("review.here()")
+        tab.run("document.getElementById('no').click()")
+        tab.wait(f"review.here() !== {json.dumps(first)}")
+        tab.close()
+
+
+def asked(address: str, method: str, path: str, **headers: str) -> tuple[int, str]:
+    """Return status and body of a request that no page sends."""
+    parts = urlsplit(address)
+    link = http.client.HTTPConnection("127.0.0.1", parts.port)
+    body = b"{}" if method == "POST" else None
+    link.request(method, path, body, {"Host": parts.netloc, **headers})
+    answer = link.getresponse()
+    text = answer.read().decode()
+    link.close()
+    return answer.status, text
+
+
+@pytest.fixture
+def in_process(store: Path) -> Iterator[tuple[Server, list[str]]]:
+    said: list[str] = []
+    review = Review(Location.of(store))
+    with Server(review, said.append) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        yield server, said
+        server.shutdown()
+        thread.join()
+    review.close()
+
+
+def test_only_the_page_is_answered(in_process):
+    server, _ = in_process
+    path, own = f"/{server.token}/", {"Origin": server.address.split("/" + server.token)[0]}
+    for method, at, headers, why in (
+        ("GET", "/", {}, "lacks the token"),
+        ("GET", "/" + "x" * len(server.token) + "/", {}, "lacks the token"),
+        ("POST", "/wrong/verdicts", own, "lacks the token"),
+        ("GET", path, {"Host": "evil.example:80"}, "this machine only"),
+        ("GET", path, {"Origin": "http://evil.example"}, "not from the review page"),
+        ("POST", path + "state", {}, "not from the review page"),
+        ("POST", path + "state", {"Origin": "null"}, "not from the review page"),
+    ):
+        status, text = asked(server.address, method, at, **headers)
+        assert (status, why in text) == (403, True), (method, at, headers)
+    assert asked(server.address, "GET", path)[0] == 200
+    assert asked(server.address, "POST", path + "state", **own)[0] == 200
+    for at in ("../etc/passwd", "moment/-1", "moment/x", "style.css"):
+        assert asked(server.address, "GET", path + at)[0] == 404
+    assert asked(server.address, "GET", path + "moment/99999")[0] == 409
+    link = http.client.HTTPConnection("127.0.0.1", server.server_port)
+    link.request("GET", path)
+    answer = link.getresponse()
+    policy = answer.getheader("Content-Security-Policy") or ""
+    assert policy.startswith("default-src 'none'")
+    assert "connect-src 'self'; script-src 'sha256-" in policy
+    html = answer.read().decode()
+    assert "http://" not in html.replace("http://www.w3.org/2000/svg", "")
+    link.close()
+
+
+def test_another_port_is_taken_if_it_is_in_use(in_process, store):
+    _, said = in_process
+    review = Review(Location.of(store))
+    with Server(review, said.append) as second:
+        assert second.server_port != PORT
+    review.close()
+    assert f"port {PORT} is in use: this review has port" in said[-1]
+
+
+def test_a_browser_that_closes_is_said_once(in_process, monkeypatch):
+    server, said = in_process
+    said.clear()
+    server.review.state(0, "anna")
+    monkeypatch.setattr(review_server, "ALONE_S", -1.0)
+    while not said:  # the server's thread says it
+        time.sleep(0.05)
+    assert len(said) == 1
+    assert "no page is open any more: 0 verdicts are kept in" in said[0]
+
+
+def given(review: Review, place: int = 0, **changed: object) -> Entry:
+    event = review.data["events"][place]
+    values = {
+        name: event[name]
+        for name in ("event", "episode_id", "condition", "first_step", "last_step", "start_s")
+    }
+    return Entry(**({"id": f"v{place}", "by": "anna", "verdict": "no"} | values | changed))
+
+
+def test_a_store_may_be_compacted_meanwhile(in_process, store):
+    review = in_process[0].review
+    assert main(["store", "compact", str(store)]) == 0
+    review.give([given(review)])
+    assert review.moment(1)["steps"]
+    assert review.write().version is not None
+    review.give([given(review, 1)])  # the labels that it wrote do not stand in its own way
+    assert review.write().taken == 1
+    assert len(rows(store, "FROM corrections")) == 2
+
+
+def test_a_verdict_on_replaced_rows_is_refused_in_a_sentence(in_process, store):
+    review = in_process[0].review
+    review.give([given(review)])
+    recording = review.data["events"][0]["recording"]
+    table = recording_transitions(int(recording, 16), ingest="b")
+    stamps = table["stamp_ns"].to_numpy().copy()
+    stamps[1:] += 7 * 10**9
+    table = replaced(table, {"stamp_ns": stamps})
+    StoreWriter(store).write(manifest(table), table)
+    with pytest.raises(LabelError, match="the recording was ingested again in the meantime"):
+        review.give([given(review, id="later")])
+    written = review.write()
+    assert written.version is None
+    (why,) = written.held_back
+    assert "the recording was ingested again in the meantime" in why
+    assert [one.id for one in review.journal.counting()] == ["v0"]  # it is kept
+
+
+def test_a_verdict_that_does_not_fit_is_not_taken(in_process):
+    review = in_process[0].review
+    for changed, why in (
+        ({"condition": "wheelslip"}, "no condition 'wheelslip'"),
+        ({"verdict": "0..99999999"}, "do not all exist"),
+        ({"episode_id": "gone/3"}, "no episode or recording"),
+    ):
+        with pytest.raises(LabelError, match=why):
+            review.give([given(review, **changed)])
+    assert review.journal.lines == []
