@@ -2,6 +2,7 @@
 
     python benchmarks/labels.py --cache FOLDER [--part held-out] [--minutes 24] [--quick] [--bound]
     python benchmarks/labels.py --cache FOLDER --fit blocked_aisle
+    python benchmarks/labels.py --cache FOLDER --verdicts
 
 Records logs of seeds that no rule was set on, on the default floor and on `generated:test` floors
 (`--part development`: the seeds and `generated:train` floors that the rules were set on; `seen`:
@@ -9,7 +10,8 @@ logs that were looked at while they were), ingests them, and prints precision an
 condition with 95 % intervals, the share of uncertain steps, and the reliability of the
 probabilities. `--bound` adds the best that any rule could do: `label_bound.py`. `--fit` prints the
 weights of a condition's `odds` that suit the development
-logs best. What is in FOLDER is not recorded again; labels follow the rules as they are now.
+logs best. `--verdicts` prints what a person's verdicts gain on the longer sample log, by doubt and
+at random. What is in FOLDER is not recorded again; labels follow the rules as they are now.
 """
 
 from __future__ import annotations
@@ -28,10 +30,12 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from restock.arrays import F64
-from restock.ingest.store.manifest import LabelScore
+from restock.ingest.store.manifest import LabelScore, label_scores
+from restock.ingest.store.transitions import replaced
 from restock.ingest.task.conditions import let_values, shipped
-from restock.ingest.task.schema import signal_columns
+from restock.ingest.task.schema import signal_columns, true_names
 from restock.ingest.task.task import STORED_SIGNALS
+from restock.replay.review.events import DoubtfulEvent, doubtful_events
 from restock.replay.review.quality import LabelQuality, label_quality, reliability
 from restock.replay.store.store import Store
 from restock.train.twin.recording.recorder import RecordingPlan, record
@@ -42,6 +46,7 @@ SEEDS = {
     "seen": {"default": range(901, 907), "generated:test": range(911, 917)},  # when rules were made
 }
 TARGETS = {"event": 0.9, "step": 0.85}
+MONDAY = Path(__file__).parents[1] / "sample_logs" / "amr_monday.mcap"
 RIDGE = 1e-3  # of standardised terms
 
 
@@ -54,7 +59,10 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=24.0, help="of each log")
     parser.add_argument("--bound", action="store_true", help="train networks: what is possible")
     parser.add_argument("--fit", metavar="CONDITION", help="print the weights that suit it best")
+    parser.add_argument("--verdicts", action="store_true", help="print what verdicts gain")
     options = parser.parse_args()
+    if options.verdicts:
+        return print_verdicts(options)
     count = 2 if options.quick else None
     minutes = 6.0 if options.quick else options.minutes
     if options.fit:
@@ -222,6 +230,75 @@ def steps_of(one: Log) -> pa.Table:
     columns = signal_columns({s.name: one[s.name].astype(s.dtype) for s in STORED_SIGNALS})
     places = {name: one[name].astype(np.int64) for name in ("episode_index", "step_index")}
     return pa.table(places | columns)
+
+
+# -- what verdicts gain -----------------------------------------------------------------------
+
+VERDICTS = (0, 30, 100)
+RANDOM_ORDERS = 5
+
+
+def print_verdicts(options: Any) -> int:
+    """Print how good labels are after some verdicts of a person who knows the truth.
+
+    The verdict on an event is its true steps. At random: the mean of orders of all events.
+    """
+    store = options.cache / "monday"
+    run_restock(["ingest", str(MONDAY), "--store", str(store)])
+    with Store(store) as opened:
+        rows = opened.sql("FROM transitions ORDER BY episode_index, step_index").to_arrow_table()
+        events = doubtful_events(opened)
+        names = [condition.name for condition in opened.conditions()]
+        period_s = opened.task().control_period_s
+    orders = 2 if options.quick else RANDOM_ORDERS
+    shuffles = [np.random.default_rng(seed).permutation(len(events)) for seed in range(orders)]
+    places = {"by doubt": [np.arange(len(events))], "at random": shuffles}
+    figures = {
+        order: [
+            np.mean([quality_after(rows, [events[at] for at in one[:count]], names, period_s)
+                     for one in several], axis=0).tolist()
+            for count in VERDICTS
+        ]
+        for order, several in places.items()
+    }  # fmt: skip
+    header = ["verdicts", *(f"{what}, {order}" for what in ("event precision", "event recall",
+              "wrong steps") for order in places)]  # fmt: skip
+    table = [
+        [count, *(f"{figures[order][row][column]:.{digits}f}"
+                  for column, digits in ((0, 3), (1, 3), (2, 0)) for order in places)]
+        for row, count in enumerate(VERDICTS)
+    ]  # fmt: skip
+    lines = [f"{len(events)} events, {orders} random orders", "", markdown(header, table)]
+    return finish(options, figures, [], lines)
+
+
+def quality_after(
+    rows: pa.Table, judged: Sequence[DoubtfulEvent], names: Sequence[str], period_s: float
+) -> tuple[float, float, float]:
+    """Return precision and recall of events, and wrong steps, once these events have verdicts."""
+    truth = [true_names(text) for text in rows["true_condition"].to_pylist()]
+    held = [set(one) for one in rows["conditions"].to_pylist()]
+    places = zip(rows["episode_id"].to_pylist(), rows["step_index"].to_pylist(), strict=True)
+    row_at = {place: row for row, place in enumerate(places)}
+    for event in judged:
+        steps = range(event.first_step, event.last_step + 1)
+        own = [row_at[event.episode_id, step] for step in steps]
+        true = [row for row in own if event.condition in truth[row]]
+        for row in own:
+            held[row].discard(event.condition)
+        for row in range(true[0], true[-1] + 1) if true else ():
+            held[row].add(event.condition)
+    rows = replaced(rows, {"conditions": [sorted(one) for one in held]})
+    scores = [one for one in label_scores(rows, names, period_s) if one.condition in names]
+
+    def total(name: str) -> int:
+        return sum(getattr(one, name) for one in scores)
+
+    return (
+        total("event_right") / total("event_labelled"),
+        total("event_found") / total("event_support"),
+        total("labelled") + total("support") - 2 * total("agreed"),
+    )
 
 
 if __name__ == "__main__":

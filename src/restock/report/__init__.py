@@ -7,18 +7,22 @@ other pages: `write_page` takes what `coverage_page`, `study_page` and the other
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from restock.report.fleet.coverage import coverage_page as coverage_page
-from restock.report.look.write import write_page as write_page
-from restock.report.run.card import write_card as write_card
-from restock.report.run.comparison import comparison_page as comparison_page
-from restock.report.run.comparison import gate_section as gate_section
-from restock.report.run.comparison import outcome_sections as outcome_sections
-from restock.report.run.comparison import study_page as study_page
-from restock.report.run.facts import gather
-from restock.report.run.gate import gate_page as gate_page
-from restock.report.run.page import page
-from restock.report.run.twin_gap import gap_page as gap_page
+from restock.public import lazy
+
+if TYPE_CHECKING:
+    from restock.report.fleet.coverage import coverage_page as coverage_page
+    from restock.report.look.write import write_page as write_page
+    from restock.report.run.card import write_card as write_card
+    from restock.report.run.comparison import comparison_page as comparison_page
+    from restock.report.run.comparison import gate_section as gate_section
+    from restock.report.run.comparison import outcome_sections as outcome_sections
+    from restock.report.run.comparison import study_page as study_page
+    from restock.report.run.gate import gate_page as gate_page
+    from restock.report.run.twin_gap import gap_page as gap_page
+else:
+    __getattr__, __dir__, _ = lazy(__name__)
 
 
 def build_report(
@@ -31,6 +35,10 @@ def build_report(
     Raises:
         RunError: no run there, or one with nothing to report on yet.
     """
+    from restock.report.look.write import write_page
+    from restock.report.run.facts import gather
+    from restock.report.run.page import page
+
     content = page(gather(Path(run)))
     return write_page(content, out if out is not None else Path(run) / "report.html", figures)
 

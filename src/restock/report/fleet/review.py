@@ -19,8 +19,7 @@ from restock.replay.review.events import page_events
 from restock.replay.review.moments import Moments
 from restock.replay.review.verdicts import CONDITIONS
 from restock.replay.store.store import Store
-from restock.report.look.charts import palette
-from restock.report.look.write import dark_rules
+from restock.report.look.theme import dark_rules, palette
 
 IN_A_FILE = 300  # events of a page without a server: the first of each order, half and half
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -20,25 +20,13 @@ import numpy as np
 import vl_convert
 
 from restock.report.look.blocks import Drawing, Rows, words
-from restock.train.twin.missions import MISSIONS
+from restock.report.look.theme import SPARE_COLOURS, WORDS_COLOURS, palette
 
 Row = Mapping[str, Any]
 
 HALF = (300, 470)  # widths of a figure that shares a line on a desktop
 FULL = (300, 630, 1000)  # widths of a figure with a line for itself
 
-# Okabe-Ito: colour-blind readers can distinguish them too.
-CONDITION_COLOURS = {
-    **{name: one.colour for name, one in MISSIONS.items()},
-    **{
-        f"{name} ({block})": colour
-        for name, one in MISSIONS.items()
-        for block, colour in one.blocks.items()
-    },
-    "recovery": "#cc79a7",
-}
-WORDS_COLOURS = {words(name): colour for name, colour in CONDITION_COLOURS.items()}
-SPARE_COLOURS = ("#56b4e9", "#009e73", "#8b5cf6", "#84643a", "#111827")
 POLICY_COLOURS = {
     "agent": "#0f766e",
     "cloned": "#7c3aed",
@@ -145,27 +133,6 @@ def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
     spare = POLICY_SPARES if colours is POLICY_COLOURS else SPARE_COLOURS
     all_of_them = palette(names, colours, spare)
     return alt.Scale(domain=list(names), range=[all_of_them[name] for name in names])
-
-
-def palette(
-    names: Collection[str],
-    colours: Mapping[str, str] = CONDITION_COLOURS,
-    spare: Sequence[str] = SPARE_COLOURS,
-) -> dict[str, str]:
-    """Return a colour for each name, independent of their order.
-
-    A name gets its own colour, else the first free spare one. The search begins at the same place
-    in every chart.
-    """
-    found = {name: colours[name] for name in names if name in colours}
-    free: list[str] = []
-    for name in sorted(set(names) - set(found)):
-        free = free or list(spare)
-        first = sum(map(ord, words(name))) % len(spare)
-        likes = (*spare[first:], *spare[:first])
-        found[name] = next(colour for colour in likes if colour in free)
-        free.remove(found[name])
-    return found
 
 
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
