@@ -155,7 +155,7 @@ def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
         store.sql(f"FROM {'novelty' if measured else 'transitions'} LIMIT 0").fetchall()
         with passed_in(store.connection, asked=asked):
             found = store.connection.sql(query).fetchall()
-        more = {event: rest for event, *rest in found}
+        more = {event: tuple(rest) for event, *rest in found}
     shuffled = sorted(
         (event.event for event in events if event.labelled),
         key=lambda name: hashlib.blake2b(name.encode(), digest_size=16).digest(),

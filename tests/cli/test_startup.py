@@ -56,6 +56,11 @@ def test_an_audit_imports_no_learning_and_no_readers(store: Path) -> None:
     assert loaded("audit", str(store)) & SLOW == set()
 
 
+def test_a_review_page_imports_no_learning_and_no_charts(store: Path, tmp_path: Path) -> None:
+    modules = loaded("review", str(store), "--out", str(tmp_path / "page.html"))
+    assert modules & (OF_LEARNING | {"vl_convert"}) == set()
+
+
 def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     bag = write_bag(Drive(), tmp_path / "bag")
     modules = loaded("ingest", str(bag), "--store", str(tmp_path / "store"), "--json")

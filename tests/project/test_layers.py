@@ -30,7 +30,7 @@ MAY_IMPORT = {
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
-    "replay": "fleet panel store ingest/containers ingest/decoding ingest/store ingest",
+    "replay": "fleet panel store ingest/containers ingest/decoding ingest/store",
     "replay/store": "ingest/steps ingest/store ingest/task",
     "replay/sampling": "",
     "replay/mixture": "sampling",

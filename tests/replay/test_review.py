@@ -108,7 +108,7 @@ def test_doubtful_events_are_wrong_more_often(monday, tmp_path):
         f"wrong steps: {before} -> {wrong_steps()}",
         f"event precision and recall: {events_before} -> {event_scores()}",
     ]
-    sys.stdout.write("\n".join(said) + "\n")  # the figures of docs/ingest.md, by pytest -s
+    sys.stdout.write("\n".join(said) + "\n")
 
 
 def test_the_list_is_a_file_whose_commands_open_the_moment(monday, tmp_path, capsys):
