@@ -23,8 +23,8 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.review.events import doubtful_events
 from restock.replay.review.journal import NAME, Entry, Journal
 from restock.replay.store.store import Store
-from restock.report.fleet import review_server
-from restock.report.fleet.review_server import PORT, Review, Server
+from restock.report.fleet import review as review_module
+from restock.report.fleet.review import PORT, Review, Server
 from restock.stats import wilson
 
 HOSTILE = "<img src=x onerror=window.hacked=1>"
@@ -360,7 +360,7 @@ def test_a_browser_that_closes_is_said_once(in_process, monkeypatch):
     server, said = in_process
     said.clear()
     server.review.state(0, "anna")
-    monkeypatch.setattr(review_server, "ALONE_S", -1.0)
+    monkeypatch.setattr(review_module, "ALONE_S", -1.0)
     while not said:  # the server's thread says it
         time.sleep(0.05)
     assert len(said) == 1

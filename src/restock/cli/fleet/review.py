@@ -139,7 +139,7 @@ class ReviewCommand:
 
     def _serve(self, place: Location) -> int:
         from restock.cli import output
-        from restock.report.fleet.review_server import Review, Server
+        from restock.report.fleet.review import Review, Server
 
         place.expect_newest()
         if place.folder is None:

@@ -1,25 +1,40 @@
-"""The review page: its HTML, with a server behind it or as one file that holds all it shows."""
+"""The review page: served on this machine, or as one file that holds all it shows.
+
+The server listens on loopback alone. Every request names the token of the address, and this machine
+as the host; what changes something comes from the page itself. Several browsers and several servers
+may work on one store: each answer has the verdicts that others have given since.
+"""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import hmac
 import json
-from collections.abc import Sequence
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 import jinja2
+import msgspec
 from markupsafe import Markup
 
-from restock.errors import RestockError
+from restock.errors import LabelError, RestockError
 from restock.files import write_text
+from restock.ingest.store.location import TRANSITIONS, Location
 from restock.replay.review.events import page_events
+from restock.replay.review.journal import Entry, Journal, Written, checked, write_verdicts
 from restock.replay.review.moments import Moments
 from restock.replay.review.verdicts import CONDITIONS
 from restock.replay.store.store import Store
-from restock.report.look.theme import dark_rules, palette
+from restock.report.look.blocks import dark_rules, palette
 
 IN_A_FILE = 300  # events of a page without a server: the first of each order, half and half
 
@@ -95,3 +110,242 @@ def first_of_orders(events: Sequence[dict[str, Any]], count: int) -> list[dict[s
     )
     half = {event["event"] for event in (*events[: count // 2], *labelled[: count // 2])}
     return [event for event in events if event["event"] in half or len(events) <= count]
+
+
+PORT = 7474  # taken if it is free, so that an SSH tunnel can be prepared
+HOSTS = ("127.0.0.1", "localhost")
+NOTHING = "default-src 'none'"  # a policy of what is not a page
+MAX_BODY_BYTES = 256 << 10
+WATCHED_S, ALONE_S = 12.0, 15.0  # without a sign of a page: others look there, nobody is there
+
+
+class Review:
+    """A review of one store: what is shown, and the verdicts that are given."""
+
+    def __init__(self, place: Location) -> None:
+        self.place = place
+        self.journal = Journal.of(place)
+        self.store = Store(place)
+        self.data = page_data(self.store)
+        self.moments = Moments(self.store)
+        self._now = self.store  # of the newest version, against which verdicts are checked
+        self._lock = threading.RLock()  # neither store nor journal is for several threads
+        self._watching: dict[str, tuple[str, float]] = {}  # browser -> event, when
+
+    def close(self) -> None:
+        """Close the stores."""
+        for store in {self.store, self._now}:
+            store.close()
+
+    def page(self) -> tuple[str, str]:
+        """Return the page and its policy."""
+        return review_html(self.data)
+
+    def moment(self, place: int) -> dict[str, Any]:
+        with self._lock:
+            return self.moments.show(self._event(place))
+
+    def frames(self, place: int) -> dict[str, Any]:
+        with self._lock:
+            return self.moments.frames(self._event(place))
+
+    def _event(self, place: int) -> dict[str, Any]:
+        events = self.data["events"]
+        if not 0 <= place < len(events):
+            raise LabelError(f"there is no event {place}")
+        event: dict[str, Any] = events[place]
+        return event
+
+    def state(self, after: int, by: str, at: str = "") -> dict[str, Any]:
+        """Return the journal's lines from one on, and what others look at."""
+        with self._lock:
+            self.journal.refresh()
+            now = time.monotonic()
+            if by:
+                self._watching[by] = (at, now)
+            lines = self.journal.lines
+            whole = not 0 < after <= len(lines)
+            return {
+                "lines": msgspec.to_builtins(lines if whole else lines[after:]),
+                "all": whole,
+                "next": len(lines),
+                "conflicts": msgspec.to_builtins(self.journal.conflicts()),
+                "watched": [
+                    event
+                    for browser, (event, when) in self._watching.items()
+                    if browser != by and now - when < WATCHED_S and event
+                ],
+            }
+
+    def give(self, entries: list[Entry]) -> None:
+        """Take verdicts: they are on the disk when this returns.
+
+        Raises:
+            LabelError: one does not fit the rows of the store as it is now; nothing is taken.
+        """
+        with self._lock:
+            given = [one for one in entries if one.verdict]
+            _, problems = checked(given, self._newest())
+            if problems:
+                raise LabelError("; ".join(problems[place] for place in sorted(problems)))
+            self.journal.append([msgspec.structs.replace(one, at="") for one in entries])
+
+    def write(self) -> Written:
+        """Write the verdicts that count into the store."""
+        with self._lock:
+            return write_verdicts(self.journal, self.place)
+
+    def _newest(self) -> Store:
+        if self.place.open_table(TRANSITIONS).version() != self._now.version:
+            if self._now is not self.store:
+                self._now.close()
+            self._now = Store(self.place)
+        return self._now
+
+    def is_alone(self) -> bool:
+        """Return whether there was a page, and there is none any more."""
+        last = max((when for _, when in self._watching.values()), default=None)
+        return last is not None and time.monotonic() - last > ALONE_S
+
+
+class _Asked(msgspec.Struct):
+    """What the page sends."""
+
+    entries: list[Entry] = []  # verdicts that it gives
+    after: int = 0  # lines of the journal that it has
+    by: Annotated[str, msgspec.Meta(max_length=40)] = ""
+    at: Annotated[str, msgspec.Meta(max_length=200)] = ""  # the event that it shows
+
+
+class Server(ThreadingHTTPServer):
+    """The server of a review; `address` is what a browser opens."""
+
+    daemon_threads = True
+
+    def __init__(self, review: Review, say: Callable[[str], None]) -> None:
+        self.review, self.say = review, say
+        self.token = secrets.token_urlsafe(18)
+        self._alone = False
+        try:
+            super().__init__(("127.0.0.1", PORT), Handler)
+        except OSError:
+            super().__init__(("127.0.0.1", 0), Handler)
+            say(f"port {PORT} is in use: this review has port {self.server_port}")
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}/{self.token}/"
+
+    def service_actions(self) -> None:
+        """Say once that no browser has the page open any more."""
+        alone = self.review.is_alone()
+        if alone and not self._alone:
+            count = len(self.review.journal.counting())
+            self.say(
+                f"no page is open any more: {count} verdicts are kept in"
+                f" {self.review.journal.path}; the address still works, Ctrl-C writes them into"
+                " the store"
+            )
+        self._alone = alone
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Let a browser that went away be; say anything else."""
+        error = sys.exc_info()[1]
+        if not isinstance(error, ConnectionError | TimeoutError):
+            self.say(f"a request failed: {error!r}")
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One request of the page."""
+
+    server: Server
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "restock", ""
+    timeout = 30
+
+    def log_message(self, *_: object) -> None:
+        """Log nothing: the token is in every line."""
+
+    def do_GET(self) -> None:
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, answer: Callable[[str], None]) -> None:
+        """Answer a request of the page itself; refuse those of others."""
+        parts = urlsplit(self.path)
+        token, _, path = parts.path.removeprefix("/").partition("/")
+        host = self.headers.get("Host", "")
+        origin = self.headers.get("Origin")
+        if host.rpartition(":")[0] not in HOSTS:
+            self._refuse("the review answers this machine only")
+        elif not hmac.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
+            self._refuse("the address lacks the token that `restock review` printed")
+        elif (origin is None and self.command == "POST") or origin not in (None, f"http://{host}"):
+            self._refuse("the request is not from the review page")
+        else:
+            try:
+                answer(path)
+            except (RestockError, OSError) as error:
+                if isinstance(error, ConnectionError):
+                    raise
+                self._send(409, json.dumps({"error": str(error)}))
+
+    def _refuse(self, why: str) -> None:
+        self.close_connection = True  # a body is not read
+        self._send(403, json.dumps({"error": why}))
+
+    def _get(self, path: str) -> None:
+        review = self.server.review
+        kind, _, place = path.partition("/")
+        if path == "":
+            html, policy = review.page()
+            self._send(200, html, "text/html", policy)
+        elif kind in ("moment", "frames") and place.isdecimal() and len(place) < 9:
+            shown = review.moment if kind == "moment" else review.frames
+            self._send(200, json.dumps(shown(int(place)), allow_nan=False))
+        else:
+            self._send(404, json.dumps({"error": "there is nothing here"}))
+
+    def _post(self, path: str) -> None:
+        review, size = self.server.review, self.headers.get("Content-Length", "")
+        if not size.isdecimal() or int(size) > MAX_BODY_BYTES:
+            self.close_connection = True
+            self._send(413, json.dumps({"error": "the request is too large"}))
+            return
+        body = self.rfile.read(int(size))
+        try:
+            asked = msgspec.json.decode(body, type=_Asked)
+        except msgspec.MsgspecError as error:
+            self._send(400, json.dumps({"error": f"not what the page sends: {error}"}))
+            return
+        if path == "verdicts":
+            review.give(asked.entries)
+        elif path == "write":
+            written = review.write()
+            state = review.state(asked.after, asked.by)
+            self._send(200, json.dumps(written.document | {"state": state}, default=str))
+            return
+        elif path != "state":
+            self._send(404, json.dumps({"error": "there is nothing here"}))
+            return
+        self._send(200, json.dumps(review.state(asked.after, asked.by, asked.at)))
+
+    def _send(
+        self, status: int, text: str, kind: str = "application/json", policy: str | None = None
+    ) -> None:
+        body = text.encode()
+        self.send_response(status)
+        for name, value in {
+            "Content-Type": f"{kind}; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": f"{policy or NOTHING}; frame-ancestors 'none'",
+            "Cache-Control": "no-store",
+            "Referrer-Policy": "same-origin",
+            "X-Content-Type-Options": "nosniff",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)

@@ -3,7 +3,7 @@
 A chart is drawn once for each width that a page may have for it, always at its own size: type is
 then equally large in every figure and on every screen. A figure is thus a `Drawing`, its SVG by
 width in CSS pixels; the page shows the widest that fits, and `live` has it answer the pointer. Each
-condition, source and policy has one colour in every chart; `theme.DARK` has the colours for a dark
+condition, source and policy has one colour in every chart; `blocks.DARK` has the colours for a dark
 background.
 """
 
@@ -19,8 +19,14 @@ import altair as alt
 import numpy as np
 import vl_convert
 
-from restock.report.look.blocks import Drawing, Rows, words
-from restock.report.look.theme import SPARE_COLOURS, WORDS_COLOURS, palette
+from restock.report.look.blocks import (
+    SPARE_COLOURS,
+    WORDS_COLOURS,
+    Drawing,
+    Rows,
+    palette,
+    words,
+)
 
 Row = Mapping[str, Any]
 

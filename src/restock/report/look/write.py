@@ -29,9 +29,8 @@ from markupsafe import Markup, escape
 
 from restock import __version__
 from restock.files import write_bytes, write_text
-from restock.report.look.blocks import Figure, Section, Table, words
+from restock.report.look.blocks import Figure, Section, Table, dark_rules, words
 from restock.report.look.charts import CONFIG
-from restock.report.look.theme import dark_rules
 
 PNG_SCALE = 2.0  # pixels a CSS pixel
 
