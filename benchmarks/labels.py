@@ -35,8 +35,13 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.task.conditions import let_values, shipped
 from restock.ingest.task.schema import signal_columns, true_names
 from restock.ingest.task.task import STORED_SIGNALS
-from restock.replay.review.events import DoubtfulEvent, doubtful_events
-from restock.replay.review.quality import LabelQuality, label_quality, reliability
+from restock.replay.review.events import (
+    DoubtfulEvent,
+    LabelQuality,
+    doubtful_events,
+    label_quality,
+    reliability,
+)
 from restock.replay.store.store import Store
 from restock.train.twin.recording.recorder import RecordingPlan, record
 

@@ -10,7 +10,7 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.ingest.store.transitions import replaced
-from restock.replay.review.quality import label_quality
+from restock.replay.review.events import label_quality
 from restock.replay.store.store import Store
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from restock.ingest.relabel import Relabelled
     from restock.ingest.store.writer import StoreWriter
     from restock.ingest.task.conditions import Condition
-    from restock.replay.review.quality import LabelQuality
+    from restock.replay.review.events import LabelQuality
     from restock.stats import ConfidenceInterval
 
 
@@ -144,7 +144,7 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
 def print_scores(path: Path, *, json: bool) -> int:
     """Print precision and recall of each condition, and how reliable the probabilities are."""
     from restock.cli import output
-    from restock.replay.review.quality import label_quality, reliability, reliability_rows
+    from restock.replay.review.events import label_quality, reliability, reliability_rows
     from restock.replay.store.store import Store
 
     with Store(path) as store:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from restock.errors import counted, policy_words
-from restock.replay.review.quality import reliability_rows
+from restock.replay.review.events import reliability_rows
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Figure,
