@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from restock.cli import main
@@ -228,8 +230,13 @@ def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Run.create(tmp_path / "young", {"config": msgspec.to_builtins(TrainConfig())})
     make_run(tmp_path / "well")
+    early = make_run(tmp_path / "early")  # stopped before a batch was audited
+    progress = early.table("progress").drop(["q_abs_max"])
+    none = pa.nulls(len(progress), pa.float64())
+    pq.write_table(progress.append_column("q_abs_max", none), early.path / "progress.parquet")
     for words, said in (
         ([str(tmp_path / "young")], "has no evaluation to diagnose"),
+        ([str(early.path)], "has no evaluation to diagnose"),
         ([str(tmp_path)], "is not a run, a panel or a store"),
         ([], "needs a run"),
         (["nowhere"], "nowhere: does not exist"),

@@ -298,6 +298,7 @@ def windows_of(run: Run) -> list[Window]:
         for name in names:  # one that an older run has not is empty
             connection.register(f"run_{name}", run.table(name))
         rows = connection.sql(query).to_arrow_table().to_pylist()
+    rows = [row for row in rows if row["q_abs_max"] is not None]  # None: no batch was audited yet
     if not rows:
         remedy = "continue the run past its first evaluation (evaluation.every_env_steps)"
         if not run.document["config"].get("env", {}).get("twin", True):
