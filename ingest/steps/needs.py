@@ -467,7 +467,13 @@ class _ScanReducer:
             for index, one in enumerate(kinds):
                 rows = np.flatnonzero(kind == index)
                 self._fill(clearance, fine, close, blind, ranges, rows, one)
-        made = {SECTORS: clearance, BEAMS: beams, CLOSE: close, BLIND: blind, UNAIMED: unaimed}
+        made: dict[str, FieldColumn] = {
+            SECTORS: clearance,
+            BEAMS: beams,
+            CLOSE: close,
+            BLIND: blind,
+            UNAIMED: unaimed,
+        }
         return made | ({FINE: fine} if self.task.tracks else {})
 
     def _fill(
@@ -516,7 +522,7 @@ class _ScanReducer:
         if key not in self._maps:
             if len(self._maps) >= _MAPS:
                 self._maps.clear()
-            bearings = first + increment * np.arange(beams)
+            bearings: F64 = first + increment * np.arange(beams, dtype=np.float64)
             count, body, at_m = self.task.sectors, self.task.body, self.source.lidar_at_m
             if at_m is None:
                 turned = bearings + body.lidar_yaw_rad

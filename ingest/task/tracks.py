@@ -18,6 +18,7 @@ wheels slip. The same code runs on logs, live and in the twin, for all its robot
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +109,13 @@ class _Detections:
     across_m: F64  # standard deviation of its place across the line of sight
     moving: Ints  # (D,) returns that move
     still: Bools  # (D,) made of static returns
+
+    def at(self, of: Bools) -> _Detections:
+        """Return some of them."""
+        return _Detections(
+            *(self.robot[of], self.x_m[of], self.y_m[of], self.along_x[of], self.along_y[of]),
+            *(self.across_m[of], self.moving[of], self.still[of]),
+        )
 
 
 class Tracker(Stateful):
@@ -217,20 +225,18 @@ class Tracker(Stateful):
         fixed = np.stack([robot[static], x[static], y[static]], axis=1)
         kept = ~static
         spacing = np.full(len(robot), SECTORS)
-        step = np.where(robot[1:] == robot[:-1], sector[1:] - sector[:-1], SECTORS)
-        spacing[1:], spacing[:-1] = step, np.minimum(spacing[:-1], step)
-        spacing = np.minimum(
-            spacing, SECTORS // 45
-        )  # beams farther apart are beams without a return
+        apart = np.where(robot[1:] == robot[:-1], sector[1:] - sector[:-1], SECTORS)
+        spacing[1:], spacing[:-1] = apart, np.minimum(spacing[:-1], apart)
+        spacing = np.minimum(spacing, SECTORS // 45)  # farther apart, beams have no return between
         apart_m = APART_M + spacing * _WIDTH_RAD * distance
         joined = np.zeros(len(robot), np.bool_)
         joined[1:] = kept[1:] & kept[:-1] & (robot[1:] == robot[:-1])
         joined[1:] &= np.hypot(x[1:] - x[:-1], y[1:] - y[:-1]) < np.minimum(apart_m[1:], 0.8)
         kind = np.cumsum(~joined)[kept]
         if not len(kind):
-            return _Detections(
-                robot[:0], *(np.zeros(0) for _ in range(5)), robot[:0], moving[:0]
-            ), fixed
+            none: F64 = np.zeros(0)
+            nobody = _Detections(robot[:0], none, none, none, none, none, robot[:0], moving[:0])
+            return nobody, fixed
         robot, x, y, moving = robot[kept], x[kept], y[kept], moving[kept]
         starts = np.flatnonzero(np.diff(kind, prepend=-1))
         size = np.diff(starts, append=len(kind))
@@ -251,12 +257,9 @@ class Tracker(Stateful):
             near = (from_it < LEFT_M) & (of[:, None] == left[:, 0])
             moves += (wide < SMALL_M) * near.sum(axis=1)
         across = 0.35 * spacing[kept][starts] * _WIDTH_RAD * away + 0.04
-        values = (
-            middle_x + INSIDE_M * along_x,
-            middle_y + INSIDE_M * along_y,
-            *(along_x, along_y, across, moves),
-        )
-        return _Detections(of[few], *(value[few] for value in values), ~few[few]), fixed
+        inside_x, inside_y = middle_x + INSIDE_M * along_x, middle_y + INSIDE_M * along_y
+        found = _Detections(of, inside_x, inside_y, along_x, along_y, across, moves, ~few)
+        return found.at(few), fixed
 
     def _places(self, scan_m: F64, seen_from: F64, of: Bools) -> tuple[Ints, Ints, F64, F64]:
         """Return robot, sector and place of the returns in range, of some of the robots."""
@@ -375,9 +378,11 @@ class Tracker(Stateful):
                 along = place - seen_from[int(robot), :2]
                 along /= max(float(np.hypot(*along)), 1e-6)
                 place = place + INSIDE_M * along
-                values = (*place, *along, 0.1)
-                one = (np.array([value]) for value in values)
-                thing = _Detections(np.array([int(robot)]), *one, np.array([0]), np.array([True]))
+                x_m, y_m, along_x, along_y, across_m = np.array([[*place, *along, 0.1]]).T
+                whose, moves = np.array([int(robot)]), np.array([0])
+                thing = _Detections(
+                    whose, x_m, y_m, along_x, along_y, across_m, moves, np.array([True])
+                )
                 self._correct(np.array([row]), thing, np.array([0]))
 
     def _drop(self) -> None:
@@ -444,7 +449,7 @@ def _rates(now: Signals) -> F64:
     return np.stack([forward, sideways, now["gyro_yaw_rate_radps"]], axis=1)
 
 
-def _moved(pose: F64, rates: F64, elapsed_s: F64) -> F64:
+def _moved(pose: F64, rates: F64, elapsed_s: NDArray[Any]) -> F64:
     """Return poses (n, 3) after some time at these speeds, along the mean heading."""
     forward, left, turn = (rates * elapsed_s[:, None]).T
     heading = pose[:, 2] + turn / 2

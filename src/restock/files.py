@@ -84,7 +84,7 @@ def _unreadable(
     )
 
 
-def first_line(error: BaseException) -> str:
+def first_line(error: BaseException | str) -> str:
     """Return the first line of an error, without the system's error number."""
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return next((line for line in said.splitlines() if line.strip()), type(error).__name__)

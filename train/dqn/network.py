@@ -156,8 +156,8 @@ def differentiable(
     parts = values.chunk(len(members))  # members are alike, so their parameters are equally many
     gradients = [None] * len(members) if gradient is None else gradient.chunk(len(members))
     return [
-        Kernel(member, *flat) if path == "native" and type(member) is QNetwork else member
-        for member, *flat in zip(members, parts, gradients, strict=True)
+        Kernel(member, part, of_part) if path == "native" and type(member) is QNetwork else member
+        for member, part, of_part in zip(members, parts, gradients, strict=True)
     ]
 
 

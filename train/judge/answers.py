@@ -96,7 +96,7 @@ def fit_response(
     return Response(
         len(y), clusters, float(gain[0]), float(delay[0]), float(unexplained[0]),
         gain[1:], delay[1:], unexplained[1:], float(offset[0]), offset[1:],
-        h[0], moments.reshape(-1, width, width),
+        h[0], moments.reshape(-1, width, width).astype(np.float64),
     )  # fmt: skip
 
 

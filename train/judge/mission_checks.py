@@ -111,9 +111,8 @@ def _on_floor(rows: FedRows, floors: Sequence[Warehouse]) -> Comparison:
         return not_run(FLOOR, what, missing)
     clearance = rows.sectors() ** 2 * rows.task.range_max_m
     x, y = sector_returns(rows.task, clearance)
-    seen = (clearance < min(rows.task.range_max_m * (1 - 1e-6), WITHIN_M)) & np.isfinite(
-        rows.pose
-    ).all(axis=1)[:, None]
+    placed = np.isfinite(np.asarray(rows.pose, np.float64)).all(axis=1, keepdims=True)
+    seen = (clearance < min(rows.task.range_max_m * (1 - 1e-6), WITHIN_M)) & placed
     cos, sin = np.cos(rows.pose[:, 2:]), np.sin(rows.pose[:, 2:])
     places = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + rows.pose[:, None, :2]
     mission = np.broadcast_to(rows.episode[:, None], seen.shape)[seen]

@@ -24,7 +24,7 @@ from restock.files import write_text
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.process import expect_installed, kill_as_interrupt
-from restock.train.dqn.algorithm import make_network
+from restock.train.dqn.algorithm import make_algorithm
 from restock.train.dqn.config import Hard, NetworkConfig, TrainConfig, describe, load_config
 from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.evaluate import (
@@ -197,7 +197,8 @@ def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
     """Copy a library's linear layers, in order, into Restock's network, which computes the same."""
     import torch
 
-    network = make_network(config, task.observation_size, len(task.actions))
+    make = make_algorithm(config.loss).make_network
+    network = make(config.network, task.observation_size, len(task.actions))
     layers = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
     with torch.no_grad():
         for layer, given in zip(layers, linears, strict=True):

@@ -70,8 +70,8 @@ class Watch:
     def take(self) -> list[dict[str, Any]]:
         """Ingest what is complete; return what was written."""
         ready = self.arrivals.complete(time.monotonic())
-        for event, path, why in self.arrivals.news:
-            self.say(event, f"{self.night.name(path)}: {why}" if why else str(path))
+        for event, there, why in self.arrivals.news:
+            self.say(event, f"{self.night.name(there)}: {why}" if why else there)
         written: list[dict[str, Any]] = []
         known = 0
         for path, result in self._ingested(ready):

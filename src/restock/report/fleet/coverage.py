@@ -15,7 +15,7 @@ from restock.replay.store.definitions import install_named
 from restock.replay.store.novelty import novel_rows, novel_rows_said, strangest
 from restock.replay.store.store import Store
 from restock.report.fleet.drift import drift_sections
-from restock.report.look import charts, floor_map
+from restock.report.look import blocks, charts, floor_map
 from restock.report.look.blocks import (
     Drawing,
     Figure,
@@ -61,7 +61,7 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
     found = coverage_facts(store)
     (totals,) = found["totals"]
     named = (row["condition"] for rows in ("shelves", "weeks", "rare") for row in found[rows])
-    colours = charts.palette(set(named))
+    colours = blocks.palette(set(named))
     in_words = {words(name): colour for name, colour in colours.items()}
     once = by_priority(words(row["condition"]) for row in found["priority"])
     sections = [
@@ -234,7 +234,7 @@ def _weeks(rows: Rows, colours: dict[str, str], once: str) -> Section | None:
         }
         for row in rows
     ]
-    names = charts.ordered(shown, "condition", charts.WORDS_COLOURS)
+    names = charts.ordered(shown, "condition", blocks.WORDS_COLOURS)
 
     def chart(width: int) -> Any:
         return (
@@ -265,7 +265,7 @@ def _robots(rows: Rows) -> Section | None:
     names = charts.ordered(
         [{"condition": words(row["condition"])} for row in rows],
         "condition",
-        charts.WORDS_COLOURS,
+        blocks.WORDS_COLOURS,
     )
     cells = {(row["robot"], words(row["condition"])): row for row in rows}
     hours = {row["robot"]: row["hours"] or 0.0 for row in rows}
@@ -302,7 +302,7 @@ def _map(found: dict[str, Rows], colours: dict[str, str]) -> Section | None:
         return [{**row, "x_m": row["x_m"] - x0, "y_m": row["y_m"] - y0} for row in rows]
 
     cell_m = bounds["cell_m"]
-    conditions = charts.ordered(found["rare"], "condition", charts.CONDITION_COLOURS)
+    conditions = charts.ordered(found["rare"], "condition", blocks.CONDITION_COLOURS)
     return Section(
         "map",
         "Where was it logged?",

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from restock.errors import RestockError, counted, policy_words
 from restock.files import read_json
-from restock.report.look import charts, floor_map
+from restock.report.look import blocks, charts, floor_map
 from restock.report.look.blocks import (
     Drawing,
     Figure,
@@ -38,9 +38,9 @@ def floor_section(facts: Facts) -> Section | None:
     ]
     conditions = {row["condition"] for row in [*facts.rare, *failures]}
     names = charts.ordered(
-        [{"condition": name} for name in conditions], "condition", charts.CONDITION_COLOURS
+        [{"condition": name} for name in conditions], "condition", blocks.CONDITION_COLOURS
     )
-    colours = charts.palette(names)
+    colours = blocks.palette(names)
     steps = sum(row["rows"] for row in facts.visited)
     return Section(
         "map",

@@ -6,7 +6,7 @@ from typing import Any
 
 from restock.errors import counted, policy_words
 from restock.replay.review.events import reliability_rows
-from restock.report.look import charts
+from restock.report.look import blocks, charts
 from restock.report.look.blocks import (
     Figure,
     Rows,
@@ -166,7 +166,7 @@ def _success_table(perturbation: str, rows: Rows) -> Table:
 
 
 def _cell_order(row: dict[str, Any]) -> tuple[str, int, str]:
-    known = list(charts.CONDITION_COLOURS)
+    known = list(blocks.CONDITION_COLOURS)
     condition = row["cell"].split(" (")[0]
     place = known.index(condition) if condition in known else len(known)
     return (row["perturbation"] if row["perturbation"] != "none" else "", place, row["cell"])
