@@ -283,7 +283,7 @@ def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
     assert main(["profile", "check", str(file), str(wrong)]) == 3
     assert "contradicts itself: /odom: its poses step at" in capsys.readouterr().out
     ingest = ["ingest", str(clean), str(wrong), "--profile", str(file), "--store", str(store)]
-    assert main(ingest) == 3
+    assert main([*ingest, "--verbose"]) == 3
     assert capsys.readouterr().out.count("contradicts itself: /odom") == 1
     query = "SELECT kind, topic, repaired FROM (SELECT unnest(findings, recursive := true)"
     assert main(["sql", str(store), f"{query} FROM recordings)", "--json"]) == 0

@@ -255,7 +255,7 @@ def test_a_wheel_radius_off_in_one_robot_is_named(logs, twin):
         "in 1 of 3 robots (robot r1: monday.mcap): the scale of the logs' wheels (speed) is 0.92"
         in one.text
     )
-    assert one.evidence == ("gain: speed of the pose to the wheels, r1",)
+    assert one.evidence == ("gain: speed of the pose to the wheels, robot r1",)
 
 
 def test_a_check_in_many_parts_is_corrected_for_their_number():

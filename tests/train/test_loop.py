@@ -390,9 +390,9 @@ def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
     shelf = logs()
     nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # named so by a profile
     shelf = dataclasses.replace(shelf, behaviour_policy=nobody)
-    loss = config(loss={"margin": 1.0}).loss
+    margin = config(loss={"margin": 1.0})
     with pytest.raises(ConfigError, match=r"choose from what they have: unknown$"):
-        LogTerms.of(loss, shelf, torch.device("cpu"))
+        LogTerms.of(margin, shelf, torch.device("cpu"))
 
 
 def test_condition_that_cannot_run_is_refused_first(tmp_path: Path) -> None:

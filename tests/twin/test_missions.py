@@ -26,7 +26,7 @@ import sys
 from restock.train import twin
 twin.__path__.insert(0, sys.argv[1])
 import numpy as np
-from restock.report.look.charts import CONDITION_COLOURS
+from restock.report.look.blocks import CONDITION_COLOURS
 from restock.train.dqn.config import TrainConfig
 from restock.train.study.contrasts import CELLS, RARE
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

@@ -52,7 +52,7 @@ class McpCommand:
         expect_installed("restock-mcp", "mcp")
         from mcp.server.mcpserver import MCPServer
         from mcp.server.mcpserver.exceptions import ToolError
-        from mcp_types import ToolAnnotations
+        from mcp.types import ToolAnnotations
 
         if self.rows < 1 or self.seconds <= 0:
             raise ConfigError("must be above 0", where="--rows, --seconds", remedy="leave it out")
