@@ -60,7 +60,7 @@ def test_what_an_encoding_lacks_is_substituted(bags: Path, tmp_path: Path) -> No
         assert done.returncode == 0, done.stderr
         return done.stdout.decode("ascii")
 
-    assert " topic " in said("ingest", str(bags), "--store", store)
+    assert " topic " in said("ingest", str(bags), "--store", store, "--verbose")
     assert recordings(tmp_path / "store") == 3
     assert "------" in said("coverage", store)
     (row,) = json.loads(said("sql", store, "SELECT 'ä─𝄞' AS text", "--json"))
