@@ -128,3 +128,8 @@ def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch
 def test_the_library_refuses_arguments_it_does_not_know(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"refused its arguments: .*wings"):
         trained(tmp_path / "x", "sb3-dqn", wings=2)
+
+
+def test_networks_side_by_side_are_refused_to_a_library() -> None:
+    with pytest.raises(ConfigError, match=r"sb3-dqn does not have network\.members"):
+        resolve(("network.members=3",), "sb3-dqn")

@@ -70,6 +70,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ("schedule.seconds", config.schedule.seconds is not None),
             ('replay.ring_capacity "auto"', config.replay.ring_capacity == "auto"),
             ("teacher.source", config.teacher.source not in (None, "none")),
+            ("network.members", config.network.members > 1),
             ("practice.rule", config.practice.rule != "natural"),
             ("evaluation.missions", config.evaluation.missions != "drawn"),
         )
