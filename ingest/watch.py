@@ -136,11 +136,8 @@ def _unfinished(file: Path) -> str:
         if stream.read(len(MAGIC)) != MAGIC:
             return "" if file.stat().st_size else f"{file.name} is empty"
         stream.seek(-len(MAGIC), 2)
-        return (
-            ""
-            if stream.read() == MAGIC and stream.tell() > len(MAGIC)
-            else (f"{file.name} has no MCAP footer yet")
-        )
+        ended = stream.read() == MAGIC and stream.tell() > len(MAGIC)
+    return "" if ended else f"{file.name} has no MCAP footer yet"
 
 
 def transient(error: RestockError) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64, Bools
-from restock.errors import StoreError
+from restock.errors import StoreError, spreadsheet_safe
 from restock.ingest.store.manifest import LabelScore, label_scores, pooled
 from restock.replay.store.definitions import install_named
 from restock.replay.store.novelty import at_hand
@@ -108,29 +108,23 @@ def review_csv(rows: list[dict[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: _plain_cell(cell) for name, cell in row.items()} for row in rows)
+    writer.writerows({name: spreadsheet_safe(cell) for name, cell in row.items()} for row in rows)
     return text.getvalue()
-
-
-def _plain_cell(cell: Any) -> Any:
-    """Keep a spreadsheet from running a text, such as a file's name, as a formula."""
-    runs = isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r"))
-    return f"'{cell}" if runs else cell
 
 
 MAX_EVENTS = 5_000  # in a page
 _MORE = """
 SELECT event, any_value(r.robot) AS robot, max(novelty) AS novelty
-FROM asked
+FROM listed
 LEFT JOIN (SELECT recording_id, tags['robot'] AS robot FROM recordings) AS r
-    ON r.recording_id = asked.recording
+    ON r.recording_id = listed.recording
 {novelty}
 GROUP BY event
 """
 _NOVELTY = """
 LEFT JOIN (
     SELECT episode_id, step_index, novelty FROM transitions JOIN novelty USING (transition_id)
-) AS t ON t.episode_id = asked.episode_id AND t.step_index BETWEEN first_step AND last_step
+) AS t ON t.episode_id = listed.episode_id AND t.step_index BETWEEN first_step AND last_step
 """
 
 
@@ -144,7 +138,7 @@ def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
     """
     events = doubtful_events(store)
     measured = at_hand(store)
-    asked = pa.table(
+    listed = pa.table(
         {
             name: [getattr(event, name) for event in events]
             for name in ("event", "recording", "episode_id", "first_step", "last_step")
@@ -158,7 +152,7 @@ def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
         # Both have to be there before the table is passed in.
         store.sql("FROM recordings LIMIT 0")
         store.sql(f"FROM {'novelty' if measured else 'transitions'} LIMIT 0").fetchall()
-        with passed_in(store.connection, asked=asked):
+        with passed_in(store.connection, listed=listed):
             found = store.connection.sql(query).fetchall()
         more = {event: tuple(rest) for event, *rest in found}
     shuffled = sorted(

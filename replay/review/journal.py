@@ -84,27 +84,20 @@ def entries_of(text: str, where: str) -> list[Line]:
     Raises:
         LabelError: a line is no verdict.
     """
-    if text.lstrip().startswith("["):
-        try:
-            return list(msgspec.json.decode(text, type=list[Line]))
-        except msgspec.MsgspecError as error:
-            raise LabelError(
-                f"is no file of verdicts: {error}",
-                where=where,
-                remedy="give the file that the review page saved, or a .csv file",
-            ) from error
     found: list[Line] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip():
-            continue
-        try:
-            found.append(msgspec.json.decode(line, type=Line))
-        except msgspec.MsgspecError as error:
-            raise LabelError(
-                f"line {number} is no verdict: {error}",
-                where=where,
-                remedy="remove or restore the line",
-            ) from error
+    what, remedy = (
+        "is no file of verdicts",
+        "give the file that the review page saved, or a .csv file",
+    )
+    try:
+        if text.lstrip().startswith("["):
+            return list(msgspec.json.decode(text, type=list[Line]))
+        for number, line in enumerate(text.splitlines(), start=1):
+            what, remedy = f"line {number} is no verdict", "remove or restore the line"
+            if line.strip():
+                found.append(msgspec.json.decode(line, type=Line))
+    except msgspec.MsgspecError as error:
+        raise LabelError(f"{what}: {error}", where=where, remedy=remedy) from error
     return found
 
 
@@ -157,7 +150,8 @@ class Journal:
                 if size:
                     stream.seek(size - 1)
                     if stream.read(1) != b"\n":  # what a killed server left is not a line
-                        stream.truncate(self._end_of_lines(stream, size))
+                        stream.seek(0)
+                        stream.truncate(stream.read().rfind(b"\n") + 1)
                 stream.write(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -168,11 +162,6 @@ class Journal:
                 remedy="make the store's folder writable, or review in a file: `--out page.html`",
             ) from error
         self.refresh()
-
-    @staticmethod
-    def _end_of_lines(stream: object, size: int) -> int:
-        stream.seek(0)  # type: ignore[attr-defined]
-        return stream.read(size).rfind(b"\n") + 1  # type: ignore[attr-defined, no-any-return]
 
     def counting(self) -> list[Entry]:
         """Return the verdicts that count: not replaced, not taken back, not in the store yet."""

@@ -35,7 +35,7 @@ class McpCommand:
     coverage, events, trace, diagnose and gate. They change nothing, and SQL reads no file outside
     PLACE. See docs/sql.md.
 
-    Example: `claude mcp add robot-logs -- restock-mcp /data/store`
+    An assistant starts it itself: name `restock-mcp PLACE` in its settings.
     """
 
     place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PLACE")]

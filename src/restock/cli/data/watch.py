@@ -109,13 +109,13 @@ class Watch:
             StoreWriter(store).clean()
             fold_if_many(StoreWriter(store))
             with open_place(store, only_store=True) as opened:
-                found_rows = query(opened, "FROM coverage_by_condition", where=store)
-                told = found_rows.to_arrow_table().to_pylist()
+                coverage = query(opened, "FROM coverage_by_condition", where=store)
+                held = coverage.to_arrow_table().to_pylist()
                 findings = run_audits(opened, load_audits(None), load_thresholds(None))
         except Exception as error:  # noqa: BLE001  (the recordings are in, and more will come)
             self.say("failed", f"coverage and audits: {first_line(error)}")
             return False
-        rows = {row["condition"]: row["rows_held"] or 0 for row in told}
+        rows = {row["condition"]: row["rows_held"] or 0 for row in held}
         grown = {name: number - self.rows.get(name, 0) for name, number in rows.items()}
         more = f" (new: {in_words({k: n for k, n in grown.items() if n}) or 'none'})"
         self.say("coverage", in_words(rows) + (more if self.rows else ""))

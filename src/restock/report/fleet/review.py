@@ -316,21 +316,21 @@ class Handler(BaseHTTPRequestHandler):
             return
         body = self.rfile.read(int(size))
         try:
-            asked = msgspec.json.decode(body, type=_Asked)
+            posted = msgspec.json.decode(body, type=_Asked)
         except msgspec.MsgspecError as error:
             self._send(400, json.dumps({"error": f"not what the page sends: {error}"}))
             return
         if path == "verdicts":
-            review.give(asked.entries)
+            review.give(posted.entries)
         elif path == "write":
             written = review.write()
-            state = review.state(asked.after, asked.by)
+            state = review.state(posted.after, posted.by)
             self._send(200, json.dumps(written.document | {"state": state}, default=str))
             return
         elif path != "state":
             self._send(404, json.dumps({"error": "there is nothing here"}))
             return
-        self._send(200, json.dumps(review.state(asked.after, asked.by, asked.at)))
+        self._send(200, json.dumps(review.state(posted.after, posted.by, posted.at)))
 
     def _send(
         self, status: int, text: str, kind: str = "application/json", policy: str | None = None
