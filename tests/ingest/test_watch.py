@@ -200,6 +200,23 @@ def test_killed_and_started_again_nothing_is_lost_or_doubled(bag, tmp_path):
     assert first["audit"].keys() == {"fail", "warn"}
 
 
+@pytest.mark.timeout(60)
+def test_a_kill_that_a_library_reports_as_an_error_ends_it(bag, tmp_path, monkeypatch):
+    """DuckDB makes an error of an interrupt in a Python function that it calls."""
+    folder, store = tmp_path / "in", tmp_path / "store"
+    shutil.copytree(bag, folder / "one")
+    assert main(["ingest", str(folder / "one"), "--store", str(store)]) == 0
+
+    def interrupted(*_: object) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise RuntimeError("KeyboardInterrupt") from None
+
+    monkeypatch.setattr("restock.cli.data.watch.run_audits", interrupted)
+    assert main(["ingest", str(folder), "--store", str(store), "--watch"]) == 130
+
+
 def names_in(store: Path) -> list[str]:
     with Store(store) as opened:
         found = opened.sql("SELECT source_file FROM recordings").fetchall()

@@ -20,6 +20,7 @@ from restock.files import first_line
 from restock.ingest.batch import IngestJob, Result, ingest_all
 from restock.ingest.store.writer import StoreWriter, fold_if_many
 from restock.ingest.watch import RETRY_S, Arrivals, transient
+from restock.process import was_interrupted
 from restock.replay.places import open_place
 from restock.replay.store.audit import load_audits, load_thresholds, run_audits
 from restock.replay.store.query import query
@@ -59,6 +60,7 @@ class Watch:
         written: list[dict[str, Any]] = []  # that no follow-up has had yet
         due_s = time.monotonic() if is_store(str(self.job.store)) else math.inf
         while True:
+            _raise_interrupt()
             if new := self.take():
                 written += new
                 due_s = time.monotonic()
@@ -138,6 +140,7 @@ class Watch:
 
     def say(self, event: str, what: str) -> None:
         """Print one line, whatever is in it."""
+        _raise_interrupt()
         at = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         if self.json:
             line = json.dumps({"at": at, "event": event, "what": what})
@@ -145,3 +148,9 @@ class Watch:
             line = f"{at} {event:<9} {visible(what)}"
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
+
+
+def _raise_interrupt() -> None:
+    """Raise the interrupt of which a library made an error of its own, or which it lost."""
+    if was_interrupted():
+        raise KeyboardInterrupt
