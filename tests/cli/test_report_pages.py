@@ -155,3 +155,20 @@ def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:
     assert text is not None
     (shown,) = json.loads(text[1])["rows"].values()
     assert [row["td"] for row in shown] == [0.5, None, None, 1.0]
+
+
+def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, capsys):
+    folder = tmp_path / "night"
+    wider = {"config__replay__batch_size": 7}
+    make_run(folder / "runs" / "<b>monday", document(0, created_ns=1), success=0.2)
+    make_run(folder / "runs" / "tuesday", document(1, created_ns=2, **wider), success=0.7)
+    make_run(folder / "old", document(1, format="restock-run/1"))
+    (folder / "fleet").symlink_to(store_path)
+    assert main(["report", str(folder)]) == 0
+    assert capsys.readouterr().out == f"{folder / 'report.html'}\n"
+    text = read(folder / "report.html").text
+    assert "tuesday, the latest run, against <b>monday: better in wheel slip" in text
+    assert re.search(r"replay\.batch_size \d+ → 7\b", text)
+    assert "was written by an earlier Restock" in text
+    assert "fleet: week by week" in text
+    assert main(["report", str(folder / "runs" / "nothing")]) == 2

@@ -90,7 +90,7 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
-    "report": "look run fleet",
+    "report": "look run fleet ingest/store replay replay/store train/judge train/run",
     "report/look": "train/twin/missions",
     "report/run": (
         "look replay/panel replay/plan replay/review replay/sampling replay/store train/evaluation"
@@ -109,7 +109,7 @@ MAY_IMPORT = {
         " replay/review replay/mixture replay/panel replay/store train/judge train/twin/missions"
     ),
     "cli/learning": (
-        "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace"
+        "cli report ingest/profile ingest/store replay replay/fleet replay/mixture replay/trace"
         " train train/judge train/dqn train/evaluation train/run"
         " train/study train/twin/floors train/twin/physics train/view ingest/task"
         " replay/panel train/feed replay/store train/twin/calibration"

@@ -13,6 +13,7 @@ from restock.public import lazy
 
 if TYPE_CHECKING:
     from restock.report.fleet.coverage import coverage_page as coverage_page
+    from restock.report.history import history_page as history_page
     from restock.report.look.write import write_page as write_page
     from restock.report.run.card import write_card as write_card
     from restock.report.run.comparison import comparison_page as comparison_page
@@ -35,6 +36,7 @@ def build_report(
     Raises:
         RunError: no run there, or one with nothing to report on yet.
     """
+    from restock.report.history import history_page as history_page
     from restock.report.look.write import write_page
     from restock.report.run.facts import gather
     from restock.report.run.page import page

@@ -14,7 +14,7 @@ from restock.cli.output import print_json, progress
 
 @dataclass
 class ReportCommand:
-    """Write one self-contained HTML page about a run; it opens without a network.
+    """Write one HTML page about a run, or about a folder of runs; it opens without a network.
 
     The page shows what the critic was fed (intended, drawn and available share per stratum, ages,
     behaviour policies), learning curves, TD error by condition, target lag, success per condition
@@ -23,7 +23,8 @@ class ReportCommand:
 
     A gap between twin and logs that `restock twin gap` wrote to RUN/gap, or to the folder `gap` of
     the panel's store, is shown in a section. For a STORE, the page shows only its gap, and is
-    STORE/gap/index.html.
+    STORE/gap/index.html. For another FOLDER, the page shows the runs in it in the order in which
+    they began, what changed from each to the next, and its stores week by week.
 
     With --card, it writes the replay card instead: what the critic was fed, on one page of
     Markdown, to stdout, RUN/replay_card.md and RUN/replay_card.json.
@@ -32,7 +33,8 @@ class ReportCommand:
     """
 
     run_directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The directory that `restock train --out` wrote; or a store, for a page about its gap only."""
+    """The directory that `restock train --out` wrote; a folder of runs and stores, for a page about
+    all of them; or a store, for a page about its gap only."""
     out: Path | None = None
     """Where to write the page. Default: RUN/report.html. Replaces an existing file."""
     figures: Path | None = None
@@ -47,8 +49,9 @@ class ReportCommand:
         from restock.errors import ConfigError
         from restock.files import expect_file_place
         from restock.ingest.store.location import Location
+        from restock.replay.places import kind_beside
         from restock.replay.store.store import is_store
-        from restock.report import build_report, gap_page, write_card, write_page
+        from restock.report import build_report, gap_page, history_page, write_card, write_page
         from restock.train.twin.calibration.twin_gap import FOLDER, read_gap
 
         if self.card:
@@ -72,6 +75,11 @@ class ReportCommand:
                 folder = self.run_directory / FOLDER
                 content = gap_page(read_gap(folder))
                 path = write_page(content, self.out or folder / "index.html", self.figures)
+            elif self.run_directory.is_dir() and kind_beside(self.run_directory) is None:
+                content = history_page(self.run_directory)
+                path = write_page(
+                    content, self.out or self.run_directory / "report.html", self.figures
+                )
             else:
                 path = build_report(self.run_directory, self.out, self.figures)
         if self.json:

@@ -51,6 +51,16 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     return found
 
 
+def coverage_weeks(store: Store) -> Section | None:
+    """Return the section of a store's weeks, as on its page."""
+    sql = statements("restock.report.fleet", "coverage.sql")["weeks"]
+    install_named(store.connection, sql)
+    rows = ask(store.connection, sql)
+    colours = blocks.palette({row["condition"] for row in rows})
+    once = by_priority(words(name) for name in store.priority())
+    return _weeks(rows, {words(name): colour for name, colour in colours.items()}, once)
+
+
 def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dict[str, Any]:
     """Return everything that the page's template needs.
 
