@@ -1,12 +1,14 @@
-"""A question to a recording over MCP, by Restock and by mcap-mcp-server: CPU seconds of the server.
+"""A question to a recording, by Restock and by others that answer SQL: CPU seconds of the process.
 
-    python benchmarks/recording_sql.py --peer PYTHON [--quick] [--json] [--check]
+    python benchmarks/recording_sql.py --peer PYTHON [--rerun PYTHON] [--quick] [--json] [--check]
 
 Each round starts a server for the sample logs' hour, asks one question about one topic with the
 SDK's client, and ends it; the servers take turns. Both get the same question: how far apart the
 largest and the smallest forward speed of /odom are. mcap-mcp-server loads the topic into a table
 before it can be asked, with messages nested three deep as JSON text. Needs the package mcp here,
-and PYTHON with mcap-mcp-server and mcp<2. Medians of five rounds.
+and PYTHON with mcap-mcp-server and mcp<2. With `--rerun`, a Python with rerun-sdk[catalog],
+`restock sql` and Rerun's catalog get the same question without MCP: Rerun converts the recording
+to its own format, serves that, and asks DataFusion. Medians of five rounds.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -38,6 +41,21 @@ CALLS: dict[str, tuple[list[str], list[tuple[str, dict[str, Any]]]]] = {
         ],
     ),
 }
+RERUN = """
+import subprocess, sys, tempfile
+import rerun as rr
+with tempfile.TemporaryDirectory() as folder:
+    made = f"{folder}/run.rrd"
+    command = [sys.executable, "-m", "rerun_cli", "mcap", "convert", sys.argv[1], "-o", made]
+    subprocess.run(command, check=True, capture_output=True)
+    with rr.server.Server(datasets={"run": [made]}) as server:
+        client = server.client()
+        dataset = client.get_dataset("run").filter_contents(["/odom"])
+        client.ctx.register_view("odom", dataset.reader(index="message_log_time"))
+        (row,) = client.ctx.sql(sys.argv[2]).to_pylist()
+        print(*row.values(), sep=",")
+"""
+RERUN_SPEED = "\"/odom:nav_msgs.msg.Odometry:message\"[1]['twist']['twist']['linear']['x']"
 AT_MOST = 0.5  # of mcap-mcp-server's CPU seconds
 
 
@@ -65,12 +83,29 @@ def answered(name: str, python: str) -> tuple[float, list[Any]]:
     return seconds, list(row.values()) if isinstance(row, dict) else row
 
 
+def alone(words: list[str]) -> tuple[float, list[Any]]:
+    """Return the CPU seconds of a process that prints the answer as CSV, and its values."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    text = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spread, count = text.split()[-1].split(",")
+    seconds = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return seconds, [float(spread), int(count)]
+
+
 def main() -> int:
     parser = option_parser(__doc__, quick="two rounds")
     parser.add_argument("--peer", required=True, metavar="PYTHON", help="that of mcap-mcp-server")
+    parser.add_argument("--rerun", metavar="PYTHON", help="that of rerun-sdk[catalog]")
     options = parser.parse_args()
     pythons = {"restock": sys.executable, "mcap-mcp-server": options.peer}
     contenders = {name: partial(answered, name, pythons[name]) for name in CALLS}
+    if options.rerun:
+        ours = QUESTION.format("twist.twist.linear.x")
+        words = [sys.executable, "-m", "restock", "sql", str(RECORDING), ours, "--csv"]
+        contenders["restock sql"] = partial(alone, words)
+        words = [options.rerun, "-c", RERUN, str(RECORDING), QUESTION.format(RERUN_SPEED)]
+        contenders["Rerun's catalog"] = partial(alone, words)
     rounds = in_turns(contenders, 2 if options.quick else 5)
     answers = {tuple(values) for each in rounds.values() for _, values in each}
     seconds = medians({name: [one for one, _ in each] for name, each in rounds.items()})
