@@ -129,7 +129,7 @@ class Moments:
                 "last": event["last_step"] + 10,
             },
         ).fetchall()
-        steps = dict(ids[:: max(len(ids) // MAX_FRAMES, 1)])
+        steps = dict(ids[:: max(-(-len(ids) // MAX_FRAMES), 1)])  # rounded up: no more than that
         notes = []
         try:
             for frame in camera_frames(self.store, list(steps)):

@@ -1,6 +1,8 @@
 """Frames of cameras: those in force at steps are kept as recorded, the others counted."""
 
+import base64
 import hashlib
+import io
 import os
 import struct
 import time
@@ -13,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
+from PIL import Image
 from support.cameras import (
     CAMERAS,
     FRONT,
@@ -40,6 +43,8 @@ from restock.ingest.steps.cameras import (
     raw_layout,
 )
 from restock.ingest.store.writer import StoreWriter
+from restock.replay.review.moments import Moments
+from restock.replay.store.store import Store
 
 FRONT_ONLY = CAMERAS.split("[cameras.rear]")[0]
 
@@ -294,3 +299,17 @@ def test_damage_of_a_file_is_counted_once(tmp_path):
     assert whole == [line for line in plain.lost_messages if line.startswith("the file")]
     assert whole
     assert 0 < counts(result)["kept"] < 30
+
+
+def test_a_moment_for_review_shows_the_frames_in_force(bag, tmp_path):
+    result, _ = written(bag, tmp_path / "store")
+    with Store(tmp_path / "store") as store:
+        ((episode,),) = store.sql("SELECT DISTINCT episode_id FROM transitions").fetchall()
+        event = {"recording": result.manifest["recording_id"], "episode_id": episode}
+        seen = Moments(store).frames(event | {"first_step": 12, "last_step": 14})
+    assert seen["notes"] == []
+    assert [step for step, _ in seen["cameras"]["front"]] == list(range(2, 25, 2))
+    for step, uri in seen["cameras"]["front"]:
+        image = Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1])))
+        sent = picture(2 * step)[3, -3]  # its colour says which message it is
+        assert np.abs(np.array(image)[3, -3].astype(int) - sent).max() <= 4
