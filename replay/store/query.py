@@ -21,7 +21,9 @@ from restock.replay.store.parquet_views import damage
 T = TypeVar("T")
 
 # A table of DuckDB's own that is spelled a little like what was asked for: never what was meant.
-_OWN_TABLE = re.compile(r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information)_[^"]*"\?')
+_OWN_TABLE = re.compile(
+    r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information|stored_\d+)_[^"]*"\?'
+)
 ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "CREATE", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}

@@ -138,6 +138,8 @@ def test_a_folder_is_a_union_that_names_its_files(tmp_path, capsys):
     assert rows_of(capsys, f"{tmp_path}/a*", query) == [{"file": files[0], "n": 3}]
     query = "SELECT DISTINCT file FROM topics ORDER BY ALL"
     assert [row["file"] for row in rows_of(capsys, tmp_path, query)] == files
+    assert cli.main(["sql", str(tmp_path), "FROM stord_odom"]) == 2
+    assert "Did you mean" not in capsys.readouterr().err  # a table of our own
 
 
 def test_what_is_lost_is_said_and_the_rest_answered(tmp_path, capsys):
