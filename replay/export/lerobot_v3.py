@@ -23,9 +23,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.replay.export.images import ImageFeature, pictures
-from restock.replay.export.one_file import fixed_lists
 from restock.replay.export.selection import Selection
-from restock.replay.export.trajectory import Counts, Trajectory
+from restock.replay.export.trajectory import Counts, Trajectory, fixed_lists
 
 CODEBASE_VERSION = "v3.0"
 CHUNK_FILES, DATA_FILE_MB = 1000, 100

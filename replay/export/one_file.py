@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.replay.export.selection import Selection
-from restock.replay.export.trajectory import Counts, Trajectory
+from restock.replay.export.trajectory import Counts, Trajectory, fixed_lists
 
 GROUP_ROWS = 16_384
 D3RLPY_VERSION = "2.1"  # of its format
@@ -77,12 +77,6 @@ def as_table(trajectory: Trajectory, number: int) -> pa.Table:
         text = column.dtype == object
         columns[name] = pa.array(column, pa.string() if text else pa.from_numpy_dtype(column.dtype))
     return pa.table(columns)
-
-
-def fixed_lists(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
-    """Return (n, k) float32 as n lists of k."""
-    flat = np.ascontiguousarray(values, np.float32).ravel()
-    return pa.FixedSizeListArray.from_arrays(pa.array(flat), values.shape[1])
 
 
 def write_npz(

@@ -250,3 +250,9 @@ def missing_columns(columns: Sequence[str], *, continuous: bool) -> list[str]:
     """Return the needed columns that are missing."""
     needed = (*REQUIRED, *COMMAND) if continuous else REQUIRED
     return [name for name in needed if name not in columns]
+
+
+def fixed_lists(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
+    """Return (n, k) float32 as n lists of k."""
+    flat = np.ascontiguousarray(values, np.float32).ravel()
+    return pa.FixedSizeListArray.from_arrays(pa.array(flat), values.shape[1])

@@ -26,9 +26,8 @@ from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.look.blocks import ask, statements
 from restock.report.run.facts import Facts, evaluation_bias, gather
-from restock.report.run.floor import floor_section
 from restock.report.run.headline import headline
-from restock.report.run.page import ways_section
+from restock.report.run.page import floor_section, ways_section
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES

@@ -15,9 +15,9 @@ import pytest
 from support.driven_robot import BEAMS, Drive, columns, scans, write_bag
 
 from restock.cli import main
+from restock.cli.data.watch import RETRY_S, SALVAGE_AFTER_S, STILL_S, Arrivals
 from restock.errors import RecordingError, StoreError
 from restock.ingest.containers.open_recording import METADATA
-from restock.ingest.watch import RETRY_S, SALVAGE_AFTER_S, STILL_S, Arrivals
 from restock.replay.store.store import Store
 
 FULL = RecordingError("cannot be read or written: No space left on device")
@@ -132,9 +132,8 @@ def test_a_folder_that_disappears_is_said_once_and_forgets_nothing(bag, tmp_path
 WATCH = """
 import sys
 from restock.cli import main
-from restock.ingest import watch as arrivals
 from restock.cli.data import watch
-arrivals.STILL_S = watch.POLL_S = 0.1
+watch.STILL_S = watch.POLL_S = 0.1
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -17,9 +17,9 @@ from support.finished_runs import document, make_run
 from support.stores import recording_transitions, write_store
 
 from restock import cli
+from restock.cli.data.audit import audit_reward
 from restock.errors import ConfigError, RunError
 from restock.ingest.store.transitions import replaced
-from restock.replay.reward_audit import audit_reward
 from restock.replay.store.audit import load_audits, load_thresholds
 from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store

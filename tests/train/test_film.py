@@ -11,7 +11,7 @@ from PIL import Image
 from support.kept_run import kept_run
 
 from restock.cli import main
-from restock.report.run.floor import films_section
+from restock.report.run.page import films_section
 from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
 from restock.train.evaluation.film import RESCUE, WORST, differing_fields, drive_again, scenes
 from restock.train.run.kept_evaluations import FILE, read_evaluations

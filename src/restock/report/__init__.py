@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from restock.report.look.write import write_page as write_page
     from restock.report.run.card import write_card as write_card
     from restock.report.run.comparison import comparison_page as comparison_page
+    from restock.report.run.comparison import gate_page as gate_page
     from restock.report.run.comparison import gate_section as gate_section
     from restock.report.run.comparison import outcome_sections as outcome_sections
     from restock.report.run.comparison import study_page as study_page
-    from restock.report.run.gate import gate_page as gate_page
     from restock.report.run.twin_gap import gap_page as gap_page
 else:
     __getattr__, __dir__, _ = lazy(__name__)

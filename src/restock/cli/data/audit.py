@@ -7,12 +7,17 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import duckdb
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RestockError
-from restock.replay.fleet.store_difference import shifted
+from restock.errors import ConfigError, ExitCode, RestockError, RunError, quoted
+from restock.files import expect_file_place, read_json, write_text
+from restock.ingest.store.location import Location
+from restock.process import interrupts_raised
+from restock.replay.fleet.store_difference import diff_stores, shifted
+from restock.replay.places import RUN_CONFIG, beside_of, open_place
 from restock.replay.store.audit import (
     OFFENDED,
     SAMPLE_ROWS,
@@ -20,11 +25,17 @@ from restock.replay.store.audit import (
     Finding,
     Severity,
     Status,
+    Thresholds,
+    check_thresholds,
+    junit_suites,
+    load_audits,
+    load_thresholds,
+    recommend_capacity,
+    run_audits,
 )
-
-if TYPE_CHECKING:
-    from restock.replay.reward_audit import RewardAudit
-    from restock.replay.store.audit import Audit, Finding
+from restock.replay.store.definitions import install_named
+from restock.replay.store.query import found
+from restock.replay.store.store import Store
 
 
 @dataclass
@@ -78,8 +89,6 @@ class AuditCommand:
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
-        from restock.replay.reward_audit import audit_reward
-        from restock.replay.store.audit import load_audits, load_thresholds
 
         if (self.capacity or self.reward) and self.second is not None:
             option = "--capacity" if self.capacity else "--reward"
@@ -125,8 +134,6 @@ class AuditCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _beside(self) -> dict[str, Path]:
-        from restock.replay.places import beside_of
-
         return beside_of(place for place in (self.second, self.third) if place is not None)
 
     def _check_options(self) -> None:
@@ -136,8 +143,6 @@ class AuditCommand:
             ConfigError: there is one.
             StoreError: a place beside the store is not a panel or a run.
         """
-        from restock.files import expect_file_place
-
         if self.discount is not None and not (self.reward and 0 <= self.discount <= 1):
             raise ConfigError(
                 f"must be within [0, 1], got {self.discount:g}"
@@ -157,9 +162,6 @@ class AuditCommand:
 
     def _run_audits(self, audits: Sequence[Audit], thresholds: Mapping[str, Any]) -> list[Finding]:
         from restock.cli import output
-        from restock.replay.places import open_place
-        from restock.replay.store.audit import run_audits
-        from restock.replay.store.store import Store
 
         given = self._beside()
         place = open_place(
@@ -190,9 +192,6 @@ class AuditCommand:
         return parts
 
     def _difference(self, old: str) -> list[Finding]:
-        from restock.replay.fleet.store_difference import diff_stores
-        from restock.replay.store.store import Store
-
         try:
             with Store(old) as first, Store(self.store) as second:
                 first.verify()
@@ -202,17 +201,12 @@ class AuditCommand:
 
     def _write(self, parts: Sequence[Part], failing: set[str]) -> None:
         """Write the findings as JUnit XML, if they are wanted."""
-        from restock.files import write_text
-        from restock.replay.store.audit import junit_suites
-
         if self.junit is not None:
             suites = {f"{part.name} {self.store}": part.findings for part in parts}
             write_text(self.junit, junit_suites(suites, failing))
 
     def _capacity(self) -> int:
         from restock.cli import output
-        from restock.replay.places import open_place
-        from restock.replay.store.audit import recommend_capacity
 
         with open_place(self.store, only_store=True) as connection:
             capacity = recommend_capacity(connection)
@@ -427,3 +421,108 @@ def _as_finding(
     audit = Audit(name, severity, advice, doc, None, "")
     columns = list(every[0]) if every else []
     return Finding(audit, status, len(every), columns, every[:SAMPLE_ROWS], {})
+
+
+DISCOUNT = 0.99  # of a store's rows, unless another is asked for
+REWARD_AUDITS = ("reward_order", "reward_undetermined")
+OF_RUN = "evaluated_"
+
+
+@dataclass(frozen=True)
+class RewardAudit:
+    """What was found of a store or a run."""
+
+    discount: float
+    returns: list[dict[str, Any]]  # a row a condition, driver and outcome
+    # A row a condition and pair of drivers; ends of `more_return` are NaN below three episodes.
+    order: list[dict[str, Any]]
+    findings: list[Finding]
+
+
+@interrupts_raised
+def audit_reward(
+    place: str | Path,
+    audits: Sequence[Audit],
+    thresholds: Thresholds,
+    *,
+    discount: float | None = None,
+) -> RewardAudit:
+    """Return whether more success earns more, in a store's logs or a run's evaluations.
+
+    A reward that pays for haste gives an agent that touches something in a quarter of its missions
+    more than a driver that touches nothing; an agent trained on it learns to touch. That shows
+    before any training, in the returns of the drivers that are there.
+
+    Args:
+        place: a store, or a run.
+        audits, thresholds: all that are known; those of the reward are run.
+        discount: of one step; for a run its own, for a store DISCOUNT.
+
+    Raises:
+        ConfigError: another discount than a run's evaluations were made with; thresholds that none
+            of the audits uses.
+        RunError: a run that was not evaluated, or by an earlier Restock.
+        StoreError: there is neither a store nor a run.
+    """
+    folder = Location.of(place).folder
+    of_run = folder is not None and (folder / RUN_CONFIG).is_file()
+    names = [OF_RUN + name if of_run else name for name in REWARD_AUDITS]
+    check_thresholds(audits, thresholds)
+    chosen = [audit for audit in audits if audit.name in names]
+    limits = {name: table for name, table in thresholds.items() if name in names}
+    if of_run:
+        assert folder is not None
+        discount = _discount_of(folder, discount)
+    discount = DISCOUNT if discount is None else discount
+    beside = {"run": place} if of_run else {}
+    with open_place(
+        place,
+        beside=beside,
+        only_store=not of_run,
+        opened=Store.verify,
+    ) as connection:
+        if of_run:
+            _check_evaluated(connection, Path(place))
+        else:
+            install_named(connection, "driven_episodes returns_of return_order")
+            connection.execute(
+                "CREATE OR REPLACE VIEW driven_episodes AS"
+                f" FROM discounted_episodes({float(discount)!r})"
+            )
+        findings = run_audits(connection, chosen, limits, beside=beside)
+        source = "run.driven_episodes" if of_run else "driven_episodes"
+        least = max(float(table["min_episodes"]) for table in limits.values())
+        same = float(limits[names[1]]["same_success"])
+        order = _rows(connection, f"FROM return_order('{source}', {least!r}, {same!r})")
+        for row in order:
+            row["more_return"] = [math.nan if end is None else end for end in row["more_return"]]
+        returns = _rows(connection, f"FROM returns_of('{source}')")
+        return RewardAudit(discount, returns, order, findings)
+
+
+def _discount_of(run: Path, requested: float | None) -> float:
+    config = read_json(run / RUN_CONFIG, error=RunError)["config"]
+    discount = float(config["loss"]["discount"])
+    if requested is not None and abs(requested - discount) > 1e-9:
+        raise ConfigError(
+            f"the evaluations of {run} are discounted by {discount:g}, not {requested:g}",
+            where="--discount",
+            remedy="leave it out: an evaluation does not keep its rewards by step",
+        )
+    return discount
+
+
+def _check_evaluated(connection: duckdb.DuckDBPyConnection, run: Path) -> None:
+    query = "SELECT table_name FROM information_schema.tables WHERE table_schema = 'run'"
+    if ("driven_episodes",) not in connection.execute(query).fetchall():
+        raise RunError(
+            "has no evaluation with discounted returns",
+            where=str(run),
+            remedy=f"restock eval {quoted(run)} --policies agent,planner,operator --episodes 200"
+            " --perturbations none",
+        )
+
+
+def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, Any]]:
+    columns, rows = found(connection, query)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
