@@ -130,6 +130,7 @@ def test_a_folder_that_disappears_is_said_once_and_forgets_nothing(bag, tmp_path
 
 
 WATCH = """
+__file__ = "watch"  # without it DuckDB takes this for a prompt, and draws bars for slow queries
 import sys
 from restock.cli import main
 from restock.cli.data import watch
