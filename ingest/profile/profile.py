@@ -62,18 +62,21 @@ from restock.ingest.profile.tables import (
 )
 from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.conditions import (
+    DRIVEN_PLAN,
     Condition,
     Kind,
     label_with_probabilities,
     labels_version,
     of_kind,
     shipped,
+    unseen,
     with_files,
 )
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.robot import Limiter, Robot, beyond_limits, refuse_beyond_steering
 from restock.ingest.task.schema import steps_schema
-from restock.ingest.task.task import Noise, Task
+from restock.ingest.task.task import PLAN_SIGNALS, Noise, Task
+from restock.ingest.task.task_sql import own_reward, reward_terms
 from restock.renamed import PROFILE_KEYS
 from restock.toml import Checked, changed, parse_toml, read_toml, toml_value, typed
 
@@ -542,7 +545,7 @@ def _check_goal_rules(profile: Profile, where: str) -> None:
 
 
 def _check_conditions(profile: Profile, where: str) -> None:
-    """Check that each condition of the profile's own binds to the columns of steps."""
+    """Check that the SQL of the profile's own binds to the columns of steps."""
     fields = [signal.field(name) for name, signal in profile.signals.items()]
     steps = steps_schema(fields).empty_table()
     for place, condition in enumerate(profile.own_conditions):
@@ -555,3 +558,15 @@ def _check_conditions(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=error.remedy,
             ) from error
+    if profile.goal_source == "hindsight":
+        for name, plan in unseen(reward_terms(profile.task), PLAN_SIGNALS).items():
+            raise ConfigError(
+                f"`task.reward_terms.{name}` names {plan[0]}, and {DRIVEN_PLAN}",
+                where=where,
+                remedy="leave it out: with goals in hindsight, nothing stood on the plan",
+            )
+    try:
+        own_reward(profile.task, steps)
+    except ConfigError as error:
+        what = f"{error.where}: {error.what}"
+        raise ConfigError(what, where=where, remedy=error.remedy) from error

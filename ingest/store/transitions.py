@@ -35,6 +35,7 @@ from restock.ingest.task.schema import (
     truth_text,
 )
 from restock.ingest.task.task import Signals, observe, reward
+from restock.ingest.task.task_sql import own_reward
 
 GROUP_ROWS = 8192  # of whole episodes that are worked out together: bounds memory
 
@@ -284,11 +285,15 @@ def transitions(
     now = {name: column[begin] for name, column in narrow.items()}
     after = {name: column[begin + 1] for name, column in narrow.items()}
     progress_m = steps.routing.progress_m(task, steps.routing.plan[tick], now, after)
+    earned = reward(task, now, after, progress_m, steps.action[tick], previous_action[begin])
+    if task.reward_terms:
+        table = label_table(rows.signals, rows.episode, rows.step, rows.custom)
+        earned = earned + own_reward(task, table)[begin + 1]
     terminates = np.array([episode.terminated for episode in episodes.episodes], np.bool_)
     values = TransitionValues(
         observation=observe(task, rows.signals, before, previous_action),
         action=steps.action[tick],
-        reward=reward(task, now, after, progress_m, steps.action[tick], previous_action[begin]),
+        reward=earned,
         progress_m=progress_m,
         residual=steps.residual[tick],
         terminates=terminates[rows.episode[begin]],

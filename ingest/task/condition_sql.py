@@ -56,10 +56,12 @@ _OF_ORDER = {
     *("any_value", "arbitrary", "list", "array_agg"),
     *("string_agg", "group_concat", "listagg"),
 }
+_FRAMED = {
+    *("WINDOW_AGGREGATE", "WINDOW_FIRST_VALUE", "WINDOW_LAST_VALUE", "WINDOW_NTH_VALUE"),
+}
 _BACKWARD = {
-    *("WINDOW_AGGREGATE", "WINDOW_LAG"),
-    *("WINDOW_FIRST_VALUE", "WINDOW_LAST_VALUE", "WINDOW_NTH_VALUE"),
-    *("WINDOW_ROW_NUMBER", "WINDOW_RANK", "WINDOW_RANK_DENSE"),
+    *_FRAMED,
+    *("WINDOW_LAG", "WINDOW_ROW_NUMBER", "WINDOW_RANK", "WINDOW_RANK_DENSE"),
 }
 
 
@@ -162,9 +164,9 @@ def _refuse_window(part: dict[str, Any], timing: str) -> str | None:
         return f"{name}() would see other episodes: write OVER episode, or OVER (episode ROWS …)"
     if timing == "post":
         return None
-    ahead = f'timing is "pre", but {name}() may look at later steps: '
+    ahead = f"{name}() may look at later steps: "
     if part["type"] not in _BACKWARD:
-        return ahead + 'set timing = "post"'
+        return ahead + 'use lag(), or in a condition set timing = "post"'
     orders = [(item["type"], _column(item["expression"])) for item in part["orders"]]
     if not orders or orders[0] not in [
         (kind, column)
@@ -181,6 +183,41 @@ def _refuse_window(part: dict[str, Any], timing: str) -> str | None:
     if not all(_constant(item["expression"]) for item in offset):
         return ahead + "give lag() a constant number"
     return None
+
+
+@lru_cache(maxsize=1024)
+def names_in(sql: str) -> frozenset[str]:
+    """Return the columns that an expression names, in lower case; `refusal` read it before."""
+    columns = (part for part in _parsed(sql) if part["class"] == "COLUMN_REF")
+    return frozenset(part["column_names"][-1].lower() for part in columns)
+
+
+@lru_cache(maxsize=1024)
+def steps_back(sql: str) -> int | None:
+    """Return how many steps an expression without refusal looks back; None: to the first."""
+    windows = [part for part in _parsed(sql) if part["class"] == "WINDOW"]
+    back = [_window_back(part) for part in windows]
+    return None if None in back else max((steps for steps in back if steps is not None), default=0)
+
+
+def _window_back(part: dict[str, Any]) -> int | None:
+    if part["type"] == "WINDOW_LAG" and not part["ignore_nulls"]:
+        offset = part["arguments"][1:2]
+        return int(offset[0]["expression"]["literal"]["text"]) if offset else 1
+    if part["type"] in _FRAMED and not part["ignore_nulls"]:
+        if part["start"] == "CURRENT_ROW_ROWS":
+            return 0
+        if part["start"] == "EXPR_PRECEDING_ROWS" and _constant(part["start_expr"]):
+            return int(part["start_expr"]["literal"]["text"])
+    return None
+
+
+def _parsed(sql: str) -> Iterator[dict[str, Any]]:
+    """Yield every node of an expression that `refusal` has nothing against."""
+    with sandbox().cursor() as connection:
+        query = SELECT.format(columns=f"({sql}\n)", source="steps")
+        ((text,),) = connection.execute("SELECT json_serialize_sql(?::VARCHAR)", [query]).fetchall()
+    return _walk(json.loads(text)["statements"][0]["node"]["select_list"])
 
 
 def _column(part: dict[str, Any]) -> str:

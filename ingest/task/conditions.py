@@ -297,18 +297,26 @@ def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
     Raises:
         ConfigError: its SQL does not run, or gives other than numbers.
     """
-    values = {}
+    values: dict[str, F64] = {}
     for name in condition.let:
         requested = msgspec.structs.replace(condition, sql=name)
-        column = _evaluate(steps, [requested], ("sql",))[condition.name, "sql"]
-        try:
-            numbers = column.cast(pa.float64())
-        except pa.ArrowInvalid as error:
-            raise ConfigError(
-                f"its SQL gives {column.type}, not a number",
-                where=f"`let` {name!r} of condition {condition.name!r}",
-            ) from error
-        values[name] = np.asarray(numbers.combine_chunks().to_numpy(zero_copy_only=False))
+        values |= {name: numbers(steps, [requested])[condition.name]}
+    return values
+
+
+def numbers(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F64]:
+    """Evaluate the SQL of conditions as numbers at each step, (N,): true is 1, null is NaN.
+
+    Raises:
+        ConfigError: it does not run, or gives other than numbers; names the condition.
+    """
+    values, types = {}, pa.types
+    for (name, _), column in _evaluate(steps, conditions, ("sql",)).items():
+        numeric = (types.is_boolean, types.is_integer, types.is_floating, types.is_decimal)
+        if not any(of(column.type) for of in numeric):
+            where = f"condition {name!r}"
+            raise ConfigError(f"its SQL gives {column.type}, not a number", where=where)
+        values[name] = np.asarray(column.cast(pa.float64()).combine_chunks().to_numpy(False))
     return values
 
 

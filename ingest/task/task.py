@@ -13,6 +13,7 @@ makes an observation sees `after`; reward and termination are what happened in [
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -214,6 +215,8 @@ class Task(Checked, frozen=True):
     tracks: Annotated[int, Meta(ge=1, le=16)] | msgspec.UnsetType = msgspec.UNSET
     bump_terminates: bool = False  # a bump ends the episode (protective stop)
     rewards: Rewards = Rewards()
+    # Terms of its own beside them: name -> (weight, SQL); see `restock.ingest.task.task_sql`.
+    reward_terms: dict[str, tuple[float, str]] | msgspec.UnsetType = msgspec.UNSET
 
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
@@ -232,6 +235,13 @@ class Task(Checked, frozen=True):
                 f"range_max_m must be above range_min_m, got {self.range_max_m:g} and"
                 f" {self.range_min_m:g}"
             )
+        for name in self.reward_terms or {}:
+            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+                raise ValueError(f"reward_terms: a name is letters, digits and _, got {name!r}")
+            if name in Rewards.__struct_fields__:
+                raise ValueError(
+                    f"reward_terms: {name!r} is in [task.rewards]: choose another name"
+                )
 
     @property
     def lidar(self) -> bool:

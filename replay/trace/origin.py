@@ -421,6 +421,8 @@ def _reward_parts(
         np.array([row["action"]]),
         np.array([previous]),
     )
+    if task.reward_terms:  # they may look back farther than what is near
+        parts[" + ".join(task.reward_terms)] = row["reward"] - np.asarray(sum(parts.values()))
     return {name: float(value[0]) + 0.0 for name, value in parts.items()}  # never -0
 
 

