@@ -284,7 +284,7 @@ def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
     )
 
 
-MIN_GROUPS = 4  # to decompress ahead
+MIN_GROUPS = 5  # to decompress ahead
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 
 
@@ -507,8 +507,9 @@ class McapFile:
                 yield channel, buffer, mcap_records.messages_at(buffer, at - start)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
+        """Yield the chunks that hold these channels; the first alone, as some need one message."""
         group: list[Chunk] = []
-        size = 0
+        size = GROUP_BYTES
         for chunk in self._contents.chunks:
             known = self._chunks.walked.get(chunk.at, chunk.index)
             if known and not known.keys() & wanted:

@@ -169,7 +169,8 @@ def _frames(inputs: InputColumns, steps: int) -> list[Finding]:
     """Find topics whose messages are of several frames: each publisher names its own."""
     found: dict[str, Finding] = {}
     for name in ("pose", "wheels"):
-        counts = Counter(frame for frame in inputs.frames_of(name) if frame)
+        counts = Counter(inputs.frames_of(name))
+        del counts[""]
         often = [one for one in counts.most_common() if one[1] >= OFTEN * counts.total()]
         if len(often) < 2:
             continue

@@ -56,7 +56,7 @@ import threading
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -65,6 +65,7 @@ import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
@@ -76,13 +77,16 @@ from restock.toml import Checked
 Timing = Literal["pre", "post"]
 Kind = Literal["outcome", "exposure"]
 Expression = Literal["sql", "probability"]  # of a condition
-Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
 _LENGTH = re.compile(r"\{(\d*\.?\d+) ([sm])\}")
 # What conditions may take on a recording: those that Restock brings take a thirtieth of it a step.
 LIMIT_S, LIMIT_S_PER_STEP = 60.0, 0.001
 NO_LIDAR = "no lidar"  # why a condition is unknown
 DRIVEN_PLAN = "the plan is the path that was driven"  # and so nothing stood on it
+
+
+Column = tuple[str, NDArray[Any]]  # DuckDB's type, and values (N,), masked if there are nulls
+Columns = dict[tuple[str, Expression], Column]  # by the condition's name
 
 
 class Condition(Checked, frozen=True):
@@ -266,12 +270,12 @@ def label_with_probabilities(
 def _labels(columns: Columns, conditions: Sequence[Condition]) -> dict[str, Bools]:
     labels = {}
     for condition in conditions:
-        column = columns[condition.name, "sql"]
-        if not pa.types.is_boolean(column.type):
+        kind, values = columns[condition.name, "sql"]
+        if kind != "BOOLEAN":
             raise ConfigError(
-                f"its SQL gives {column.type}, not a boolean", where=_where(condition, "sql")
+                f"its SQL gives {kind}, not a boolean", where=_where(condition, "sql")
             )
-        labels[condition.name] = np.asarray(column.fill_null(False).combine_chunks(), np.bool_)
+        labels[condition.name] = np.ma.filled(values, False)
     return labels
 
 
@@ -280,11 +284,8 @@ def _probabilities(columns: Columns, conditions: Sequence[Condition]) -> dict[st
     for condition in conditions:
         if not condition.probability:
             continue
-        column, where = columns[condition.name, "probability"], _where(condition, "probability")
-        try:
-            values = column.cast(pa.float64()).combine_chunks().to_numpy(zero_copy_only=False)
-        except pa.ArrowInvalid as error:
-            raise ConfigError(f"its SQL gives {column.type}, not a number", where=where) from error
+        where = _where(condition, "probability")
+        values = _numbers(columns[condition.name, "probability"], where)
         if len(wrong := values[(values < 0) | (values > 1)]):
             raise ConfigError(f"it must be in [0, 1], but gives {wrong[0]:.4g}", where=where)
         found[condition.name] = values.astype(np.float32)
@@ -310,14 +311,16 @@ def numbers(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F64]:
     Raises:
         ConfigError: it does not run, or gives other than numbers; names the condition.
     """
-    values, types = {}, pa.types
-    for (name, _), column in _evaluate(steps, conditions, ("sql",)).items():
-        numeric = (types.is_boolean, types.is_integer, types.is_floating, types.is_decimal)
-        if not any(of(column.type) for of in numeric):
-            where = f"condition {name!r}"
-            raise ConfigError(f"its SQL gives {column.type}, not a number", where=where)
-        values[name] = np.asarray(column.cast(pa.float64()).combine_chunks().to_numpy(False))
-    return values
+    columns = _evaluate(steps, conditions, ("sql",)).items()
+    return {name: _numbers(column, f"condition {name!r}") for (name, _), column in columns}
+
+
+def _numbers(column: Column, where: str) -> F64:
+    """Return a column's numbers (N,); NaN for null."""
+    kind, values = column
+    if values.dtype.kind not in "biuf":
+        raise ConfigError(f"its SQL gives {kind}, not a number", where=where)
+    return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
 
 def too_near_to_call(
@@ -344,8 +347,12 @@ def _evaluate(
     if not requested:
         return columns
     with sandbox().cursor() as connection:
-        numbered = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
-        connection.register("steps", numbered)
+        named = {word.lower() for c, _ in requested for word in c.words} | {
+            "episode_index",
+            "step_index",
+        }
+        used = steps.select([name for name in steps.column_names if name.lower() in named])
+        connection.register("steps", used.append_column("row_", pa.array(np.arange(len(steps)))))
         limit_s = LIMIT_S + len(steps) * LIMIT_S_PER_STEP
         began = time.monotonic()
         for several in together.values():
@@ -447,12 +454,15 @@ def _query(
     )
     query = SELECT.format(columns=f"{columns},\nrow_", source=_source(requested[0][0]))
     with _interrupted_after(connection, limit_s):
-        rows = connection.sql(query).to_arrow_table()
-    if not np.array_equal(rows["row_"].to_numpy(), np.arange(count)):
+        found = connection.execute(query)  # `sql` would plan it twice
+        kinds = [str(column[1]) for column in found.description]
+        *values, row = found.fetchnumpy().values()
+    if not np.array_equal(row, np.arange(count)):
         raise duckdb.InvalidInputException(
-            f"it gives {len(rows):,} values, not one for each of the {count:,} steps"
+            f"it gives {len(row):,} values, not one for each of the {count:,} steps"
         )
-    return {(c.name, part): rows.column(place) for place, (c, part) in enumerate(requested)}
+    names = [(condition.name, part) for condition, part in requested]
+    return dict(zip(names, zip(kinds, values, strict=False), strict=True))
 
 
 @contextmanager
@@ -515,7 +525,12 @@ def shipped(
     with a profile's default noise.
     """
     constants = constants or Noise().constants | STAND_IN_LIMITS
-    return {one.name: one.with_constants(constants) for one in of_kind(_as_shipped(), kind)}
+    return {one.name: one for one in of_kind(_of_robot(tuple(constants.items())), kind)}
+
+
+@lru_cache(maxsize=64)
+def _of_robot(constants: tuple[tuple[str, float], ...]) -> list[Condition]:
+    return [one.with_constants(dict(constants)) for one in _as_shipped()]
 
 
 @cache

@@ -226,7 +226,7 @@ def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
     ("sql", "said"),
     [
         ("clearance_mm < 1", 'Referenced column "clearance_mm" not found'),
-        ("clearance_m", "its SQL gives float, not a boolean"),
+        ("clearance_m", "its SQL gives FLOAT, not a boolean"),
         ("lead(bumped) OVER episode", "lead() may look at later steps"),
     ],
 )

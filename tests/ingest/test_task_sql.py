@@ -132,7 +132,7 @@ def test_without_terms_nothing_changes_and_each_word_counts():
 REFUSED = [
     ('x = [1, "lead(clearance_m) OVER episode"]', "lead() may look at later steps"),
     ('x = [1, "clearence_m < 1"]', 'Referenced column "clearence_m" not found'),
-    ("x = [1, \"'much'\"]", "its SQL gives string, not a number"),
+    ("x = [1, \"'much'\"]", "its SQL gives VARCHAR, not a number"),
     ('x = [1, "command_speed_mps"]', "which is chosen only after the step"),
     ('x = [1, "(SELECT 1)"]', "it contains a query"),
     ('x = [1, "random()"]', "reads data other than the steps"),
