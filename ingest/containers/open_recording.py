@@ -15,7 +15,7 @@ import glob
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -28,6 +28,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import (
     HEAD_BYTES,
     INVALID_YAML,
+    LEROBOT_DATA,
+    LEROBOT_INFO,
     NOT_KEPT,
     ZSTD_MAGIC,
     Container,
@@ -42,16 +44,46 @@ from restock.ingest.containers.storage import (
 from restock.ingest.decoding.decoders import READABLE
 from restock.ingest.decoding.definitions import DEFAULT_DISTRO, choose_definitions
 
+
+def _open_lerobot(path: Path, *, salvage: bool, watch: Watch) -> Storage:
+    from restock.ingest.containers.lerobot_folder import LeRobotFolder  # with it comes PyArrow
+
+    return LeRobotFolder(path, salvage=salvage, watch=watch)
+
+
+def _lerobot_files(folder: Path) -> Iterator[Path]:
+    yield folder / LEROBOT_INFO
+    yield from sorted(folder.glob(LEROBOT_DATA))
+
+
+LEROBOT = Container(
+    name="LeRobot",
+    endings=(),
+    claims=lambda head: b'"codebase_version"' in head,
+    open=_open_lerobot,
+    format="lerobot-v3",
+    bag_format="lerobot-v3",
+    files=_lerobot_files,
+)
 CONTAINERS: tuple[Container, ...] = (
-    mcap_file.CONTAINER,
-    sqlite_file.CONTAINER,
-    ros1_file.CONTAINER,
+    *(mcap_file.CONTAINER, sqlite_file.CONTAINER, ros1_file.CONTAINER),
+    LEROBOT,
 )
 
 
 def claiming(head: bytes) -> Container | None:
     """Return the container that claims a file by its first bytes, or None."""
-    return next((one for one in CONTAINERS if one.claims(head)), None)
+    return next((one for one in CONTAINERS if not one.files and one.claims(head)), None)
+
+
+def folder_container(folder: Path) -> Container | None:
+    """Return the container that claims a whole folder by its first file, or None."""
+    for one in CONTAINERS:
+        if one.files and (file := next(one.files(folder))).is_file():
+            with file.open("rb") as stream:
+                if one.claims(stream.read(FOLDER_HEAD_BYTES)):
+                    return one
+    return None
 
 
 def endings() -> tuple[str, ...]:
@@ -65,10 +97,11 @@ LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
 MAX_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
+FOLDER_HEAD_BYTES = 1 << 20  # of the file by which a container claims a folder
 _PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # of a bag that is split; longer ones are dates
 _NAMES = (
     f"recordings end in {', '.join(name for one in CONTAINERS for name in one.endings)}"
-    " or are rosbag2 folders"
+    " or are folders of rosbag2 or LeRobot"
 )
 _ZSTD = re.compile(r"\.zstd?$")
 
@@ -163,7 +196,7 @@ def _in_folder(folder: Path) -> list[Path]:
 
     Opening such an item raises an error for it alone.
     """
-    if is_bag(folder):
+    if is_bag(folder) or folder_container(folder):
         return [folder]
     recordings = []
     for item in sorted(folder.iterdir()):
@@ -328,6 +361,8 @@ def container_of(path: Path) -> Container | None:
         RecordingError: it is missing, empty, a Git LFS pointer or not a recording.
     """
     where = str(path)
+    if path.is_dir():
+        return folder_container(path)
     _refuse_special(path)
     try:
         with path.open("rb") as file:
@@ -426,6 +461,8 @@ class _Opening:
     def _files(self) -> tuple[list[Path], BagMetadata]:
         try:
             if self.path.is_dir():
+                if folder_container(self.path):
+                    return [self.path], BagMetadata()
                 return self._bag()
             there = self.path.exists()
         except OSError as error:
@@ -445,6 +482,8 @@ class _Opening:
         files = self._opened(files)
         self._refuse_serialisation(metadata)
         self._compare(metadata, files)
+        if files_of := self.containers[0].files:
+            files = [*files_of(self.path)]
         recording = Recording(
             *(self.path, self._format(), files, self.storages, self.distro),
             *(self.damage, self.notes, self.cleanup),

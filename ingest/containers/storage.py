@@ -42,6 +42,7 @@ MAX_ENTRIES = 1_000
 MAX_TEXT = 4_096  # characters of a name or value
 MAX_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
 HEAD_BYTES = 64  # by which a container claims a file
+LEROBOT_INFO, LEROBOT_DATA = "meta/info.json", "data/*/*.parquet"
 NOT_KEPT = f"not text, longer than {MAX_TEXT:,} characters, or beyond entry {MAX_ENTRIES:,}"
 # What the YAML library raises of an invalid document, or of one that it does not expect.
 INVALID_YAML = (
@@ -198,6 +199,8 @@ class Container:
     open: Opener
     format: str  # what a store calls a recording that is one such file
     bag_format: str  # and one that is a folder of them
+    # Of a format that is a folder: its files, the first of which is the one that `claims` looks at.
+    files: Callable[[Path], Iterator[Path]] | None = None
 
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -40,6 +40,7 @@ from restock.ingest.profile.tables import (
     HINDSIGHT,
     POLICY_FALLBACK,
     POSE_FALLBACK,
+    RECKONED,
     ROUTE_FALLBACK,
     SCANS,
     STEERED,
@@ -206,6 +207,8 @@ class Profile(Checked, frozen=True):
             fallbacks["behaviour_policy"] = POLICY_FALLBACK.format(names=names)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
+        elif self.inputs.pose.by_rates:
+            fallbacks["pose"] = RECKONED.format(topic=self.inputs.pose.topic)
         elif self.inputs.pose.by_fix and self.inputs.heading is None:
             fallbacks["heading"] = FIX_FALLBACK.format(track_m=self.inputs.pose.track_m or 1.0)
         if self.motion is not None:
@@ -390,6 +393,15 @@ def not_live(profile: Profile) -> list[NotLive]:
                 "whose frame and heading are not computed live",
                 "[inputs.pose]",
                 f"{_POSE}, such as that of robot_localization's navsat_transform_node",
+            )
+        )
+    elif pose is not None and pose.by_rates:
+        found.append(
+            NotLive(
+                "its pose by dead reckoning",
+                "which is not computed live",
+                "[inputs.pose]",
+                f"{_POSE}, such as that of its odometry",
             )
         )
     if profile.goal_source == "hindsight":

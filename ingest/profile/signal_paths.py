@@ -19,6 +19,7 @@ that name frames, and those of transforms, are here too.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,6 +41,11 @@ Rows = NDArray[np.intp]
 NAMES = "name"  # the sibling that names elements, as in sensor_msgs/JointState
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]*\])?)(?:\.|$)")
 _ELEMENT = re.compile(r"(.+)\[(\d{1,6})\]")
+IN = " in "  # between a path and the unit of its values
+UNITS = {  # by the unit of a field: others, and what they are of it
+    "mps": {"mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6},
+    "radps": {"deg/s": math.pi / 180, "rpm": math.pi / 30},
+}
 
 
 class PathProblem(Exception):
@@ -48,8 +54,15 @@ class PathProblem(Exception):
 
 def element_of(path: str) -> tuple[str, int | None]:
     """Split a path of one element into the list and its index; None for the whole field."""
-    match = _ELEMENT.fullmatch(path)
-    return (match[1], int(match[2])) if match else (path, None)
+    bare = path.partition(IN)[0]
+    match = _ELEMENT.fullmatch(bare)
+    return (match[1], int(match[2])) if match else (bare, None)
+
+
+def factor_of(key: str, path: str) -> float | None:
+    """Return what turns the values at a path into the unit of the field `key`; None: unknown."""
+    unit = path.partition(IN)[2]
+    return UNITS.get(key.rpartition("_")[2], {}).get(unit) if unit else 1.0
 
 
 @dataclass(frozen=True)
@@ -413,7 +426,7 @@ CONVENTIONS = (
 
 def conventions_of(kind: str, path: str, fields: Collection[str] | None = None) -> list[Convention]:
     """Return what messages of this type say of the value at a path, by the `fields` they have."""
-    bare = re.sub(r"\[[^\]]*\]", "", path)
+    bare = re.sub(r"\[[^\]]*\]", "", path.partition(IN)[0])
     return [
         one
         for one in CONVENTIONS

@@ -23,7 +23,15 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError, StoreError
-from restock.ingest.profile.signal_paths import PathProblem, SignalPath, last_part, pressed_paths
+from restock.ingest.profile.signal_paths import (
+    IN,
+    UNITS,
+    PathProblem,
+    SignalPath,
+    factor_of,
+    last_part,
+    pressed_paths,
+)
 from restock.ingest.profile.tag_rules import NAMED
 from restock.ingest.task.schema import COLUMNS
 from restock.toml import Checked
@@ -266,12 +274,14 @@ _SCAN_FIELDS = {
 
 # What each input must and may say of a message: signal-side name -> whether it is required.
 # `orientation` is a quaternion's path and becomes a yaw.
+RATES = {"speed_mps": False, "sideways_mps": False, "yaw_rate_radps": False}
 INPUT_FIELDS: dict[str, dict[str, bool]] = {
-    "command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
+    "command": {**RATES, "speed_mps": True, "steering_rad": False},
     "pose": {
         **{"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
         **{"latitude_deg": False, "longitude_deg": False, "status": False},
         **{"covariance_m2": False, "covariance_type": False},
+        **RATES,
     },
     "heading": {"orientation": False, "yaw_rad": False},  # of a pose by fix
     "wheels": {"speed_mps": True, "yaw_rate_radps": True},
@@ -305,6 +315,7 @@ STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POLICY_FALLBACK = "the source whose command it equals: {names}; else the profile's behaviour_policy"
 FIX_FALLBACK = "the direction of the last {track_m:g} m driven, as fixes have no heading"
+RECKONED = "dead reckoning by the speeds of {topic}: it drifts, and slip cannot be detected"
 POSE_FALLBACK = "from transforms, by [frames]"
 WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be detected"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
@@ -355,6 +366,11 @@ class Input(Checked, frozen=True):
         """Return whether it is a position by latitude and longitude."""
         return "latitude_deg" in self.fields
 
+    @property
+    def by_rates(self) -> bool:
+        """Return whether it has speeds; a pose that has is by dead reckoning."""
+        return not RATES.keys().isdisjoint(self.fields)
+
 
 class Inputs(Checked, frozen=True):
     """The `[inputs]` of a profile."""
@@ -403,6 +419,9 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
     if source.by_fix:
         missing = sorted({"latitude_deg", "longitude_deg"} - source.fields.keys())
         unknown += sorted(source.fields.keys() & {"x_m", "y_m", "orientation", "yaw_rad"})
+    elif name == "pose" and source.by_rates:
+        missing = sorted({"speed_mps", "yaw_rate_radps"} - source.fields.keys())
+        unknown += sorted(source.fields.keys() & {"x_m", "y_m", "orientation", "yaw_rad"})
     elif name in ("pose", "heading") and not source.fields.keys() & {"orientation", "yaw_rad"}:
         missing.append("orientation")
     _check_settings(f"inputs.{name}", name, source, where)
@@ -417,6 +436,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             unknown.append("angle_max_rad beside angle_increment_rad")
         elif not {"angle_increment_rad", "angle_max_rad"} & source.fields.keys():
             missing.append("angle_increment_rad")
+    _check_units(f"inputs.{name}", source, where)
     _check_wheelbase(f"inputs.{name}", source, where)
     _check_pressed(f"inputs.{name}", source, where)
     if unknown or missing:
@@ -499,6 +519,17 @@ def _check_pressed(key: str, source: Input, where: str) -> None:
         ) from None
 
 
+def _check_units(key: str, source: Input, where: str) -> None:
+    for field, path in source.fields.items():
+        if factor_of(field, path) is None:
+            raise ConfigError(
+                f"`{key}.fields.{field}`: {path!r} is not in a unit that is converted",
+                where=where,
+                remedy=f"after a speed or a yaw rate:{IN}"
+                + ", ".join(unit for units in UNITS.values() for unit in units),
+            )
+
+
 def _check_wheelbase(key: str, source: Input, where: str) -> None:
     if ("steering_rad" in source.fields) != (source.wheelbase_m is not None):
         raise ConfigError(
@@ -528,6 +559,7 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
             where=where,
             remedy=f"a source of commands has the fields {', '.join(COMMAND_SOURCE_FIELDS)}",
         )
+    _check_units(key, source, where)
     complete = "speed_mps" in commanding and len(commanding) == len(source.fields) == 2
     by_button = key != COMMAND_THROUGH and source.fields.keys() == {"pressed"}
     if not (complete or by_button):

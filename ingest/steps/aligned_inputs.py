@@ -15,7 +15,7 @@ from restock.arrays import Bools, Ints
 from restock.errors import RecordingError, counted
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.signal_paths import plain
+from restock.ingest.profile.signal_paths import element_of, factor_of, plain
 from restock.ingest.profile.tables import (
     COMMAND_SOURCES,
     COMMAND_THROUGH,
@@ -337,6 +337,8 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
 
 def sideways_path(source: Input) -> str:
     """Return the path of a command's speed to the left, beside that ahead; "" if it has none."""
+    if given := source.fields.get("sideways_mps"):
+        return element_of(given)[0]
     path = source.fields.get("speed_mps", "")
     return path[:-1] + "y" if path.split(".")[-2:] == ["linear", "x"] else ""
 
@@ -344,6 +346,7 @@ def sideways_path(source: Input) -> str:
 def sideways_notes(source: Input, fields: Mapping[str, FieldColumn]) -> list[str]:
     """Count the commands that also ask for a speed sideways, which no action has."""
     aside = np.asarray(fields.get(sideways_path(source), np.zeros(0)), np.float64)
+    aside = aside * (factor_of("sideways_mps", source.fields.get("sideways_mps", "")) or 1.0)
     count = int((np.abs(aside) > SIDEWAYS_MPS).sum())
     if not count:
         return []

@@ -35,6 +35,7 @@ from restock.ingest.profile.signal_paths import (
     PathProblem,
     conventions_of,
     element_of,
+    factor_of,
     frame_path,
     plain,
     pressed_in,
@@ -42,6 +43,7 @@ from restock.ingest.profile.signal_paths import (
 )
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS
+from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import Placement
 from restock.ingest.task.task import yaw_of
 
@@ -142,7 +144,7 @@ def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None =
 
 @dataclass(frozen=True)
 class FixedPoses:
-    """Poses (N,) by fixes; NaN where there is none (a position may stand without a yaw)."""
+    """Poses (N,) by fixes or dead reckoning; NaN if unknown (a position may have no yaw)."""
 
     x_m: F64  # to the east
     y_m: F64  # to the north
@@ -207,11 +209,33 @@ def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
     return yaw
 
 
+def reckon(time_ns: Ints, rates: F64, max_gap_s: float) -> FixedPoses:
+    """Return the poses to which speed, speed to the left and yaw rate (3, N) lead, from zero.
+
+    Between two messages the robot has the mean of their rates; over more than `max_gap_s` it does
+    not move. Where a rate is not finite, all count as 0, and there is no pose.
+    """
+    order = np.argsort(time_ns, kind="stable")
+    known = np.isfinite(rates[:, order]).all(axis=0)
+    rates = np.where(known, rates[:, order], 0.0)
+    step_s = np.diff(time_ns[order], prepend=time_ns[order][:1]) * 1e-9
+    mean = (rates + np.concatenate([rates[:, :1], rates[:, :-1]], axis=1)) / 2
+    ahead, aside, turn = mean * np.where(step_s <= max_gap_s, step_s, 0.0)
+    yaw = np.cumsum(turn)
+    cos, sin = np.cos(yaw - turn / 2), np.sin(yaw - turn / 2)
+    poses = np.full((3, len(order)), np.nan)
+    found = np.stack(
+        [np.cumsum(cos * ahead - sin * aside), np.cumsum(sin * ahead + cos * aside), yaw]
+    )
+    poses[:, order[known]] = found[:, known]
+    return FixedPoses(poses[0], poses[1], poses[2], np.full(len(order), "", object))
+
+
 class InputColumns:
     """The inputs of a profile that a recording has, and their columns."""
 
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
-        self.topics = topics
+        self.topics, self.max_gap_s = topics, profile.clock.max_gap_s
         self.origin_m = np.array(profile.origin_m or (0.0, 0.0))  # of all positions
         self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
         self.by_name: dict[str, Input] = {  # those whose topic the recording has
@@ -234,6 +258,8 @@ class InputColumns:
         return self._numbers(name, key)
 
     def _numbers(self, name: str, key: str) -> F64:
+        if name == "pose" and self.by_name[name].by_rates and key in ("x_m", "y_m", "yaw_rad"):
+            return np.asarray(getattr(self.reckoned, key), np.float64)
         if self.by_name[name].by_fix and key in ("x_m", "y_m", "yaw_rad"):
             return np.asarray(getattr(self.fixed, key), np.float64)
         if key == "yaw_rad" and "orientation" in self.by_name[name].fields:
@@ -251,6 +277,7 @@ class InputColumns:
                 remedy=f"correct `inputs.{name}.fields.{key}` in the profile",
             )
         none = self.no_estimate(name, key)
+        column = column * (factor_of(key, self.by_name[name].fields[key]) or 1.0)
         return np.where(none, np.nan, column) if none.any() else np.asarray(column, np.float64)
 
     def _pressed(self, name: str) -> F64:
@@ -298,6 +325,17 @@ class InputColumns:
         if (none := self.no_estimate("pose", "latitude_deg")).any():
             fixes = replace(fixes, status=np.where(none, -1.0, 0.0))
         return fixes.poses(source.origin_deg, source.max_std_m, source.track_m)
+
+    @cached_property
+    def reckoned(self) -> FixedPoses:
+        """Return the pose at each message of a pose by dead reckoning."""
+        columns = self.topics[self.by_name["pose"].topic]
+        speed, turn = (self.numbers("pose", key) for key in ("speed_mps", "yaw_rate_radps"))
+        aside = np.zeros(len(speed))
+        if "sideways_mps" in self.by_name["pose"].fields:
+            aside = self.numbers("pose", "sideways_mps")
+        time_ns = np.asarray(columns.fields.get(STAMP, columns.log_time_ns), np.int64)
+        return reckon(time_ns, np.stack([speed, aside, turn]), self.max_gap_s)
 
     def _heading_at(self, time_ns: Ints) -> F64:
         """Return the heading (N,) received last at these log times; NaN if none is known."""

@@ -163,6 +163,8 @@ def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) ->
 def _by_profile(recording: Recording, profile: Profile) -> Poses | None:
     source = profile.inputs.pose
     if source is not None and source.topic in recording.topics:
+        if source.by_rates:
+            return None
         if source.by_fix:
             settings = source.origin_deg, source.max_std_m, source.track_m
             return _by_fixes(recording, source.topic, source.fields, *settings)

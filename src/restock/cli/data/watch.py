@@ -2,7 +2,8 @@
 
 A recording is complete if its files have kept their names, sizes and times for `STILL_S`, and if it
 says so itself: an MCAP file ends with its footer, and a bag's folder has the metadata.yaml that
-rosbag2 writes last, and every file that it lists. Nothing is remembered on disk: the store knows
+rosbag2 writes last, and every file that it lists; a LeRobot folder has the frames that
+its info counts. Nothing is remembered on disk: the store knows
 recordings by their content, so a process that was killed takes them all again, and those that are
 in the store are unchanged.
 """
@@ -15,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,9 +31,11 @@ from restock.ingest.containers.mcap_records import MAGIC
 from restock.ingest.containers.open_recording import (
     METADATA,
     bag_files,
+    folder_container,
     read_metadata,
     recordings_in,
 )
+from restock.ingest.containers.storage import unwatched
 from restock.ingest.store.writer import StoreWriter, fold_if_many
 from restock.process import was_interrupted
 from restock.replay.places import open_place
@@ -266,6 +270,11 @@ def incomplete(path: Path) -> str:
     try:
         if not path.is_dir():
             return _unfinished(path)
+        if container := folder_container(path):
+            with suppress(RecordingError):  # which ingest reports
+                damage = container.open(path, salvage=True, watch=unwatched).damage
+                return damage[0].what if damage else ""
+            return ""
         if not (path / METADATA).is_file():
             return f"no {METADATA} yet"
         files, missing, _ = bag_files(path, read_metadata(path)[0])

@@ -1,0 +1,366 @@
+"""A LeRobot v3.0 data set as a recording: a topic for each feature, a message a frame.
+
+    meta/info.json                          features: dtype, shape and names; how many frames
+    meta/episodes/chunk-*/file-*.parquet    which data file each episode is in
+    data/chunk-*/file-*.parquet             a row a frame
+
+A numeric feature becomes a topic of its name (`/action`) with a float64 for each of its `names`
+(`x.vel` is the field `x_vel`; without names `value_0`, `value_1`, …), as CDR with a definition, so
+that what reads ROS 2 messages reads them. `/frame` has the counters of each frame. A feature of
+images becomes a topic of sensor_msgs/msg/CompressedImage; videos are listed and not read.
+
+LeRobot keeps no dates: time starts at 1970-01-01, and each episode `GAP_S` after the one before it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from restock.arrays import Bools, Ints
+from restock.errors import RecordingError, counted
+from restock.files import first_line, read_json
+from restock.ingest.containers.storage import (
+    LEROBOT_DATA,
+    LEROBOT_INFO,
+    Damage,
+    Extra,
+    Integrity,
+    Metadata,
+    Packed,
+    Watch,
+    keep_entries,
+    unwatched,
+)
+from restock.ingest.decoding.columns import Channel, MessageBatch
+
+VERSION = "v3.0"
+GAP_S = 10  # between two episodes: longer than what a profile allows within one
+MAX_S = 1e6  # of a timestamp
+ROWS, IMAGES = 65_536, 256  # frames read at a time
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+FRAME, IMAGE = "/frame", "sensor_msgs/msg/CompressedImage"
+CDR = b"\x00\x01\x00\x00"
+UNREADABLE = (pa.ArrowException, OSError, KeyError, TypeError, ValueError)
+_NUMERIC = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
+
+
+class _Feature(NamedTuple):
+    name: str
+    fields: tuple[str, ...]  # of its messages; none: an image
+
+
+class _Frames(NamedTuple):
+    """A data file, and what is known of its frames."""
+
+    path: Path
+    name: str
+    stamp_ns: Ints  # (N,)
+
+
+class LeRobotFolder:
+    """The folder of a data set, read only. The format has no checksums, so it is never verified.
+
+    Raises:
+        RecordingError: its info is of no data set of this version, or a data file cannot be read
+            or is out of order (unless `salvage`).
+    """
+
+    from_ros2 = False
+
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+        self._path, self._salvage, self._watch = path, salvage, watch
+        self.integrity: Integrity = "unverified"
+        self.damage: list[Damage] = []
+        self.notes: list[str] = []
+        self.extras: list[Extra] = []
+        self.packed: list[Packed] = []
+        info = read_json(path / LEROBOT_INFO, error=RecordingError)
+        if (version := info.get("codebase_version")) != VERSION:
+            raise RecordingError(
+                f"a LeRobot data set of codebase_version {version!r}: only {VERSION} is read",
+                where=str(path / LEROBOT_INFO),
+                remedy="convert it: `python -m lerobot.datasets.v30.convert_dataset_v21_to_v30`"
+                if version == "v2.1"
+                else None,
+            )
+        robot = info.get("robot_type")
+        said = keep_entries({"robot_type": robot} if isinstance(robot, str) else {})[0]
+        self.metadata = [Metadata(LEROBOT_INFO, "", said)]
+        self._features = dict(enumerate(self._described(info.get("features")), 2))
+        self.channels = {1: Channel(1, FRAME, "lerobot/msg/Frame", "cdr", "ros2msg", _FRAME)}
+        for number, feature in self._features.items():
+            text = "".join(f"float64 {name}\n" for name in feature.fields).encode()
+            kind, form = (_type(feature), "ros2msg") if text else (IMAGE, "")
+            self.channels[number] = Channel(number, f"/{feature.name}", kind, "cdr", form, text)
+        self.counts = dict.fromkeys(self.channels, 0)
+        self._files = self._opened()
+        claimed, held = info.get("total_frames"), self.counts[1]
+        if isinstance(claimed, int) and claimed != held:
+            what = f"{LEROBOT_INFO} counts {claimed:,} frames, and there are {held:,}"
+            if claimed > held:
+                self._lose(what, claimed - held)
+            else:
+                self.notes.append(what)
+        there = [file.stamp_ns for file in self._files if len(file.stamp_ns)]
+        self.span_ns = (int(there[0][0]), int(there[-1][-1])) if there else None
+
+    def _described(self, features: object) -> Iterator[_Feature]:
+        """Yield the features that are read; list or note the others."""
+        if not isinstance(features, dict):
+            raise RecordingError("it has no features", where=str(self._path / LEROBOT_INFO))
+        for name, about in features.items():
+            about = about if isinstance(about, dict) else {}
+            kind, shape = str(about.get("dtype")), about.get("shape")
+            if name in (*COUNTERS, "timestamp"):
+                continue
+            if kind == "video":
+                files = list(self._path.glob("videos/*/*/*.mp4"))
+                size = sum(f.stat().st_size for f in files if f.parts[-3] == name)
+                self.extras.append(Extra("attachment", name, "video/mp4", size))
+            elif kind == "image":
+                yield _Feature(name, ())
+            elif not _NUMERIC.fullmatch(kind):
+                self.notes.append(f"feature {name} is a {kind}: it is not read")
+            elif not isinstance(shape, list) or len(shape) > 1 or shape == [0]:
+                self.notes.append(
+                    f"feature {name} has the shape {shape}: only those of one dimension are read"
+                )
+            else:
+                yield _Feature(name, field_names(about.get("names"), shape[0] if shape else 1))
+        if self.extras:
+            self.notes.append(
+                f"{counted(len(self.extras), 'feature')} of video: listed, and not read"
+            )
+
+    def _opened(self) -> list[_Frames]:
+        """Find the data files and the stamps of their frames; a file that is missing is damage."""
+        listed = self._listed()
+        found: list[tuple[Path, str]] = []
+        parts: list[tuple[Ints, NDArray[Any]]] = []
+        for path in sorted(self._path.glob(LEROBOT_DATA)):
+            name = path.relative_to(self._path).as_posix()
+            frames = listed.pop(name, 0)
+            self._watch("looking through the data files", len(found), len(found) + len(listed) + 1)
+            try:
+                file = pq.ParquetFile(path)
+                lacking = [one.name for one in self._features.values()]
+                lacking = [
+                    one
+                    for one in ("timestamp", *COUNTERS, *lacking)
+                    if one not in file.schema_arrow.names
+                ]
+                if lacking:
+                    raise ValueError(f"it has no column {', '.join(lacking)}")
+                table = file.read(columns=["timestamp", "episode_index"])
+                episode = table["episode_index"].to_numpy().astype(np.int64)
+                seconds = table["timestamp"].to_numpy().astype(np.float64)
+                if not (np.abs(seconds) < MAX_S).all():  # False for NaN
+                    raise ValueError("a timestamp is not a number, or implausible")
+            except UNREADABLE as error:
+                what = f"{name} cannot be read: {first_line(error)}"
+                self._refuse(what)
+                self._lose(what, frames)
+                continue
+            found.append((path, name))
+            parts.append((episode, seconds))
+        for name, frames in listed.items():
+            self._lose(f"{name}, which meta/episodes lists, is missing", frames)
+        if not found:
+            raise RecordingError("a LeRobot data set without data files", where=str(self._path))
+        stamps, problem = stamps_of(*map(np.concatenate, zip(*parts, strict=True)))
+        if problem is not None:
+            ends = np.cumsum([len(episode) for episode, _ in parts])
+            at = int(np.searchsorted(ends, problem[0], "right"))
+            row = problem[0] - (ends[at] - len(parts[at][0]))
+            what = f"{found[at][1]}: row {row:,} {problem[1]}"
+            self._refuse(what)
+            self._damaged(what)
+        for channel in self.channels:
+            self.counts[channel] += len(stamps)
+        cuts = np.cumsum([len(episode) for episode, _ in parts])[:-1]
+        each = np.split(stamps, cuts)
+        self.notes.append(
+            f"LeRobot has no dates: time starts at 1970-01-01, with {GAP_S} s before each episode"
+        )
+        return [_Frames(*one, stamp_ns) for one, stamp_ns in zip(found, each, strict=True)]
+
+    def _listed(self) -> Counter[str]:
+        """Return the frames of each data file as meta/episodes lists them."""
+        frames = Counter[str]()
+        columns = ["data/chunk_index", "data/file_index", "length"]
+        try:
+            for file in sorted(self._path.glob("meta/episodes/*/*.parquet")):
+                table = pq.ParquetFile(file).read(columns=columns)
+                for chunk, number, length in zip(
+                    *(table[name].to_pylist() for name in columns), strict=True
+                ):
+                    frames[f"data/chunk-{chunk:03d}/file-{number:03d}.parquet"] += length
+        except UNREADABLE as error:
+            self.notes.append(f"meta/episodes cannot be read: {first_line(error)}")
+        return frames
+
+    def _refuse(self, what: str) -> None:
+        if not self._salvage:
+            raise RecordingError(
+                what,
+                where=str(self._path),
+                remedy="`--salvage` reads what can still be read of it",
+            )
+
+    def _lose(self, what: str, frames: int) -> None:
+        """Count frames that there should be and are not."""
+        for channel in self.channels:
+            self.counts[channel] += frames
+        self._damaged(what, dict.fromkeys(self.channels, frames))
+
+    def _damaged(self, what: str, messages: dict[int, int] | None = None) -> None:
+        self.integrity = "damaged"
+        if all(item.what != what for item in self.damage):
+            self.damage.append(Damage(what, messages or {}))
+
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
+        """Yield the frames of each data file in order."""
+        wanted = [number for number in self.channels if number in channels]
+        names = [self._features[number].name for number in wanted if number != 1]
+        names += [*COUNTERS, "timestamp"] if 1 in channels else []
+        images = any(number != 1 and not self._features[number].fields for number in wanted)
+        for file in self._files if wanted else ():
+            done = 0
+            try:
+                parts = pq.ParquetFile(file.path).iter_batches(
+                    IMAGES if images else ROWS, columns=names
+                )
+                for part in parts:
+                    stamp_ns = file.stamp_ns[done : done + len(part)]
+                    for number in wanted:
+                        yield number, self._batch(number, part, stamp_ns, file.name)
+                    done += len(part)
+            except UNREADABLE as error:
+                lost = dict.fromkeys(wanted, len(file.stamp_ns) - done)
+                self._damaged(f"{file.name} from row {done:,} on: {first_line(error)}", lost)
+
+    def _batch(self, number: int, part: pa.RecordBatch, stamp_ns: Ints, file: str) -> MessageBatch:
+        """Build the messages of one channel for these frames."""
+        if number == 1:
+            counters = [
+                part[name].cast(pa.int64()).to_numpy(zero_copy_only=False) for name in COUNTERS
+            ]
+            seconds = part["timestamp"].cast(pa.float64()).to_numpy(zero_copy_only=False)
+            return cdr_batch(np.stack([*counters, seconds.view(np.int64)], axis=1), stamp_ns)
+        feature = self._features[number]
+        column = part[feature.name]
+        if feature.fields:
+            good, values = rows_of(column, len(feature.fields))
+        else:
+            pictures = column.field("bytes") if pa.types.is_struct(column.type) else column
+            good = np.asarray(pictures.is_valid())
+        if not good.all():
+            why = (
+                f"another number of values than {len(feature.fields)}"
+                if feature.fields
+                else ("no picture within the table")
+            )
+            self._damaged(
+                f"{file}: frames with {why} in {feature.name}", {number: int((~good).sum())}
+            )
+        if feature.fields:
+            return cdr_batch(values, stamp_ns[good])
+        kept = stamp_ns[good]
+        payloads = map(image_cdr, pictures.drop_null().to_pylist(), kept.tolist())
+        return MessageBatch.of(list(payloads), kept, kept)
+
+    def close(self) -> None:
+        """Do nothing: files are opened one by one while they are read."""
+
+
+_FRAME = "".join([*(f"int64 {name}\n" for name in COUNTERS), "float64 timestamp\n"]).encode()
+
+
+def _type(feature: _Feature) -> str:
+    words = re.findall(r"[A-Za-z0-9]+", feature.name)
+    return "lerobot/msg/" + ("".join(word[0].upper() + word[1:] for word in words) or "Feature")
+
+
+def field_names(names: object, width: int) -> tuple[str, ...]:
+    """Return a field for each of a feature's `width` values, made from its `names`.
+
+    These are a list, or lists by the name of an axis (`{"motors": [...]}`).
+    """
+    if isinstance(names, dict):
+        lists = [value if isinstance(value, list) else [key] for key, value in names.items()]
+        names = [name for some in lists for name in some]
+    if not isinstance(names, list) or len(names) != width:
+        names = [""] * width
+    fields = list[str]()
+    for at, name in enumerate(names):
+        field = re.sub(r"[^a-z0-9]+", "_", str(name).lower()).strip("_")
+        field = field if field[:1].isalpha() else f"value_{field or at}"
+        fields.append(field if field not in fields else f"{field}_{at}")
+    return tuple(fields)
+
+
+def stamps_of(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[int, str] | None]:
+    """Return a log time for each frame (N,), and the first frame that is out of order, and why.
+
+    Within an episode time goes on as its timestamps do; each begins GAP_S after the last ended. So
+    does what follows a frame that is out of order.
+    """
+    if not len(episode):
+        return np.zeros(0, np.int64), None
+    ahead, later = np.diff(episode), np.diff(seconds) > 0
+    wrong = np.flatnonzero((ahead < 0) | ((ahead == 0) & ~later))
+    first = np.concatenate([[0], np.flatnonzero((ahead != 0) | ~later) + 1])
+    run = np.repeat(np.arange(len(first)), np.diff(first, append=len(episode)))
+    within_ns = np.rint((seconds - seconds[first][run]) * 1e9).astype(np.int64)
+    last_ns = within_ns[np.append(first[1:], len(episode)) - 1]
+    begin_ns = np.cumsum(np.append(0, last_ns[:-1]) + GAP_S * 10**9)
+    problem = None
+    if len(wrong):
+        at = int(wrong[0]) + 1
+        problem = (
+            at,
+            (
+                f"is of episode {episode[at]:,}, after episode {episode[at - 1]:,}"
+                if episode[at] != episode[at - 1]
+                else f"of episode {episode[at]:,} is not later than the one before it"
+            ),
+        )
+    return begin_ns[run] + within_ns, problem
+
+
+def rows_of(column: pa.Array, width: int) -> tuple[Bools, NDArray[np.float64]]:
+    """Return which of N rows have `width` values, and those values, (M, width); null is NaN."""
+    good = np.ones(len(column), np.bool_)
+    if hasattr(column.type, "value_type"):
+        good = np.asarray(pc.fill_null(pc.equal(pc.list_value_length(column), width), False))
+        column = column.filter(pa.array(good)).flatten()
+    values = column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+    return good, values.reshape(-1, width)
+
+
+def cdr_batch(values: NDArray[Any], stamp_ns: Ints) -> MessageBatch:
+    """Serialise rows (N, k) of eight-byte numbers, a message each, all of one length."""
+    size = len(CDR) + 8 * values.shape[1]
+    messages = np.empty((len(values), size), np.uint8)
+    messages[:, : len(CDR)] = np.frombuffer(CDR, np.uint8)
+    messages[:, len(CDR) :] = np.ascontiguousarray(values).view(np.uint8)
+    start = np.arange(len(values), dtype=np.int64) * size
+    return MessageBatch(messages.reshape(-1), start, start + size, stamp_ns, stamp_ns)
+
+
+def image_cdr(picture: bytes, stamp_ns: int) -> bytes:
+    """Serialise a picture as sensor_msgs/msg/CompressedImage, its format by its first bytes."""
+    form = b"png\0" if picture.startswith(b"\x89PNG") else b"jpeg\0\0\0\0"
+    head = struct.pack("<iIIII", *divmod(stamp_ns, 10**9), 1, 0, len(form.rstrip(b"\0")) + 1)
+    return CDR + head + form + struct.pack("<I", len(picture)) + picture
