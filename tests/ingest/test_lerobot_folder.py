@@ -13,12 +13,12 @@ import pytest
 from support.cameras import file_of, picture
 
 from restock.cli import main
+from restock.cli.data.watch import incomplete
 from restock.errors import RecordingError
 from restock.ingest.containers.lerobot_folder import field_names
 from restock.ingest.containers.open_recording import open_recording, recordings_in
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.steps.input_columns import reckon
-from restock.cli.data.watch import incomplete
 from restock.replay.store.store import Store
 
 NAMES = ["arm_gripper.pos", "x.vel", "y.vel", "theta.vel"]  # of a LeKiwi, with one joint
@@ -316,7 +316,7 @@ def test_dead_reckoning_follows_the_arc():
     rates[0, 50] = np.nan
     broken = reckon(time_ns, rates, 0.5)
     assert np.flatnonzero(np.isnan(broken.x_m)).tolist() == [50]
-    sideways = reckon(time_ns, np.zeros((3, 101)) + [[0.0], [0.3], [0.0]], 0.5)
+    sideways = reckon(time_ns, np.full((101, 3), [0.0, 0.3, 0.0]).T, 0.5)
     assert sideways.y_m[-1] == pytest.approx(0.6)
     apart = reckon(np.array([0, 10**9]), np.ones((3, 2)), 0.5)
     assert apart.x_m.tolist() == [0.0, 0.0]  # nobody knows what happened in between
