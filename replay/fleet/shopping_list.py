@@ -19,6 +19,7 @@ import pyarrow as pa
 from restock.arrays import F64
 from restock.errors import figure, plural
 from restock.replay.fleet.gaps import Gap, Unit, Yields, find_gaps
+from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.plan.source_plan import (
     Forecast,
@@ -26,6 +27,7 @@ from restock.replay.plan.source_plan import (
     missions_to_see_one,
     probability_to_close,
 )
+from restock.replay.store.audit import load_thresholds
 from restock.replay.store.store import Store
 
 # Of `FROM gaps(name)`, with their types.
@@ -398,9 +400,6 @@ def install_gaps(store: Store) -> None:
 
 
 def _list_of(own: Store, name: str) -> ShoppingList:
-    from restock.replay.mixture.mixture import load_mixture
-    from restock.replay.store.audit import load_thresholds
-
     yields, gaps = find_gaps(
         own,
         load_mixture(name),

@@ -21,9 +21,9 @@ from restock.arrays import F64
 from restock.errors import StoreError, expect
 from restock.ingest.task.task import STORED_SIGNALS
 from restock.process import interrupts_raised
-from restock.replay.store.query import values
+from restock.replay.store.query import rows_of
 from restock.replay.store.store import Store
-from restock.stats import NOT_KNOWN, ConfidenceInterval
+from restock.stats import CONFIDENCE, NOT_KNOWN, TAILS, ConfidenceInterval
 
 MIN_EPISODES = 5  # of each sample: fewer say nothing of its spread
 _RESAMPLES_AT_ONCE = 50
@@ -62,9 +62,7 @@ def shift(first: NDArray[Any], second: NDArray[Any]) -> Shift:
     )
 
 
-def standardised_difference(
-    first: F64, second: F64, confidence: float = 0.95
-) -> ConfidenceInterval:
+def standardised_difference(first: F64, second: F64) -> ConfidenceInterval:
     """Return (mean(second) - mean(first)) / pooled spread, of two values each; 0 if all agree."""
     n, m = len(first), len(second)
     difference = float(second.mean() - first.mean())
@@ -74,7 +72,7 @@ def standardised_difference(
         return ConfidenceInterval(value, value, value)
     value = difference / float(spread)
     error = np.sqrt((n + m) / (n * m) + value**2 / (2 * (n + m)))
-    reach = NormalDist().inv_cdf(0.5 + confidence / 2) * float(error)
+    reach = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2) * float(error)
     return ConfidenceInterval(value, value - reach, value + reach)
 
 
@@ -94,7 +92,7 @@ def false_discovery_adjusted(p_values: Sequence[float]) -> list[float]:
 
 def share_differences(
     first: Any, second: Any, groups: Sequence[slice], *, rng: np.random.Generator,
-    resamples: int = 1000, confidence: float = 0.95,
+    resamples: int = 1000,
 ) -> list[ConfidenceInterval]:  # fmt: skip
     """share in `second` less share in `first` of each value, with intervals over episodes.
 
@@ -120,8 +118,7 @@ def share_differences(
         times = rng.poisson(1.0, (min(_RESAMPLES_AT_ONCE, resamples - start), episodes))
         weights = times.astype(np.float64)
         draws.append(_in_groups(weights @ second, groups) - _in_groups(weights @ first, groups))
-    tail = (1 - confidence) / 2
-    low, high = np.nanquantile(np.concatenate(draws), [tail, 1 - tail], axis=0)
+    low, high = np.nanquantile(np.concatenate(draws), TAILS, axis=0)
     return [
         ConfidenceInterval(float(one), float(least), float(most))
         for one, least, most in zip(at, low, high, strict=True)
@@ -240,7 +237,7 @@ def _same_task(first: Store, second: Store) -> None:
 def _difference(
     connection: duckdb.DuckDBPyConnection, first: Store, second: Store, rng: np.random.Generator
 ) -> StoreDifference:
-    episodes = _rows(connection, "FROM episode_changes")
+    episodes = rows_of(connection, "FROM episode_changes")
     total = connection.sql("SELECT count(*) FROM episode_pairs").fetchall()[0][0]
     pairs, others = connection.sql(
         "SELECT count(*), count(*) FILTER (condition_a IS NOT DISTINCT FROM condition_b AND"
@@ -252,12 +249,12 @@ def _difference(
             "a": _side(connection, first, "a"),
             "b": _side(connection, second, "b"),
         },
-        definitions=_rows(connection, "FROM definition_changes"),
-        recordings=_rows(connection, "FROM recording_changes"),
+        definitions=rows_of(connection, "FROM definition_changes"),
+        recordings=rows_of(connection, "FROM recording_changes"),
         episodes=episodes,
         same_episodes=int(total) - len(episodes),
         rows_paired=int(pairs),
-        labels=_rows(connection, "FROM label_changes"),
+        labels=rows_of(connection, "FROM label_changes"),
         other_labels=int(others),
         shares=_shares(connection, rng),
         signals_of=compared,
@@ -266,7 +263,7 @@ def _difference(
 
 
 def _side(connection: duckdb.DuckDBPyConnection, store: Store, name: str) -> dict[str, Any]:
-    counted = _rows(
+    counted = rows_of(
         connection,
         f"SELECT count(DISTINCT recording_id) AS recordings, count(*) AS episodes,"
         f" coalesce(sum(rows_{name}), 0)::BIGINT AS rows,"
@@ -416,8 +413,3 @@ def _custom(connection: duckdb.DuckDBPyConnection) -> list[str]:
     return [
         name for name in _in_both(connection, list(dict.fromkeys(names))) if kinds[name] in numeric
     ]
-
-
-def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> Rows:
-    relation = connection.sql(query)
-    return [dict(zip(relation.columns, row, strict=True)) for row in values(relation)]

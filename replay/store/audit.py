@@ -34,7 +34,7 @@ from restock.process import interrupts_raised
 from restock.renamed import AUDITS
 from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.parquet_views import damage
-from restock.replay.store.query import found, interruptible
+from restock.replay.store.query import found, interruptible, rows_of
 from restock.toml import read_toml
 
 Severity = Literal["error", "warning", "info"]
@@ -375,8 +375,7 @@ def recommend_capacity(
     install_named(connection, "capacity_curve capacity_needed")
 
     def ask() -> tuple[list[dict[str, Any]], tuple[Any, ...]]:
-        columns, rows = found(connection, "FROM capacity_curve()")
-        curve = [dict(zip(columns, row, strict=True)) for row in rows]
+        curve = rows_of(connection, "FROM capacity_curve()")
         needed = connection.execute(
             "FROM capacity_needed($cells, $episodes)",
             {"cells": cells_share, "episodes": effective_episodes},

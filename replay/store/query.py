@@ -235,6 +235,14 @@ def found(
     return [column[0] for column in columns], connection.fetchall()
 
 
+def rows_of(
+    connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
+) -> list[dict[str, Any]]:
+    """Return the rows of a query by column, as `found` does."""
+    columns, rows = found(connection, text, given)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
 def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
     """Return the rows of a relation; times with a zone as text in UTC."""
     if ZONED not in map(str, relation.types):

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 
+CONFIDENCE = 0.95  # of every interval
+TAILS = [(1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2]  # the quantiles at its ends
 MIN_PAIRS = 3  # from which on `paired_t` says more than the mean
 _WEIGHTS_AT_ONCE = 4_000_000  # in memory
 
@@ -50,7 +52,7 @@ def no_interval_text(why: str | None) -> str:
     return f" (no interval: {why})" if why else ""
 
 
-def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Return the Wilson score interval of a proportion; (0, 1) without trials.
 
     Unlike the normal interval it stays inside [0, 1] and has a width at 0 and n successes.
@@ -59,7 +61,7 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
         raise ValueError(f"successes must be in [0, trials], got {successes} of {trials}")
     if trials == 0:
         return 0.0, 1.0
-    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
     share = successes / trials
     centre = (share + z * z / (2 * trials)) / (1 + z * z / trials)
     half = (z / (1 + z * z / trials)) * math.sqrt(
@@ -101,7 +103,6 @@ def improvement_of_arms(
     *,
     rng: np.random.Generator,
     resamples: int = 2000,
-    confidence: float = 0.95,
 ) -> ConfidenceInterval:
     """Return P(a run of `better` beats one of `worse` on an episode), ties counting half.
 
@@ -119,12 +120,12 @@ def improvement_of_arms(
         return ConfidenceInterval(float(wins.mean()), float("nan"), float("nan"))
     weights = [cluster_counts(n, resamples, rng) / n for n in wins.shape]
     draws = np.einsum("ijk,ri,rj,rk->r", wins, *weights, optimize=True)
-    return ConfidenceInterval(float(wins.mean()), *percentiles(draws, confidence))
+    return ConfidenceInterval(float(wins.mean()), *percentiles(draws))
 
 
-def percentiles(draws: NDArray[Any], confidence: float = 0.95) -> tuple[float, float]:
+def percentiles(draws: NDArray[Any]) -> tuple[float, float]:
     """Return the percentile interval of a statistic's bootstrap draws (R,)."""
-    low, high = np.quantile(draws, _tails(confidence))
+    low, high = np.quantile(draws, TAILS)
     return float(low), float(high)
 
 
@@ -134,7 +135,6 @@ def bootstrap(
     *,
     rng: np.random.Generator,
     resamples: int = 2000,
-    confidence: float = 0.95,
 ) -> tuple[float, float]:
     """Return a stratified bootstrap interval of `statistic` over all values together.
 
@@ -148,7 +148,7 @@ def bootstrap(
     for index in range(resamples):
         sample = [group[rng.integers(len(group), size=len(group))] for group in groups]
         draws[index] = statistic(np.concatenate(sample))
-    return percentiles(draws, confidence)
+    return percentiles(draws)
 
 
 def mean_over_strata(
@@ -156,7 +156,6 @@ def mean_over_strata(
     *,
     rng: np.random.Generator,
     resamples: int = 2000,
-    confidence: float = 0.95,
 ) -> ConfidenceInterval:
     """Return the mean of the strata's means, each (n,) weighted alike whatever its size.
 
@@ -167,11 +166,12 @@ def mean_over_strata(
         for values in strata
     ]
     value = float(np.mean([values.mean() for values in strata]))
-    return ConfidenceInterval(value, *percentiles(np.mean(means, axis=0), confidence))
+    return ConfidenceInterval(value, *percentiles(np.mean(means, axis=0)))
 
 
 def difference_of_arms(
-    first: NDArray[Any], second: NDArray[Any], *, confidence: float = 0.95
+    first: NDArray[Any],
+    second: NDArray[Any],
 ) -> ConfidenceInterval:
     """Return mean(second) - mean(first) of two arms that drove the same episodes.
 
@@ -202,7 +202,7 @@ def difference_of_arms(
     if variance == 0:
         return ConfidenceInterval(value, value, value)
     freedom = sum(part for part, _ in parts) ** 2 / sum(part**2 / df for part, df in parts)
-    half = float(t.ppf(0.5 + confidence / 2, freedom)) * math.sqrt(variance)
+    half = float(t.ppf(0.5 + CONFIDENCE / 2, freedom)) * math.sqrt(variance)
     return ConfidenceInterval(value, value - half, value + half)
 
 
@@ -212,9 +212,7 @@ def _interaction(arm: F64) -> float:
     return float((left**2).sum() / ((arm.shape[0] - 1) * (arm.shape[1] - 1)))
 
 
-def paired_t(
-    differences: NDArray[Any], confidence: float = 0.95
-) -> tuple[ConfidenceInterval, float]:
+def paired_t(differences: NDArray[Any]) -> tuple[ConfidenceInterval, float]:
     """Return the mean of paired differences (n,), its Student's t interval, and p of no difference.
 
     With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below
@@ -227,7 +225,7 @@ def paired_t(
     if len(values) < MIN_PAIRS or nothing_varies(values):
         return ConfidenceInterval(value, float("nan"), float("nan")), float("nan")
     test = ttest_1samp(values, 0.0)
-    low, high = test.confidence_interval(confidence)
+    low, high = test.confidence_interval(CONFIDENCE)
     return ConfidenceInterval(value, float(low), float(high)), float(test.pvalue)
 
 
@@ -267,9 +265,7 @@ def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F
     return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(np.float64)
 
 
-def for_few_clusters(
-    interval: ConfidenceInterval, clusters: int, confidence: float = 0.95
-) -> ConfidenceInterval:
+def for_few_clusters(interval: ConfidenceInterval, clusters: int) -> ConfidenceInterval:
     """Return the percentile interval of a bootstrap over C clusters, widened for small C.
 
     That interval is too narrow for small C: a draw's variance is (C - 1) / C of the true one,
@@ -280,8 +276,8 @@ def for_few_clusters(
 
     if clusters < 2:
         return ConfidenceInterval(interval.value, float("nan"), float("nan"))
-    normal = NormalDist().inv_cdf(0.5 + confidence / 2)
-    factor = float(t.ppf(0.5 + confidence / 2, clusters - 1)) / normal
+    normal = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
+    factor = float(t.ppf(0.5 + CONFIDENCE / 2, clusters - 1)) / normal
     factor *= math.sqrt(clusters / (clusters - 1))
     low, high = (
         interval.value + factor * (end - interval.value) for end in (interval.low, interval.high)
@@ -296,7 +292,6 @@ def clustered_quantiles(
     *,
     rng: np.random.Generator,
     resamples: int = 1000,
-    confidence: float = 0.95,
 ) -> list[ConfidenceInterval]:
     """Return quantiles of values (N,) with clusters (N,), each value counting once.
 
@@ -316,7 +311,7 @@ def clustered_quantiles(
     for start in range(0, resamples, chunk):
         counts = cluster_counts(number, min(chunk, resamples - start), rng)
         draws.append(_quantile_rows(values, counts[:, place], shares))
-    return _intervals(at, np.concatenate(draws), confidence)
+    return _intervals(at, np.concatenate(draws))
 
 
 def clustered_ratio(
@@ -326,7 +321,6 @@ def clustered_ratio(
     *,
     rng: np.random.Generator,
     resamples: int = 1000,
-    confidence: float = 0.95,
 ) -> ConfidenceInterval:
     """Return sum(above) / sum(below) of (N,) each; a mean if `below` is all ones.
 
@@ -345,7 +339,7 @@ def clustered_ratio(
     with np.errstate(divide="ignore", invalid="ignore"):
         drawn = (counts @ top) / (counts @ bottom)
     drawn = drawn[np.isfinite(drawn)]
-    return _intervals(at, drawn[:, None], confidence)[0] if len(drawn) else NOT_KNOWN
+    return _intervals(at, drawn[:, None])[0] if len(drawn) else NOT_KNOWN
 
 
 def _quantile_rows(values: F64, weights: F64, shares: Sequence[float]) -> F64:
@@ -358,15 +352,10 @@ def _quantile_rows(values: F64, weights: F64, shares: Sequence[float]) -> F64:
     return rows
 
 
-def _intervals(at: F64, draws: F64, confidence: float) -> list[ConfidenceInterval]:
+def _intervals(at: F64, draws: F64) -> list[ConfidenceInterval]:
     """Return the intervals of statistics (Q,) with their draws (R, Q)."""
-    low, high = np.quantile(draws, _tails(confidence), axis=0)
+    low, high = np.quantile(draws, TAILS, axis=0)
     return [
         ConfidenceInterval(float(value), float(least), float(most))
         for value, least, most in zip(at, low, high, strict=True)
     ]
-
-
-def _tails(confidence: float) -> list[float]:
-    tail = (1 - confidence) / 2
-    return [tail, 1 - tail]

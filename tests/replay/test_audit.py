@@ -331,6 +331,8 @@ def test_findings_do_not_depend_on_what_is_held_in_memory(tmp_path, monkeypatch)
             kept[rows, summarised_rows] = sorted(tables)
             look("")
             assert not tables
+            counted = store.sql("SELECT count(reward) FROM transitions").fetchall()
+            assert counted == [(3 * len(recording_transitions(1)),)]  # from the files again
         return [(one.audit.name, one.status, one.rows) for one in found]
 
     nothing = findings(0, 0)

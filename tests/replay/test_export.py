@@ -8,9 +8,6 @@ CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON name
 import importlib.util
 import json
 import re
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,7 +35,6 @@ from restock.replay.export.trajectory import Counts, Trajectory, trajectories
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 
-TESTS = Path(__file__).parent
 SLIP = "FROM held_conditions WHERE condition = 'wheel_slip'"
 
 
@@ -66,25 +62,6 @@ def n_step_panel(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
         '[evaluation_split]\nby = "none"\n'
     )
     return panel_of(store, mixture, out)
-
-
-def test_what_a_killed_export_left_goes_away_with_the_next(tmp_path, store_path):
-    code = (
-        "import os, signal, sys\n"
-        "from restock.replay.export import dataset, one_file\n"
-        "def killed(selection, trajectories, out, counts):\n"
-        "    out.touch()\n"
-        "    os.kill(os.getpid(), signal.SIGKILL)\n"
-        "one_file.write_parquet = killed\n"
-        "dataset.export_dataset(*sys.argv[1:])\n"
-    )
-    out = tmp_path / "a.parquet"
-    done = subprocess.run([sys.executable, "-c", code, str(store_path), "parquet", str(out)])
-    assert done.returncode == -signal.SIGKILL
-    assert len(list(tmp_path.iterdir())) == 1
-    assert not out.exists()
-    export_dataset(store_path, "parquet", out)
-    assert [path.name for path in tmp_path.iterdir()] == [out.name]
 
 
 def test_whose_drive_it_was_goes_along(tmp_path):

@@ -7,7 +7,6 @@ from support.long import one_in
 from support.stores import recording_transitions, write_store
 
 from restock.errors import QueryError
-from restock.replay.store.audit import load_audits, load_thresholds, run_audits
 from restock.replay.store.definitions import MACROS, VIEWS, definitions, install_named
 from restock.replay.store.query import query
 from restock.replay.store.store import Store
@@ -65,34 +64,6 @@ def test_what_a_query_makes_itself_is_left_as_it_is(tmp_path):
         store.sql("CREATE OR REPLACE VIEW drops AS SELECT 'mine' AS reason; FROM drops")
         assert store.sql("SELECT reason FROM drops").fetchall() == [("mine",)]
         assert query(store.connection, "FROM drops", where="").fetchall() == [("mine",)]
-
-
-def test_audits_leave_views_as_they_found_them(tmp_path):
-    """Few rows are held in memory while they run."""
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
-    names = "SELECT table_name FROM duckdb_tables()"
-    plan = "EXPLAIN SELECT sum(reward) FROM transitions"
-    with Store(path) as store:
-        audits = load_audits()
-        during = []
-
-        def done(_: str) -> None:
-            during.append(str(store.bare.execute(plan).fetchall()))
-
-        connection = store.connection
-        first = run_audits(connection, audits, load_thresholds(), done=done)
-        assert connection.execute("SELECT count(*) FROM episodes").fetchall() != [(0,)]
-        assert not any("PARQUET" in one for one in during)
-        assert store.bare.execute(names).fetchall() == []
-        after = store.connection.execute(plan).fetchall()
-        assert "PARQUET" in str(after)
-        assert store.sql("SELECT count(reward) FROM transitions").fetchall() == [
-            (len(recording_transitions(1)),)
-        ]
-        again = run_audits(store.bare, audits, load_thresholds())
-        assert [(one.audit.name, one.rows) for one in first] == [
-            (one.audit.name, one.rows) for one in again
-        ]
 
 
 @pytest.mark.long

@@ -158,18 +158,6 @@ def test_small_stretches_and_batches_pack_the_same_bytes(tmp_path, monkeypatch, 
     assert held[0].to_pylist() == held[1].to_pylist()
 
 
-def test_how_the_rows_lie_does_not_change_the_panel(transitions, tmp_path):
-    mixture = parse_mixture(GOLDEN)
-    shuffled = transitions.take(pa.array(np.random.default_rng(0).permutation(len(transitions))))
-    first, second = (
-        build_panel(table, mixture, tmp_path / name, task=TASK, conditions=CONDITIONS)
-        for name, table in (("a", transitions), ("b", shuffled))
-    )
-    assert first.id == second.id
-    assert first.header.files[ROWS] == second.header.files[ROWS]
-    assert first.meta.to_pylist() == second.meta.to_pylist()
-
-
 def test_ids_that_no_ingest_gave_find_their_rows_too(transitions, tmp_path):
     # Ids of three recordings mixed: the runs of rising ids overlap.
     ids = np.random.default_rng(1).permutation(len(transitions))

@@ -145,7 +145,6 @@ WAYS: dict[str, Way] = {
     "a library's buffer without TD errors": by_library(False),
 }
 NOT_TOLD = {"PanelDataset", "PanelDataset, 2 workers", "a library's buffer without TD errors"}
-NO_STEPS = {"PanelDataset", "PanelDataset, 2 workers", "a library's buffer"}
 
 
 @pytest.fixture(scope="module")

@@ -241,7 +241,7 @@ def test_after_a_failed_run_none_is_begun(tmp_path, capsys, monkeypatch, interru
             assert ended.wait(30)
 
     said: list[str] = []
-    monkeypatch.setattr("restock.cli.output.say", said.append)
+    monkeypatch.setattr("restock.cli.learning.study.say", said.append)
     monkeypatch.setattr(study_run, "run_job", job)
     monkeypatch.setattr(study_run, "interrupt_running", ended.set)
     (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 1]"))

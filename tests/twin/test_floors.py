@@ -1,7 +1,5 @@
 """Generated floors, floors from TOML and from occupancy maps, and several of them in one twin."""
 
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
@@ -141,18 +139,6 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_image(tmp_path / "a.pgm")[0], [[0, 1, 1], [0, 0, 1]])
     (tmp_path / "b.pgm").write_bytes(b"P5\n2 1\n65535\n\x00\x00\xff\xff")
     np.testing.assert_array_equal(read_image(tmp_path / "b.pgm")[0], [[0, 1]])
-
-
-def png_header(width: int, height: int) -> bytes:
-    """Return a PNG header that gives a size, without any data."""
-
-    def chunk(kind: bytes, data: bytes = b"") -> bytes:
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    size = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT") + chunk(b"IEND")
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.missions import KINDS
+from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS
 from restock.train.twin.physics.episode import EpisodeSpec, refuse_unfit, unfit_kinds
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,
@@ -459,7 +459,6 @@ def drive_evaluation(
 def evaluation_env(plan: EvaluationPlan) -> WarehouseVectorEnv:
     """Make the twin in which a plan's episodes are driven."""
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
-    from restock.train.twin.missions import DEFAULT_CONDITIONS
 
     profile = profile_of_run(plan.run)
     return WarehouseVectorEnv(

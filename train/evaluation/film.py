@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -316,8 +317,6 @@ def _beside(
 
 def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
     """Encode an endless WebP of at most MAX_FRAMES frames; the last one stays for a second."""
-    from io import BytesIO
-
     picked = np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))
     images = [Image.fromarray(frames[i]) for i in picked.tolist()]
     durations = [FRAME_MS] * (len(images) - 1) + [1000]

@@ -183,7 +183,6 @@ def estimate(
     horizon: int | None = None,
     rng: np.random.Generator,
     resamples: int = 2000,
-    confidence: float = 0.95,
 ) -> list[OpeEstimate]:
     """Return every estimate, with a percentile bootstrap interval over whole episodes.
 
@@ -206,7 +205,7 @@ def estimate(
         if name == FQE or len(logged) < 2:
             answers.append(OpeEstimate(name, value))
             continue
-        interval = percentiles(estimator(of, counts), confidence)
+        interval = percentiles(estimator(of, counts))
         answers.append(OpeEstimate(name, value, *interval))
     return answers
 
@@ -278,7 +277,16 @@ class OpePlan:
 
 
 def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
-    """Read and check the run and the logs of an evaluation; raise as reading these does."""
+    """Read and check the run and the logs of an evaluation.
+
+    Args:
+        path: the run.
+        logs: a store, or a panel whose held-out episodes count; default the run's own panel.
+
+    Raises:
+        RunError: no such run, no policy yet, or no episode that it did not learn from.
+        StoreError, PanelError: no such logs.
+    """
     run = Run.open(path)
     trained = parse_config(run.document["config"], where=str(path / "config.json"))
     agent = load_agent(run)
@@ -287,33 +295,15 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
     return OpePlan(path, agent, trained, task, dataset, config)
 
 
-def evaluate_run_off_policy(
-    path: Path | str,
-    logs: str | None,
-    config: OpeConfig = OpeConfig(),
-    progress: Callable[[int], None] | None = None,
-    *,
-    write: bool = True,
+def evaluate_planned(
+    plan: OpePlan, progress: Callable[[int], None] | None = None, *, write: bool = True
 ) -> OpeResult:
     """Evaluate the policy of a run, and write `RUN/eval/off_policy.parquet`.
 
     Args:
-        path: the run.
-        logs: a store, or a panel whose held-out episodes count; default the run's own panel.
         progress: called with 1 before every update of its models.
         write: whether to write the file.
-
-    Raises:
-        RunError: no such run, no policy yet, or no episode that it did not learn from.
-        StoreError, PanelError: no such logs.
     """
-    return evaluate_planned(plan_off_policy(Path(path), logs, config), progress, write=write)
-
-
-def evaluate_planned(
-    plan: OpePlan, progress: Callable[[int], None] | None = None, *, write: bool = True
-) -> OpeResult:
-    """Evaluate as `evaluate_run_off_policy` does."""
     with torch_threads(plan.trained.threads):
         rows = evaluate_off_policy(
             plan.policy.network,

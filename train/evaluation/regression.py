@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from restock.errors import RunError, counted, quoted
@@ -138,8 +139,6 @@ def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict
 
 def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
     """Read what `restock eval` wrote of the run's own policy, or of another; None: none drove."""
-    import pyarrow.compute as pc  # slow to import
-
     table, _ = shown_evaluation(run.path)
     driven = table.filter(pc.equal(table["policy"], policy))
     return driven if len(driven) else None

@@ -20,6 +20,7 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Any, Literal
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 
@@ -364,8 +365,6 @@ class Arm:
 
     def fed(self) -> pa.Table:
         """Return draws by run, cell, tenth and episode."""
-        import duckdb
-
         query = files("restock.train.judge").joinpath("fed_mix.sql").read_text(encoding="utf-8")
         parts = []
         with duckdb.connect() as connection:

@@ -21,11 +21,13 @@ from typing import Any
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from restock.arrays import F64
 from restock.errors import RestockError, RunError, counted, quoted
 from restock.replay.fleet.panel_difference import diff_panels
 from restock.replay.panel.panel import Panel
+from restock.replay.store.query import rows_of
 from restock.stats import (
     ConfidenceInterval,
     difference_of_arms,
@@ -295,8 +297,6 @@ def _episodes(runs: Sequence[Run]) -> tuple[str, list[pa.Table]]:
 
 def last_evaluation(run: Run) -> pa.Table:
     """Return the last periodic evaluation in training; raise RunError if there was none."""
-    import pyarrow.compute as pc  # slow to import
-
     table = run.table("evaluations")
     if not len(table):
         raise RunError(
@@ -379,7 +379,7 @@ def _fed(a: Run, b: Run) -> Rows:
     with duckdb.connect() as connection:
         for side, run in (("a", a), ("b", b)):
             connection.register(f"fed_{side}", run.table("sampled_episodes"))
-        return _rows(connection, query.read_text(encoding="utf-8"))
+        return rows_of(connection, query.read_text(encoding="utf-8"))
 
 
 def _ages(a: Run, b: Run) -> Rows:
@@ -393,11 +393,6 @@ def _ages(a: Run, b: Run) -> Rows:
             line |= {f"{name}_{side}": row[name] for name in ("p50", "p90")}
     empty = dict.fromkeys(("p50_a", "p50_b", "p90_a", "p90_b"))
     return [{**empty, **line} for line in lines.values()]
-
-
-def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> Rows:
-    relation = connection.sql(query)
-    return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
 
 
 def _evaluations(a: Run, b: Run, rng: np.random.Generator) -> tuple[str | None, Rows, str | None]:

@@ -34,8 +34,8 @@ from restock.train.dqn.config import (
 from restock.train.judge.before_training import RowDiagnosis, diagnose_before_training
 from restock.train.judge.comparability import refuse_dependent
 from restock.train.judge.windows import (
+    LIMITS,
     Cause,
-    DiagnosisLimits,
     Window,
     action_symptoms,
     median_window,
@@ -68,10 +68,7 @@ class Diagnosis:
     experiment: str  # what would confirm it
 
 
-def diagnose(
-    runs: Sequence[Run],
-    limits: DiagnosisLimits = DiagnosisLimits(),  # noqa: B008  (frozen)
-) -> Diagnosis:
+def diagnose(runs: Sequence[Run]) -> Diagnosis:
     """Diagnose runs of one method, which differ in their seed.
 
     Raises:
@@ -81,7 +78,7 @@ def diagnose(
     refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]
     figures = [_figures(*pair) for pair in zip(runs, windows, strict=True)]
-    verdicts = [_verdict(*its, limits) for its in zip(runs, windows, figures, strict=True)]
+    verdicts = [_verdict(*its) for its in zip(runs, windows, figures, strict=True)]
     causes = [cause for cause, _ in verdicts]
     ((cause, votes), *_) = Counter(causes).most_common()
     advice = "; ".join(dict.fromkeys(advice for _, advice in verdicts if advice))
@@ -94,8 +91,8 @@ def diagnose(
         causes,
         figures,
         windows,
-        _evidence(shown[0], limits),
-        _experiment(cause, shown, limits, target_rule(runs[0]), advice),
+        _evidence(shown[0]),
+        _experiment(cause, shown, target_rule(runs[0]), advice),
     )
 
 
@@ -129,11 +126,9 @@ def _figures(run: Run, windows: Sequence[Window]) -> Window:
     return replace(median_window(windows[-WINDOWS:]), actions=actions)
 
 
-def _verdict(
-    run: Run, windows: Sequence[Window], figures: Window, limits: DiagnosisLimits
-) -> tuple[Cause, str]:
+def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Cause, str]:
     """Return the verdict on the last windows, and what to do if it is UNDETERMINED."""
-    if windows[-1].diverged(limits) and figures.diverged(limits):
+    if windows[-1].diverged() and figures.diverged():
         return "DIVERGENCE", ""
     last = windows[-WINDOWS:]
     if len(last) < WINDOWS:
@@ -141,15 +136,15 @@ def _verdict(
             "train longer, or evaluate more often (evaluation.every_env_steps): "
             f"{counted(len(last), 'evaluation')}, and the verdict needs {WINDOWS}"
         )
-    lagging = any(not window.lag < limits.lag for window in last)
+    lagging = any(not window.lag < LIMITS.lag for window in last)
     if lagging and (young := _too_young(last, target_rule(run))):
         return "UNDETERMINED", f"train longer: {young}"
-    if len({bool(window.target(limits)) for window in last}) > 1:
+    if len({bool(window.target()) for window in last}) > 1:
         return "UNDETERMINED", (
             f"train longer: the last {WINDOWS} evaluations do not agree on whether the target is "
             "at fault"
         )
-    cause = figures.cause(limits)
+    cause = figures.cause()
     many = (
         "correct what the evidence names, and train again: more than half of the conditions are in "
         "doubt, which may be their rows or the critic"
@@ -181,7 +176,7 @@ def _explained(explained: float | None) -> str:
     return "" if explained is None else f" {explained:.0%} of the targets' variance explained,"
 
 
-def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
+def _evidence(window: Window) -> list[str]:
     """Describe a window in sentences."""
     most = f"of at most {window.q_bound:.3g}"
     if isinf(window.q_bound):
@@ -191,11 +186,11 @@ def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
         f" L {window.lag:.3f}, S {window.clock:.2f},{_explained(window.explained)}"
         f" max |Q| {window.q_abs_max:.3g} {most}"
     ]
-    lines += [f"target: {reason}" for reason in window.target(limits)]
-    for condition, reasons in window.bad(limits).items():
+    lines += [f"target: {reason}" for reason in window.target()]
+    for condition, reasons in window.bad().items():
         lines += [f"{condition}: {reason}" for reason in reasons]
-    lacking = window.lacking(limits)
-    for symptom in window.unlogged(limits):
+    lacking = window.lacking()
+    for symptom in window.unlogged():
         alone = "" if symptom in lacking else f"; {ALONE}"
         lines.append(f"{symptom.condition}: {symptom.reason}{alone}")
     return lines
@@ -204,16 +199,15 @@ def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
 def _experiment(
     cause: Cause,
     windows: Sequence[Window],
-    limits: DiagnosisLimits,
     rule: TargetRule,
     advice: str,  # where it is UNDETERMINED
 ) -> str:
-    named = dict.fromkeys(name for window in windows for name in window.bad(limits))
+    named = dict.fromkeys(name for window in windows for name in window.bad())
     which = ", ".join(named) or "the condition with the largest gap"
     lacking = {
         f"{lack.action!r} in {lack.condition}": None
         for window in windows
-        for lack in window.lacking(limits)
+        for lack in window.lacking()
     }
     return {
         "HEALTHY": "none needed: no figure is past its limit",

@@ -26,6 +26,7 @@ from importlib.resources import files
 from statistics import median
 from typing import Any, Literal
 
+import duckdb
 import numpy as np
 
 from restock.errors import RunError
@@ -63,8 +64,6 @@ def action_symptoms(run: Run, since: int) -> list[ActionSymptom]:
 
     Empty for a run without logs, of another library, or of a Restock that kept no such table.
     """
-    import duckdb
-
     query = files("restock.train.judge").joinpath("action_coverage.sql").read_text("utf-8")
     with duckdb.connect() as connection:
         connection.register("run_actions", run.table("actions"))
@@ -112,6 +111,9 @@ class DiagnosisLimits:
     fresh: float = 0.02  # … and of its fresh rows drawn: nor does driving supply it
 
 
+LIMITS = DiagnosisLimits()
+
+
 @dataclass(frozen=True)
 class Symptom:
     """One condition in one window, or over several."""
@@ -149,50 +151,50 @@ class Window:
         """Return G_k divided by the median G: how much worse than the others the condition is."""
         return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
 
-    def bad(self, limits: DiagnosisLimits) -> dict[str, list[str]]:
+    def bad(self) -> dict[str, list[str]]:
         """Return the conditions whose replay is in doubt, with reasons in words."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
         least = min(follows, default=0.0)
         doubts = {}
         for symptom in self.symptoms:
-            reasons = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
+            reasons = [*self._supply(symptom), *self._rows(symptom, least)]
             relative = self.relative(symptom)
             if relative is not None and symptom.gap is not None:
-                if symptom.gap >= limits.gap and relative >= limits.relative:
+                if symptom.gap >= LIMITS.gap and relative >= LIMITS.relative:
                     reasons.append(
                         f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
                         f" {relative:.1f} times the median condition's gap"
                     )
-            elif not symptom.replay_share and (symptom.outlier or 0.0) >= limits.gap:
+            elif not symptom.replay_share and (symptom.outlier or 0.0) >= LIMITS.gap:
                 reasons.append(
                     f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and "
                     "the condition is not in replay"
                 )
-            if reasons and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
+            if reasons and symptom.quota_met is not None and symptom.quota_met < LIMITS.quota_met:
                 reasons.append(f"got {symptom.quota_met:.0%} of its quota")
             if reasons:
                 doubts[symptom.condition] = reasons
         return doubts
 
-    def _supply(self, symptom: Symptom, limits: DiagnosisLimits) -> list[str]:
+    def _supply(self, symptom: Symptom) -> list[str]:
         if symptom.supply is None:  # a run from before it was kept
             return [] if symptom.replay_share else ["is not in replay"]
-        if symptom.supply >= limits.supply:
+        if symptom.supply >= LIMITS.supply:
             return []
         share, observed = symptom.replay_share, symptom.met_share
         return [f"is {share:.2%} of replay and {observed:.1%} of the steps when driving"]
 
-    def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
+    def _rows(self, symptom: Symptom, least: float) -> list[str]:
         reasons = []
-        if symptom.agreement is not None and symptom.agreement < limits.agreement:
+        if symptom.agreement is not None and symptom.agreement < LIMITS.agreement:
             reasons.append(
                 f"{symptom.agreement:.0%} of its logged rows look like it: check the label"
             )
         rest = symptom.unexplained
         if (
             rest is not None
-            and rest >= limits.unexplained
-            and rest >= limits.unexplained_relative * least
+            and rest >= LIMITS.unexplained
+            and rest >= LIMITS.unexplained_relative * least
         ):
             reasons.append(
                 f"its logged rows leave {rest:.0%} of the variance of their next observations "
@@ -201,65 +203,65 @@ class Window:
             )
         return reasons
 
-    def unlogged(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+    def unlogged(self) -> list[ActionSymptom]:
         """Return actions that the policy wants in conditions whose logged rows hardly have them."""
         return [
             symptom
             for symptom in self.actions
             if symptom.condition_rows >= _MIN_LOGGED
-            and symptom.wanted_low >= limits.wanted
-            and symptom.logs_share <= limits.logged
+            and symptom.wanted_low >= LIMITS.wanted
+            and symptom.logs_share <= LIMITS.logged
         ]
 
-    def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+    def lacking(self) -> list[ActionSymptom]:
         """Return those of `unlogged` that fresh rows do not supply either."""
-        unlogged = self.unlogged(limits)
-        return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= limits.fresh]
+        unlogged = self.unlogged()
+        return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= LIMITS.fresh]
 
-    def target(self, limits: DiagnosisLimits) -> list[str]:
+    def target(self) -> list[str]:
         """Return in words which figures put the target in doubt; empty if none does.
 
         A value that is not a number is past every limit.
         """
         reasons = []
-        if self.lag < limits.no_lag:
+        if self.lag < LIMITS.no_lag:
             reasons.append(
-                f"L is {self.lag:.2g} (at least {limits.no_lag:g} is expected): there is no target"
+                f"L is {self.lag:.2g} (at least {LIMITS.no_lag:g} is expected): there is no target"
                 " network to speak of"
             )
-        elif not self.lag < limits.lag:
-            reasons.append(f"L is {self.lag:.3g} (limit {limits.lag:g}): the target is far behind")
-        if self.clock >= limits.clock:
-            reasons.append(f"S is {self.clock:.3g} (limit {limits.clock:g}): the networks disagree")
-        if self.gap_median >= limits.gap_everywhere:
+        elif not self.lag < LIMITS.lag:
+            reasons.append(f"L is {self.lag:.3g} (limit {LIMITS.lag:g}): the target is far behind")
+        if self.clock >= LIMITS.clock:
+            reasons.append(f"S is {self.clock:.3g} (limit {LIMITS.clock:g}): the networks disagree")
+        if self.gap_median >= LIMITS.gap_everywhere:
             reasons.append(
-                f"the median G is {self.gap_median:.3g} (limit {limits.gap_everywhere:g}):"
+                f"the median G is {self.gap_median:.3g} (limit {LIMITS.gap_everywhere:g}):"
                 " everything is worse held out"
             )
         return reasons
 
-    def diverged(self, limits: DiagnosisLimits) -> bool:
+    def diverged(self) -> bool:
         """Return whether values exceed the sum of rewards, or explain nothing of their targets."""
         if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
             return True
         # A frozen target can be far from what it is learnt from; then the target is at fault.
-        if self.explained is None or self.target(limits):
+        if self.explained is None or self.target():
             return False
-        return self.explained < limits.explained
+        return self.explained < LIMITS.explained
 
-    def cause(self, limits: DiagnosisLimits) -> Cause:
-        """Return the cause by these limits."""
-        if self.diverged(limits):
+    def cause(self) -> Cause:
+        """Return the cause by these figures."""
+        if self.diverged():
             return "DIVERGENCE"
-        bad = self.bad(limits)
+        bad = self.bad()
         buffer = 0 < len(bad) <= len(self.symptoms) / 2
-        if self.target(limits):
+        if self.target():
             return "BOTH" if buffer else "TARGET"
         if buffer:
             return "BUFFER"
         if bad:
             return "UNDETERMINED"
-        return "ACTION_COVERAGE" if self.lacking(limits) else "HEALTHY"
+        return "ACTION_COVERAGE" if self.lacking() else "HEALTHY"
 
 
 def median_window(windows: Sequence[Window]) -> Window:
@@ -290,8 +292,6 @@ def median_window(windows: Sequence[Window]) -> Window:
 
 def windows_of(run: Run) -> list[Window]:
     """Return the windows of a run, one an evaluation that had updates before it."""
-    import duckdb
-
     query = files("restock.train.judge").joinpath("diagnose.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
         names = ("evaluation_buffer", "conditions", "strata", "progress")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import torch
 
 from restock.errors import ConfigError, RestockError
 from restock.files import write_text
@@ -196,8 +197,6 @@ def train_library(arm: LibraryArm) -> None:
 
 def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
     """Copy a library's linear layers, in order, into Restock's network, which computes the same."""
-    import torch
-
     make = make_algorithm(config.loss).make_network
     network = make(config.network, task.observation_size, len(task.actions))
     layers = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]

@@ -22,7 +22,7 @@ from restock.train.dqn.config import (
     parse_config,
     refuse_untaught,
 )
-from restock.train.evaluation.eval_run import FIRST_SEED, wrong_seed
+from restock.train.evaluation.eval_run import FIRST_SEED, refuse_unknown, wrong_seed
 from restock.train.judge.comparability import Treatment
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import unknown_measure
@@ -209,8 +209,6 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
 
 def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
     """Raise ConfigError if a run could not be evaluated after training."""
-    from restock.train.evaluation.eval_run import refuse_unknown
-
     names = evaluation.perturbations
     refuse_unknown("perturbations", names, where=f"{where}: evaluation.perturbations")
 

@@ -19,7 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.cli.output import plain
 from restock.errors import ConfigError, QueryError, RestockError, RunError
+from restock.process import expect_installed
 
 if TYPE_CHECKING:
     import duckdb
@@ -47,8 +49,6 @@ class McpCommand:
 
     def run(self) -> None:
         """Serve until the client closes stdin."""
-        from restock.process import expect_installed
-
         expect_installed("restock-mcp", "mcp")
         from mcp.server.mcpserver import MCPServer
         from mcp.server.mcpserver.exceptions import ToolError
@@ -101,7 +101,6 @@ class _Questions:
         `FROM columns` lists every table and column with its meaning. Topics of recordings are
         tables under their names, in double quotes: `SELECT log_time_ns FROM "/odom"`.
         """
-        from restock.cli.output import plain
         from restock.replay.places import open_place
         from restock.replay.store.query import fetch
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.errors import quoted
+from restock.cli.output import print_json, say
+from restock.errors import ConfigError, quoted
 
 if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile
@@ -42,7 +43,6 @@ class NodeCommand:
     ingest recordings of drives with this policy."""
 
     def run(self) -> int:
-        from restock.errors import ConfigError
         from restock.ingest.live.policy_file import PolicyFile
 
         if self.on is not None:
@@ -62,7 +62,6 @@ class NodeCommand:
         return run_node(ros, self.policy, drive=self.drive, activate=self.activate)
 
     def _play(self, recording: Path) -> int:
-        from restock.cli.output import print_json
         from restock.ingest.live.pilot import Pilot, play, summary
         from restock.ingest.live.policy_file import PolicyFile
         from restock.ingest.task.robot import Limits
@@ -74,8 +73,6 @@ class NodeCommand:
         return 0
 
     def _write(self, profile: Profile, out: Path) -> int:
-        from restock.cli.output import say
-        from restock.errors import ConfigError
         from restock.files import expect_file_place, write_bytes
         from restock.ingest.live.node import with_node_topics
         from restock.ingest.profile.profile import profile_toml

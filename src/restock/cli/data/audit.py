@@ -12,6 +12,8 @@ from typing import Annotated, Any, NamedTuple
 import duckdb
 import tyro
 
+from restock.cli import output
+from restock.cli.command_line import refuse
 from restock.errors import ConfigError, ExitCode, RestockError, RunError, quoted
 from restock.files import expect_file_place, read_json, write_text
 from restock.ingest.store.location import Location
@@ -34,8 +36,9 @@ from restock.replay.store.audit import (
     run_audits,
 )
 from restock.replay.store.definitions import install_named
-from restock.replay.store.query import found
+from restock.replay.store.query import rows_of
 from restock.replay.store.store import Store
+from restock.stats import interval_text
 
 
 @dataclass
@@ -88,8 +91,6 @@ class AuditCommand:
 
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
-        from restock.cli import output
-
         if (self.capacity or self.reward) and self.second is not None:
             option = "--capacity" if self.capacity else "--reward"
             raise ConfigError("takes one place", where=option, remedy=f"leave out {self.second}")
@@ -161,8 +162,6 @@ class AuditCommand:
         expect_file_place(self.junit, "--junit", run=run or Path(self.store))
 
     def _run_audits(self, audits: Sequence[Audit], thresholds: Mapping[str, Any]) -> list[Finding]:
-        from restock.cli import output
-
         given = self._beside()
         place = open_place(
             self.store,
@@ -206,8 +205,6 @@ class AuditCommand:
             write_text(self.junit, junit_suites(suites, failing))
 
     def _capacity(self) -> int:
-        from restock.cli import output
-
         with open_place(self.store, only_store=True) as connection:
             capacity = recommend_capacity(connection)
         if self.json:
@@ -227,8 +224,6 @@ class AuditCommand:
 
 
 def _refuse_with(command: AuditCommand, other: str, *names: str) -> None:
-    from restock.cli.command_line import refuse
-
     refuse(command, names, f"cannot be combined with {other}", remedy="leave out one of them")
 
 
@@ -248,8 +243,6 @@ def _document(part: str, finding: Finding) -> dict[str, Any]:
 
 def _print(findings: list[Finding]) -> None:
     """Print each finding with its first rows and advice, then the names of the others."""
-    from restock.cli import output
-
     reported = [finding for finding in findings if finding.rows]
     if reported:
         output.print_table(
@@ -278,8 +271,6 @@ def _print(findings: list[Finding]) -> None:
 
 def _print_reward(reward: RewardAudit) -> None:
     """Print returns by driver, and whether more success earns a higher return."""
-    from restock.cli import output
-
     names = ("condition", "driver", "outcome", "episodes", "success_share")
     title = f"returns by driver, discounted by {reward.discount:g} a step"
     output.print_table(reward.returns, [*names, "discounted_mean", "return_mean"], title=title)
@@ -313,8 +304,6 @@ VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # for a pair 
 
 
 def _interval(value: float, ends: list[float]) -> str:
-    from restock.stats import interval_text
-
     low, high = (None if math.isnan(end) else end for end in ends)
     return interval_text(value, low, high)
 
@@ -493,10 +482,10 @@ def audit_reward(
         source = "run.driven_episodes" if of_run else "driven_episodes"
         least = max(float(table["min_episodes"]) for table in limits.values())
         same = float(limits[names[1]]["same_success"])
-        order = _rows(connection, f"FROM return_order('{source}', {least!r}, {same!r})")
+        order = rows_of(connection, f"FROM return_order('{source}', {least!r}, {same!r})")
         for row in order:
             row["more_return"] = [math.nan if end is None else end for end in row["more_return"]]
-        returns = _rows(connection, f"FROM returns_of('{source}')")
+        returns = rows_of(connection, f"FROM returns_of('{source}')")
         return RewardAudit(discount, returns, order, findings)
 
 
@@ -521,8 +510,3 @@ def _check_evaluated(connection: duckdb.DuckDBPyConnection, run: Path) -> None:
             remedy=f"restock eval {quoted(run)} --policies agent,planner,operator --episodes 200"
             " --perturbations none",
         )
-
-
-def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, Any]]:
-    columns, rows = found(connection, query)
-    return [dict(zip(columns, row, strict=True)) for row in rows]

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from restock.cli import output
+from restock.cli.command_line import refuse
 from restock.replay.export import FORMATS
 
 TO = (*FORMATS, "onnx")
@@ -50,9 +52,6 @@ class ExportCommand:
 
     def run(self) -> None:
         """Write the data set and say what is in it."""
-        from restock.cli import output
-        from restock.cli.command_line import refuse
-
         if self.to == "onnx":
             of_rows = ["query", "action", "cameras"]
             of_rows += ["panel"] if self.alarm is None else []

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from restock import native
+from restock.cli import output
+from restock.cli.data.night import info_total
 from restock.cli.failures import GL, NO_GL
 from restock.errors import ExitCode, RecordingError, counted, quoted, visible
 from restock.process import cores, install_command, installed
@@ -71,8 +73,6 @@ class InfoCommand:
 
     def run(self) -> int:
         """Describe the machine, each store and each recording; return the worst exit code."""
-        from restock.cli import output
-
         stores = [path for path in self.paths if _is_store(path)]
         findings = self._findings(stores)
         wrong = any(one.state == "wrong" for one in findings)
@@ -97,7 +97,6 @@ class InfoCommand:
 
     def _describe(self, paths: Sequence[str]) -> tuple[ExitCode, list[dict[str, Any]]]:
         """Describe each recording; return the exit code of the worst, and the descriptions."""
-        from restock.cli import output
         from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.decoding.definitions import choose_definitions
 
@@ -131,8 +130,6 @@ class InfoCommand:
                 if not self.json:
                     _print(entry)
         if len(entries) > 1 and not self.json:
-            from restock.cli.data.night import info_total
-
             output.print_text(info_total(entries, refused))
         return code, entries
 
@@ -294,8 +291,6 @@ def _qos(profile: dict[str, Any]) -> str:
 
 
 def _print(entry: dict[str, Any]) -> None:
-    from restock.cli import output
-
     clocked = entry["integrity"] is not None
     rows = [
         {

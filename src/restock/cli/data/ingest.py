@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
+from restock.cli import output
+from restock.cli.data.night import Night
 from restock.errors import (
     ConfigError,
     ExitCode,
@@ -95,8 +97,6 @@ class IngestCommand:
         tags = parse_tags(self.tag, empty=True)
         profile = load_profile(self.profile)  # before what is slow to import: it may not be there
 
-        from restock.cli import output
-        from restock.cli.data.night import Night
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.decoding.definitions import choose_definitions
         from restock.ingest.store.writer import StoreWriter, fold_if_many
@@ -207,7 +207,6 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
 
 def show(outcome: IngestResult) -> None:
     """Print the counts of one recording as tables."""
-    from restock.cli import output
     from restock.ingest.profile.tag_rules import in_words
     from restock.ingest.store.manifest import UNUSED
 

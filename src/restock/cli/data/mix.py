@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import tyro
 
+from restock.cli import output
 from restock.errors import MixtureError, counted, figure
 
 if TYPE_CHECKING:
@@ -52,7 +53,6 @@ class MixCommand:
 
     def run(self) -> None:
         """Plan, and unless it is a dry run, pack."""
-        from restock.cli import output
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import check_free, open_source, write_panel
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ConfigError, ExitCode, RecordingError, counted, visible
-from restock.files import write_text
+from restock.files import expect_file_place, write_text
 
 if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
@@ -94,8 +95,6 @@ class ProfileCommand:
         return self._new() if self.action == "new" else self._check()
 
     def _new(self) -> int:
-        from restock.cli import output
-        from restock.files import expect_file_place
         from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.propose.drives import names_of, propose_for_drives
         from restock.ingest.propose.footprint import parse_footprint
@@ -178,7 +177,6 @@ class ProfileCommand:
         Raises:
             RecordingError: none can be read.
         """
-        from restock.cli import output
         from restock.ingest.propose.drives import drives_by_kind, robot_traits
 
         if len(paths) == 1:
@@ -202,7 +200,6 @@ class ProfileCommand:
         return drives_by_kind([*traits], [*traits.values()]), [*unreadable]
 
     def _open(self, path: Path | str) -> Recording:
-        from restock.cli import output
         from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.containers.storage import unwatched
         from restock.ingest.propose.roles import choose_robot
@@ -221,7 +218,6 @@ class ProfileCommand:
         return recording
 
     def _check(self) -> int:
-        from restock.cli import output
         from restock.cli.data.ingest import as_json, show
         from restock.ingest.pipeline import ingest
         from restock.ingest.profile.profile import load_profile
@@ -275,7 +271,6 @@ class ProfileCommand:
 
         Also return the share of ticks at which the lidar sees something inside the robot's outline.
         """
-        from restock.cli import output
         from restock.ingest.propose.trial import try_profile
         from restock.ingest.steps.needs import as_recorded, read_topics
         from restock.ingest.task.conditions import NOMINAL

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ExitCode, QueryError, StoreError
 from restock.process import went_on_after_interrupt
 
@@ -60,7 +61,6 @@ class SqlCommand:
 
     def run(self) -> int:
         """Run the query and print or write its rows."""
-        from restock.cli import output
         from restock.replay.places import beside_of, open_place
 
         place, others, query = self._places()
@@ -93,7 +93,6 @@ class SqlCommand:
     def _answer(
         self, connection: duckdb.DuckDBPyConnection, text: str, *, alone: bool = False
     ) -> None:
-        from restock.cli import output
         from restock.replay.store.query import fetch
 
         text = text.rstrip()
@@ -131,7 +130,6 @@ class SqlCommand:
 
     def _write(self, connection: duckdb.DuckDBPyConnection, text: str, out: Path) -> None:
         """Write the rows of a query to a file, by its ending."""
-        from restock.cli import output
         from restock.files import expect_file_place, temporary_name
         from restock.replay.store.query import fetch, write_parquet
 
@@ -162,8 +160,6 @@ class SqlCommand:
 
     def _prompt(self, connection: duckdb.DuckDBPyConnection) -> None:
         """Answer queries one after the other: a semicolon ends each, Ctrl-D ends the prompt."""
-        from restock.cli import output
-
         with contextlib.suppress(ImportError):
             import readline  # noqa: F401  (gives the prompt arrow keys and a history)
         output.say('End a query with ";". help lists what else there is. Ctrl-D to quit.')
@@ -201,7 +197,6 @@ class SqlCommand:
         return self.path, tuple(others), query
 
     def _export(self, place: str, out: Path) -> None:
-        from restock.cli import output
         from restock.files import expect_file_place
         from restock.replay.store.store import Store, export_views
 

@@ -10,7 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ExitCode, figure, quoted
+from restock.cli import output
+from restock.cli.command_line import refuse
+from restock.cli.fleet.diff import section
+from restock.errors import (
+    ConfigError,
+    ExitCode,
+    RestockError,
+    by_priority,
+    figure,
+    quoted,
+    uncertain_labels,
+)
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
@@ -47,9 +58,6 @@ class CoverageCommand:
 
     def run(self) -> None:
         """Ask, print, and write the page."""
-        from restock.cli import output
-        from restock.cli.command_line import refuse
-        from restock.errors import by_priority, uncertain_labels
         from restock.files import expect_file_place
         from restock.replay.store.novelty import at_hand, novel_rows, novel_rows_said
         from restock.replay.store.store import Store
@@ -82,7 +90,6 @@ class CoverageCommand:
                 output.print_text(said)
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
-        from restock.errors import RestockError
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
@@ -160,8 +167,6 @@ class GapsCommand:
 
     def run(self) -> None:
         """Find the gaps, plan what fills them, and print both."""
-        from restock.cli import output
-        from restock.errors import ConfigError
         from restock.files import expect_file_place
         from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
         from restock.replay.mixture.mixture import load_mixture
@@ -221,7 +226,6 @@ def _missing(
 
 
 def _print_gaps(answer: dict[str, Any]) -> None:
-    from restock.cli import output
     from restock.replay.fleet.shopping_list import readable
 
     unit = answer["unit"]
@@ -250,9 +254,6 @@ def _print_gaps(answer: dict[str, Any]) -> None:
 
 
 def _table(title: str, rows: list[dict[str, Any]], note: str = "") -> None:
-    from restock.cli import output
-    from restock.cli.fleet.diff import section
-
     section(title, rows)
     if note:
         output.print_text(note)
@@ -286,7 +287,6 @@ class DriftCommand:
 
     def run(self) -> int:
         """Measure and print."""
-        from restock.cli import output
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.store.store import Store
 
@@ -302,8 +302,6 @@ class DriftCommand:
 
 
 def _print_drift(drift: Drift) -> None:
-    from restock.cli import output
-
     verdicts: dict[tuple[str, str], Counter[str]] = {}
     for row in drift.tests:
         verdicts.setdefault((row["robot"], row["against"]), Counter())[row["verdict"]] += 1

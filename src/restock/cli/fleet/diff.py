@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ExitCode, RestockError
 
 
@@ -40,8 +41,6 @@ class DiffCommand:
 
     def run(self) -> int:
         """Compare and print; with --exit-code, return whether they differ."""
-        from restock.cli import output
-
         document = _difference(self.first, self.second)
         if self.json:
             output.print_json(document)
@@ -68,7 +67,6 @@ def _difference(first: str, second: str) -> dict[str, Any]:
         from restock.train.judge.compare import diff_runs
 
         return diff_runs(Path(first), Path(second))
-    from restock.cli import output
     from restock.replay.fleet.store_difference import diff_stores
     from restock.replay.store.store import Store
 
@@ -121,7 +119,6 @@ def show(document: dict[str, Any]) -> None:
 
 
 def _print_stores(document: dict[str, Any]) -> None:
-    from restock.cli import output
     from restock.replay.fleet.store_difference import shifted
 
     a, b = document["a"], document["b"]
@@ -164,8 +161,6 @@ def _print_stores(document: dict[str, Any]) -> None:
 
 
 def _print_panels(document: dict[str, Any]) -> None:
-    from restock.cli import output
-
     _sides(document, ("id", "store", "store_version", "rows", "effective_rows", "logs_share"))
     if not document["different"]:
         output.print_text("the same panel: mixture, rows and weights")
@@ -184,8 +179,6 @@ def _print_panels(document: dict[str, Any]) -> None:
 
 
 def _print_runs(document: dict[str, Any]) -> None:
-    from restock.cli import output
-
     _sides(document, ("env_steps", "gradient_steps", "panel"))
     settings = [{**row, "a": row["first"], "b": row["second"]} for row in document["settings"]]
     section("settings that differ", _lines(settings, _same("setting", "kind", "a", "b")))
@@ -212,8 +205,6 @@ def _print_runs(document: dict[str, Any]) -> None:
 
 
 def _sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
-    from restock.cli import output
-
     heads = [f"{side}: {document[side]['path']}" for side in "ab"]
     output.print_table(
         [
@@ -271,8 +262,6 @@ def _with_interval(row: dict[str, Any], name: str) -> str:
 
 
 def _print_labels(labels: dict[str, Any]) -> None:
-    from restock.cli import output
-
     if not labels["rows_compared"]:
         return
     section("labels that changed", labels["changes"])
@@ -285,8 +274,6 @@ def _print_labels(labels: dict[str, Any]) -> None:
 
 def section(title: str, rows: list[dict[str, Any]]) -> None:
     """Print a table, cut on a terminal, with a note of what was left out."""
-    from restock.cli import output
-
     if not rows:
         return
     shown = rows[:SHOWN] if sys.stdout.isatty() else rows

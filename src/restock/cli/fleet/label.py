@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ConfigError, ExitCode, counted
 
 if TYPE_CHECKING:
@@ -50,7 +51,6 @@ class LabelCommand:
 
     def run(self) -> int:
         """Label, and say what changed."""
-        from restock.cli import output
         from restock.ingest.relabel import open_for_relabel, relabel_store
 
         if self.score:
@@ -143,7 +143,6 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
 
 def print_scores(path: Path, *, json: bool) -> int:
     """Print precision and recall of each condition, and how reliable the probabilities are."""
-    from restock.cli import output
     from restock.replay.review.events import label_quality, reliability, reliability_rows
     from restock.replay.store.store import Store
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ConfigError, ExitCode, LabelError, quoted
 
 if TYPE_CHECKING:
@@ -65,7 +66,6 @@ class ReviewCommand:
         return self._serve(place)
 
     def _write(self, place: Location, out: Path) -> int:
-        from restock.cli import output
         from restock.files import expect_file_place
         from restock.replay.review.events import doubtful_events, review_csv, review_rows
         from restock.replay.store.store import Store
@@ -128,8 +128,6 @@ class ReviewCommand:
         else:
             written = take_file(Path(file), place, dry_run=self.dry_run)
         if self.json:
-            from restock.cli import output
-
             more = {"dry_run": self.dry_run, "without_verdict": left_open}
             output.print_json(written.document | more)
             return ExitCode.OK
@@ -138,7 +136,6 @@ class ReviewCommand:
         return ExitCode.OK
 
     def _serve(self, place: Location) -> int:
-        from restock.cli import output
         from restock.report.fleet.review import Review, Server
 
         place.expect_newest()
@@ -183,8 +180,6 @@ def print_written(
     written: Written, nothing: str, *, left_open: int = 0, dry_run: bool = False
 ) -> None:
     """Print what verdicts changed."""
-    from restock.cli import output
-
     for why in written.held_back:
         output.print_text(f"held back: {why}")
     if not written.outcomes:

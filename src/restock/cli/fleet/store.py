@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ConfigError, ExitCode, counted, quoted
 
 if TYPE_CHECKING:
@@ -47,7 +48,6 @@ class CompactCommand:
 
     def run(self) -> ExitCode:
         """Compact, and report what became of the files."""
-        from restock.cli import output
         from restock.ingest.store.writer import StoreWriter, compact
 
         store = StoreWriter(self.store)
@@ -87,7 +87,6 @@ class CompactCommand:
         return ExitCode.OK
 
     def _drop_damaged(self, store: StoreWriter) -> ExitCode:
-        from restock.cli import output
         from restock.ingest.store.damaged_files import drop_damaged
 
         done = drop_damaged(store, dry_run=self.dry_run)
@@ -148,7 +147,6 @@ class RemoveCommand:
 
     def run(self) -> ExitCode:
         """Remove, and say what was removed and how to get it back."""
-        from restock.cli import output
         from restock.ingest.store.removal import remove_recordings
         from restock.ingest.store.writer import StoreWriter
 
@@ -229,7 +227,6 @@ class VerifyCommand:
 
     def run(self) -> ExitCode:
         """Verify, and list what is damaged."""
-        from restock.cli import output
         from restock.ingest.store.damaged_files import verify_store
         from restock.replay.panel.panel import HEADER
 
@@ -245,7 +242,6 @@ class VerifyCommand:
         return ExitCode.FAILED if done.damaged else ExitCode.OK
 
     def _verify_panel(self) -> ExitCode:
-        from restock.cli import output
         from restock.replay.panel.panel import Panel
 
         panel = Panel.open(self.store, verify=True)

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from restock.cli.output import plain, print_json, print_sections, say
+from restock.errors import ConfigError, ExitCode
+
 if TYPE_CHECKING:
     from restock.train.judge.compare import Comparison
 
@@ -44,8 +47,6 @@ class CompareCommand:
     """Print the verdict, the differences, the checks and the outcomes as JSON."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json, say
-        from restock.errors import ConfigError, ExitCode
         from restock.train.judge.compare import compare
 
         first, second = self.runs, self.against
@@ -77,7 +78,6 @@ def _write(
     comparison: Comparison, first: Sequence[Path], second: Sequence[Path], out: Path
 ) -> Path:
     """Write the page, with the curves and costs that the comparison itself does not need."""
-    from restock.cli.output import plain
     from restock.report import comparison_page, write_page
     from restock.train.study.contrasts import learning_curves, training_cost
 
@@ -106,7 +106,6 @@ def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
 
 def _show(comparison: Comparison, names: tuple[str, str]) -> None:
     """Print what differs, the checks that failed, the verdict and the outcomes."""
-    from restock.cli.output import plain, print_sections, say
     from restock.report import gate_section, outcome_sections
 
     found = plain(comparison.as_json())

@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.cli.command_line import refuse
+from restock.cli.output import print_json, print_parted, print_text, say
+from restock.errors import ConfigError, ExitCode
+
 if TYPE_CHECKING:
     from restock.train.judge.before_training import RowDiagnosis
     from restock.train.judge.diagnose import Diagnosis
@@ -55,9 +59,6 @@ class DiagnoseCommand:
     """Print the verdict, the evidence and every window as JSON."""
 
     def run(self) -> int:
-        from restock.cli.command_line import refuse
-        from restock.cli.output import print_json, say
-        from restock.errors import ConfigError, ExitCode
         from restock.train.judge.diagnose import check_place, confirm, diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
@@ -104,9 +105,6 @@ class DiagnoseCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _before_training(self, path: Path, layouts: str) -> int:
-        from restock.cli.command_line import refuse
-        from restock.cli.output import print_json
-        from restock.errors import ExitCode
         from restock.ingest.profile.profile import load_profile
         from restock.train.judge.before_training import diagnose_before_training
         from restock.train.twin.floors.layout import DEFAULT
@@ -131,8 +129,6 @@ class DiagnoseCommand:
 
 
 def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
-    from restock.cli.output import print_parted, print_text
-
     several = len(paths) > 1  # a verdict of one is said below
     print_parted(
         [
@@ -163,7 +159,6 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
 
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
-    from restock.cli.output import print_parted, print_text
     from restock.train.judge.before_training import GAP_CHECK
 
     named = {check for one in diagnosis.findings for check in one.evidence}
@@ -223,8 +218,6 @@ def _range(least: float | None, most: float | None) -> str:
 
 
 def _show_confirmation(confirmation: dict[str, Any]) -> None:
-    from restock.cli.output import print_text
-
     answer = {True: "CONFIRMED", False: "REFUTED", None: "NOT DECIDED"}[confirmation["confirmed"]]
     changed = ", ".join(confirmation["changed"])
     print_text(f"{answer}: with {changed} it is {confirmation['cause']} ({confirmation['run']})")

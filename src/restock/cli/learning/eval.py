@@ -8,6 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.cli.command_line import refuse
+from restock.cli.output import (
+    names_in,
+    print_json,
+    print_parted,
+    print_table,
+    progress,
+    reported,
+    say,
+)
+from restock.errors import ExitCode, counted, policy_words
+
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpeConfig, OpeResult
 
@@ -73,8 +85,6 @@ class EvalCommand:
     """Print the table and the settings as JSON."""
 
     def run(self) -> int:
-        from restock.cli.command_line import refuse
-
         if self.on_logs is not None:
             why = "cannot be combined with --on-logs, which drives nothing"
             refuse(self, _DRIVES, why, remedy="leave out one of them")
@@ -82,8 +92,6 @@ class EvalCommand:
         return self._drive()
 
     def _drive(self) -> int:
-        from restock.cli.output import names_in, print_json, progress, say
-        from restock.errors import ExitCode
         from restock.train.evaluation.eval_run import (
             clones_driven,
             drive_evaluation,
@@ -137,9 +145,6 @@ class EvalCommand:
         return int(ExitCode.OK)
 
     def _show(self, document: dict[str, Any]) -> None:
-        from restock.cli.output import say
-        from restock.errors import policy_words
-
         if (rows := document.get("results")) is not None:
             show_measures(rows)
             trained = document.get("trained", {})
@@ -154,8 +159,6 @@ class EvalCommand:
             say(f"not filmed: {why}")
 
     def _evaluate_off_policy(self, logs: str) -> int:
-        from restock.cli.output import print_json, progress, say
-        from restock.errors import counted
         from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
 
         config = OpeConfig()
@@ -180,8 +183,6 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
 
     A table that is too wide is split, so that no measure is left out.
     """
-    from restock.cli.output import print_parted, reported, say
-    from restock.errors import policy_words
     from restock.train.run.kept_evaluations import measured_row
 
     names = policy_words(row["policy"] for row in rows)
@@ -207,8 +208,6 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
 
 def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
     """Print a row per measure and condition, and why weighting is refused if it is."""
-    from restock.cli.output import print_json, print_table, say
-
     if as_json:
         print_json(
             {

@@ -9,6 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from restock.cli.output import names_in, print_json, print_sections, progress, say
+from restock.errors import ConfigError, ExitCode
+
 
 @dataclass
 class GateCommand:
@@ -50,8 +53,6 @@ class GateCommand:
     """Print the document as JSON: claim, evidence and limits."""
 
     def run(self) -> int:
-        from restock.cli.output import names_in, print_json, print_sections, progress, say
-        from restock.errors import ExitCode
         from restock.files import write_text
         from restock.report import gate_page, write_page
         from restock.train.judge.gate import FOLDER, drive_gate, junit, plan_gate
@@ -89,9 +90,6 @@ def _margins(text: str) -> dict[str, float]:
     Raises:
         ConfigError: a part is no name and number.
     """
-    from restock.cli.output import names_in
-    from restock.errors import ConfigError
-
     found = {}
     for part in names_in(text):
         name, _, value = part.partition("=")

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from restock.cli.output import print_json, progress
+from restock.errors import ConfigError
 
 
 @dataclass
@@ -46,7 +47,6 @@ class ReportCommand:
     """Print {"report": PATH, "bytes": N} instead of the path, or the card as JSON."""
 
     def run(self) -> int | None:
-        from restock.errors import ConfigError
         from restock.files import expect_file_place
         from restock.ingest.store.location import Location
         from restock.replay.places import kind_beside

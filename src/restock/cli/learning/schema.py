@@ -11,6 +11,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from restock.cli import output
+from restock.errors import ConfigError
+
 # name -> the files that it is of
 CONFIGS: Mapping[str, str] = {
     "train": "`restock train --config`",
@@ -42,8 +45,6 @@ class SchemaCommand:
 
     def run(self) -> None:
         """Print or write."""
-        from restock.cli import output
-        from restock.errors import ConfigError
         from restock.files import expect_file_place, write_text
 
         if self.name is not None and self.name not in CONFIGS:

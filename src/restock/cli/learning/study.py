@@ -6,12 +6,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.errors import ExitCode, RestockError
+from restock.cli.output import plain, print_json, print_table, say
+from restock.errors import ConfigError, ExitCode, RestockError
 
 if TYPE_CHECKING:
     from restock.train.study.study import StudyPlan
@@ -60,10 +62,6 @@ class StudyCommand:
     """Print the result as JSON."""
 
     def run(self) -> int:
-        from json import dumps
-
-        from restock.cli.output import plain, print_json, say
-        from restock.errors import ConfigError
         from restock.files import expect_place, write_text
         from restock.report import study_page, write_page
         from restock.train.study.study import StudyPlan, load_study
@@ -91,7 +89,6 @@ class StudyCommand:
 
     def _show(self, plan: StudyPlan) -> int:
         """Print the runs of a study, which is checked."""
-        from restock.cli.output import print_json, print_table
         from restock.train.study.study import check_jobs
         from restock.train.study.study_run import check_mixtures
 

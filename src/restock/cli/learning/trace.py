@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import quoted
+from restock.cli import output
+from restock.cli.command_line import refuse
+from restock.errors import ConfigError, quoted
 
 if TYPE_CHECKING:
     from restock.replay.trace import trace as tracing
@@ -59,7 +61,6 @@ class TraceCommand:
 
     def run(self) -> None:
         """Trace, and print what was found."""
-        from restock.cli import output
         from restock.replay.trace.trace import listed_rows, trace_row
 
         self._check_view()
@@ -90,9 +91,6 @@ class TraceCommand:
             _print_view(written)
 
     def _check_view(self) -> None:
-        from restock.cli.command_line import refuse
-        from restock.errors import ConfigError
-
         if self.view is None:
             refuse(self, ("critic",), "has no effect without --view", remedy="give --view FILE")
             return
@@ -134,8 +132,6 @@ def document(trace: tracing.Trace) -> dict[str, Any]:
 
 
 def _print(trace: tracing.Trace, with_messages: bool) -> None:
-    from restock.cli import output
-
     _section("as it was sampled", trace.audit)
     _section("its episode of the twin", trace.episode)
     stored = trace.origin.transition if trace.origin is not None else {}
@@ -148,8 +144,6 @@ def _print(trace: tracing.Trace, with_messages: bool) -> None:
 
 
 def _print_origin(origin: Origin, with_messages: bool) -> None:
-    from restock.cli import output
-
     _section("its row of the store", {**origin.store, **origin.transition})
     _section("terms of its reward", origin.reward_parts)
     manifest = origin.recording or {}
@@ -201,8 +195,6 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
 
 
 def _print_view(written: dict[str, Any]) -> None:
-    from restock.cli import output
-
     rows = [{"topic": topic, "messages": count} for topic, count in written["topics"].items()]
     output.print_text()
     output.print_table(rows, title=f"{written['path']}, {written['seconds']:g} s")
@@ -213,8 +205,6 @@ def _print_view(written: dict[str, Any]) -> None:
 
 def _section(title: str, values: dict[str, Any] | None) -> None:
     """Print a table of names and values, without empty ones."""
-    from restock.cli import output
-
     known = {name: value for name, value in (values or {}).items() if value not in (None, "", [])}
     if known:
         rows = [{"": name, "value": _short(value)} for name, value in known.items()]
@@ -223,8 +213,6 @@ def _section(title: str, values: dict[str, Any] | None) -> None:
 
 
 def _short(value: Any) -> str:
-    from restock.cli import output
-
     if isinstance(value, dict):
         return " ".join(f"{name}: {_short(entry)}" for name, entry in value.items())
     if isinstance(value, list) and value and isinstance(value[0], dict):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from threading import Thread
 from types import FrameType
@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import quoted
+from restock.cli.output import print_json, print_table, progress, say
+from restock.errors import RestockError, quoted
+from restock.process import went_on_after_interrupt
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
@@ -74,8 +76,6 @@ class TrainCommand:
     """Print the outcome as JSON."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json, say
-        from restock.errors import RestockError
         from restock.train.dqn.config import apply_overrides, parse_config
         from restock.train.prepare import prepare_new, prepare_resumed
 
@@ -118,9 +118,7 @@ class TrainCommand:
 
 def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
     """Train to the end; then flush the twin's episodes if a store is given."""
-    from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
-    from restock.process import went_on_after_interrupt
     from restock.train.feed.fresh_log import flush
     from restock.train.loop import TrainingInterrupted, nothing_to_do, train
     from restock.train.run.run import resuming
@@ -186,8 +184,6 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """Let the first Ctrl-C stop the loop with a checkpoint, and the second one at once."""
-    from restock.cli.output import say
-
     # On a thread: a handler must not print while what it interrupts does.
     reported = Thread(target=say, args=(_STOPPING,))
     stopping = False
@@ -237,9 +233,6 @@ def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
 def _print(
     prepared: Prepared, outcome: TrainResult, flushed: Flushed | None, *, as_json: bool
 ) -> None:
-    from dataclasses import asdict
-
-    from restock.cli.output import print_json, print_table, say
     from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls
     from restock.train.run.run import Run
 

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from restock.cli.output import print_json, print_table, stderr, stdout
 from restock.cli.start import stages
 from restock.cli.start.stages import Settings, Stage
 from restock.cli.start.work import Work, escape, speaker
-from restock.errors import ConfigError, ExitCode, policy_words, quoted
+from restock.errors import ConfigError, ExitCode, RestockError, policy_words, quoted
 from restock.stats import wilson
 
 if TYPE_CHECKING:
@@ -54,7 +55,6 @@ class DemoCommand:
 
     def run(self) -> int:
         from restock.cli import main
-        from restock.cli.output import print_json, stderr, stdout
 
         if not 0 < self.seconds < math.inf:
             raise ConfigError(f"must be a number above 0, got {self.seconds:g}", where="--seconds")
@@ -205,7 +205,6 @@ def steps_of(run: Path) -> int:
 
 def tell(to: Settings, console: Console) -> None:
     """Print the results, read from what the stages wrote."""
-    from restock.cli.output import print_table
     from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls
     from restock.train.run.run import Run
 
@@ -323,7 +322,6 @@ def rare_event(to: Settings) -> list[str]:
     row = _chosen(to.run)
     if row is None:
         return []
-    from restock.errors import RestockError
     from restock.replay.trace.trace import trace_row
 
     name = f"{row['gradient_step']}/{row['batch_row']}"

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from restock.cli.output import print_json, stderr, stdout
 from restock.cli.start import decisions, stages
 from restock.cli.start.decisions import NO_ROOM, Stop
 from restock.cli.start.outcomes import Document
@@ -337,7 +338,6 @@ class StartCommand:
     def run(self) -> int:
         """Run all stages; return 3 if a person must decide or a needed stage failed."""
         from restock.cli import main
-        from restock.cli.output import print_json, stderr, stdout
 
         if not self.paths:
             raise RecordingError("no recording given", remedy="restock start BAG --out DIR")

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import counted
+from restock.cli import output
+from restock.errors import ConfigError, ExitCode, counted
 
 if TYPE_CHECKING:
     from restock.train.twin.calibration.fitted_twin import FittedTwin
@@ -49,8 +50,6 @@ class FitCommand:
 
     def run(self) -> int:
         """Fit, print, write."""
-        from restock.cli import output
-        from restock.errors import ConfigError, ExitCode
         from restock.files import expect_file_place
         from restock.replay.store.store import Store
         from restock.train.twin.calibration.fitted_twin import write_fit
@@ -82,7 +81,6 @@ class FitCommand:
         return ExitCode.OK
 
     def _fit(self, store: Any, recordings: tuple[str, ...]) -> FittedTwin:
-        from restock.cli import output
         from restock.train.twin.calibration.fit import FitConfig, fit
         from restock.train.twin.calibration.fit_solver import DEFAULT
 
@@ -101,8 +99,6 @@ class FitCommand:
 
 
 def _show(fit: FittedTwin) -> None:
-    from restock.cli import output
-
     rows = [
         {
             "parameter": item.name,

@@ -8,6 +8,9 @@ from typing import Annotated
 
 import tyro
 
+from restock.cli import output
+from restock.errors import ExitCode
+
 
 @dataclass
 class GapCommand:
@@ -50,8 +53,6 @@ class GapCommand:
 
     def run(self) -> int:
         """Measure, print, write."""
-        from restock.cli import output
-        from restock.errors import ExitCode
         from restock.replay.store.store import Store
         from restock.report import gap_page, write_page
         from restock.train.twin.calibration.gap import measure_gap

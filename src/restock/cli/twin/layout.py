@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from restock.cli import output
+from restock.cli.output import cell
 from restock.errors import ConfigError, RestockError
 
 if TYPE_CHECKING:
@@ -64,7 +66,6 @@ class LayoutCommand:
 
     def run(self) -> int:
         """Print, and write what was asked for."""
-        from restock.cli import output
         from restock.files import write_text
         from restock.train.twin.env.render import draw_floor, write_png
         from restock.train.twin.floors.floor_files import write_floor, write_map
@@ -170,9 +171,6 @@ class LayoutCommand:
 
 
 def _show(name: str, facts: dict[str, Any]) -> None:
-    from restock.cli import output
-    from restock.cli.output import cell
-
     notes = facts.get("notes", [])
     rows = {key: value for key, value in facts.items() if key not in ("notes", "elsewhere")}
     texts = {key: value if isinstance(value, str) else cell(value) for key, value in rows.items()}

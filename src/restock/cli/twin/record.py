@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from restock.cli import output
 from restock.errors import ConfigError, RecordingError, RestockError
 
 if TYPE_CHECKING:
@@ -78,7 +79,6 @@ class RecordCommand:
 
     def run(self) -> None:
         """Record, and print what was recorded."""
-        from restock.cli import output
         from restock.files import expect_place
         from restock.ingest.profile.tag_rules import parse_tags
         from restock.replay.fleet.missions_file import MissionsFile
@@ -202,8 +202,6 @@ def load_policy(name: str) -> Policy | None:
 
 
 def _print_recording(done: dict[str, Any]) -> None:
-    from restock.cli import output
-
     kinds = [
         {
             "missions of": kind,
@@ -231,8 +229,6 @@ def _print_recording(done: dict[str, Any]) -> None:
 
 
 def _print_plan(values: dict[str, Any]) -> None:
-    from restock.cli import output
-
     rows = [
         {"": key, "would be": _in_words(value)}
         for key, value in values.items()

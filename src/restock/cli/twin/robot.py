@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from restock.cli import output
+
 FRICTION = 0.8  # of the floor
 
 
@@ -30,7 +32,6 @@ class RobotCommand:
 
     def run(self) -> int:
         """Build it and drive every action."""
-        from restock.cli import output
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.task.robot import refuse_beyond_steering
         from restock.train.twin.physics.model import (
