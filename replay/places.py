@@ -19,7 +19,7 @@ from restock.errors import RecordingError, RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.replay.store.definitions import definitions, install_named
-from restock.replay.store.parquet_views import REMAKE, read_parquet
+from restock.replay.store.parquet_views import REMAKE, literal, read_parquet
 from restock.replay.store.query import query
 from restock.replay.store.store import Store, is_store, set_memory_limit
 
@@ -192,7 +192,7 @@ class Place:
 def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None:
     """Let the connection read no file and no Python object but those of a folder."""
     folders = [] if folder is None else [str(folder), str(folder.absolute())]
-    listed = ", ".join("'" + one.replace("'", "''") + "'" for one in folders)
+    listed = ", ".join(map(literal, folders))
     connection.execute(
         f"SET allowed_directories = [{listed}]; SET enable_external_access = false;"
         " SET python_enable_replacements = false; SET enable_progress_bar = false"
@@ -305,10 +305,8 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
         read_parquet(connection, view, [file], schema=schema)
         for field in pq.read_schema(file):
             if meaning := (field.metadata or {}).get(b"meaning", b"").decode():
-                text = meaning.replace("'", "''")
-                connection.execute(
-                    f'COMMENT ON COLUMN "{schema}"."{view}"."{field.name}" IS \'{text}\''
-                )
+                column = f'"{schema}"."{view}"."{field.name}"'
+                connection.execute(f"COMMENT ON COLUMN {column} IS {literal(meaning)}")
     if "audit" in files:
         _add_replay_audit(connection, path, schema)
     if "eval_episodes" in files:

@@ -24,6 +24,7 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import DTYPES, FieldColumn, Leaf, Ragged
 from restock.ingest.decoding.decoders import empty_column
 from restock.replay.store.definitions import LISTS, make_on_demand
+from restock.replay.store.parquet_views import literal
 
 STAMP = "header.stamp"
 
@@ -122,7 +123,7 @@ class Topics:
             source = f"stored_{number}_{view}" if self._several else view
             taken = ["file"] if self._several else []
             self._connection.register(source, _Source(self, file, *topics[topic], taken))
-            parts.append(f"SELECT {_literal(str(file))} AS file, * FROM {_quoted(source)}")
+            parts.append(f"SELECT {literal(visible(str(file)))} AS file, * FROM {_quoted(source)}")
         if not parts:
             return
         if self._several:
@@ -275,10 +276,6 @@ def _distinct(names: Iterable[str], taken: Sequence[str] = ()) -> list[str]:
 
 def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
-
-
-def _literal(text: str) -> str:
-    return "'" + visible(text).replace("'", "''") + "'"
 
 
 _KINDS = {"string": "VARCHAR", "time": "BIGINT"} | {

@@ -182,8 +182,10 @@ def export_dataset(
         counts.rows += sum(selection.left_out.values())
         counts.left_out.update(selection.left_out)
         contents = Contents()
-        written = contents.counted(_trajectories(selection, counts))
-        episodes = _advancing(written, advance)
+        found = trajectories(
+            selection.batches, continuous=continuous, counts=counts, where=selection.where
+        )
+        episodes = _advancing(contents.counted(count_episodes(found, counts)), advance)
         if (first := next(episodes, None)) is None:
             raise StoreError("no whole transition is left of the rows", where=selection.where)
         if first.observations.shape[1] != selection.observation_size:
@@ -210,18 +212,6 @@ def export_dataset(
         "notes": notes,
         "provenance": selection.provenance,
     }
-
-
-def _trajectories(selection: Selection, counts: Counts) -> Iterator[Trajectory]:
-    return count_episodes(
-        trajectories(
-            selection.batches,
-            continuous=selection.continuous,
-            counts=counts,
-            where=selection.where,
-        ),
-        counts,
-    )
 
 
 def _advancing(

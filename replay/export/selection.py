@@ -28,6 +28,7 @@ from restock.replay.export.trajectory import (
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import open_place
 from restock.replay.plan.candidates import LATER
+from restock.replay.store.parquet_views import literal
 from restock.replay.store.query import fetch, interruptible
 from restock.replay.store.query import query as run_query
 from restock.replay.store.store import Store
@@ -234,10 +235,9 @@ def _with_frames(
             where=where,
             remedy="select it too, or give --cameras none",
         )
-    name = camera.replace("'", "''")
     having = (
         f"FROM ({text}) WHERE transition_id IN"
-        f" (SELECT transition_id FROM transition_frames WHERE camera = '{name}')"
+        f" (SELECT transition_id FROM transition_frames WHERE camera = {literal(camera)})"
     )
     counts = [
         fetch(connection, f"SELECT count(*) FROM ({one})", where=where)[1][0][0]

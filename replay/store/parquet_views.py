@@ -103,10 +103,11 @@ def parquet_view(
     Each query that names the view opens every file to find out its columns.
     """
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
+    listed = ", ".join(map(literal, files))
     nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
     return (
         f"CREATE OR REPLACE VIEW {name} AS SELECT *{nulls}"
-        f" FROM read_parquet({_list(files)}, union_by_name = true)"
+        f" FROM read_parquet([{listed}], union_by_name = true)"
     )
 
 
@@ -124,7 +125,7 @@ def _view_of_known(
     names it would parse them again.
     """
     fields = ", ".join(
-        f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
+        f"{literal(column)}: {{name: {literal(column)}, type: {literal(kind)},"
         " default_value: NULL}"
         for column, kind in kinds.items()
     )
@@ -133,7 +134,7 @@ def _view_of_known(
     connection.execute(
         f'SET VARIABLE "{types_name}" = MAP {{{fields}}};'
         f' CREATE OR REPLACE VIEW "{schema}"."{view}" AS FROM read_parquet('
-        f"getvariable({_literal(files_name)}), schema = getvariable({_literal(types_name)}))"
+        f"getvariable({literal(files_name)}), schema = getvariable({literal(types_name)}))"
     )
 
 
@@ -165,10 +166,6 @@ def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | Non
     )
 
 
-def _list(files: Sequence[str | os.PathLike[str]]) -> str:
-    return "[" + ", ".join(_literal(str(file)) for file in files) + "]"
-
-
 def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
     """Return the columns of an Arrow schema with DuckDB's types."""
     with passed_in(connection, columns_of_schema=schema.empty_table()):
@@ -176,8 +173,9 @@ def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> di
     return {str(row[0]): str(row[1]) for row in rows}
 
 
-def _literal(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"
+def literal(value: object) -> str:
+    """Return a value as a text in SQL; None as NULL."""
+    return "NULL" if value is None else "'" + str(value).replace("'", "''") + "'"
 
 
 DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")

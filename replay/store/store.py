@@ -51,6 +51,7 @@ from restock.replay.store.definitions import (
 from restock.replay.store.parquet_views import (
     StoredTable,
     damage,
+    literal,
     manifest_tables,
     parquet_view,
     register,
@@ -515,7 +516,7 @@ def init_script(store: Store) -> str:
     """
     beside = set(made_by(FRAMES_SQL))  # their files are none of the tables
     columns = ", ".join(
-        "(" + ", ".join(_literal(value) for value in row) + ")"
+        "(" + ", ".join(literal(value) for value in row) + ")"
         for row in store.sql("FROM columns").fetchall()
         if row[0] not in beside
     )
@@ -564,9 +565,9 @@ def export_views(store: Store, out: str | Path) -> Path:
             partial.write_text(init_script(store), encoding="utf-8")
         else:
             with duckdb.connect() as connection:
-                quoted = str(partial).replace("'", "''")
                 connection.execute(
-                    f"ATTACH '{quoted}' AS views (STORAGE_VERSION '{STORAGE_VERSION}'); USE views"
+                    f"ATTACH {literal(partial)} AS views (STORAGE_VERSION '{STORAGE_VERSION}');"
+                    " USE views"
                 )
                 connection.execute(init_script(store))
                 connection.execute("USE memory; DETACH views")
@@ -574,7 +575,3 @@ def export_views(store: Store, out: str | Path) -> Path:
     finally:
         partial.unlink(missing_ok=True)
     return out
-
-
-def _literal(value: object) -> str:
-    return "NULL" if value is None else "'" + str(value).replace("'", "''") + "'"
