@@ -438,12 +438,15 @@ def beam_angles(source: Input, first: F64, last: F64, beams: Ints) -> tuple[F64,
     return (-first, -increment) if source.upside_down else (first, increment)
 
 
+_Maps = tuple[SectorMap | MovedMap, Lidar | None]  # None: no tracks are asked for
+
+
 class _ScanReducer:
     def __init__(self, task: Task, source: Input) -> None:
         self.task, self.source = task, source
         fields = source.fields
         self.paths = [fields[key] for key in ("ranges_m", *angle_keys(fields))]
-        self._maps: dict[tuple[float, float, int], tuple[SectorMap | MovedMap, Lidar]] = {}
+        self._maps: dict[tuple[float, float, int], _Maps] = {}
 
     def __call__(self, fields: Fields) -> dict[str, FieldColumn]:
         ranges = fields[self.paths[0]]
@@ -506,7 +509,7 @@ class _ScanReducer:
             table = np.asarray(values).reshape(stop - start, beams)
             found = sectors.clearance(table, task.range_min_m, task.range_max_m)
             clearance[here] = found
-            if task.tracks:
+            if lidar is not None:
                 fine[here] = lidar.scan(np.asarray(table, np.float64), task.range_min_m)
             close[here] = np.isneginf(table).any(axis=1)
             seen = (found < task.range_max_m).any(axis=1)  # False for NaN: no beam ends there
@@ -516,22 +519,22 @@ class _ScanReducer:
                     table[free] >= task.range_min_m  # False for NaN
                 ).any(axis=1)
 
-    def _map(
-        self, first: float, increment: float, beams: int
-    ) -> tuple[SectorMap | MovedMap, Lidar]:
+    def _map(self, first: float, increment: float, beams: int) -> _Maps:
         key = (first, increment, beams)
         if key not in self._maps:
             if len(self._maps) >= _MAPS:
                 self._maps.clear()
             bearings: F64 = first + increment * np.arange(beams, dtype=np.float64)
             count, body, at_m = self.task.sectors, self.task.body, self.source.lidar_at_m
+            sectors: SectorMap | MovedMap
             if at_m is None:
-                turned = bearings + body.lidar_yaw_rad
-                self._maps[key] = SectorMap.build(bearings, count, body), Lidar(turned)
+                turned, from_m = bearings + body.lidar_yaw_rad, (0.0, 0.0)
+                sectors = SectorMap.build(bearings, count, body)
             else:
                 turned = bearings + (self.source.lidar_yaw_rad or 0.0)
-                moved = MovedMap.build(turned, count, body, at_m)
-                self._maps[key] = moved, Lidar(turned, moved.from_m)
+                sectors = MovedMap.build(turned, count, body, at_m)
+                from_m = sectors.from_m
+            self._maps[key] = sectors, Lidar(turned, from_m) if self.task.tracks else None
         return self._maps[key]
 
     def _angle(self, fields: Fields, path: str) -> NDArray[np.float64]:
