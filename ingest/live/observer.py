@@ -30,6 +30,7 @@ from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.task import Signals, nearest_action, observe
+from restock.ingest.task.task_sql import Past
 from restock.ingest.task.tracks import Tracker
 
 _DELAYS = 200  # of each topic, of which the median counts
@@ -236,6 +237,8 @@ class LiveObserver:
         self._ticked = True
         self._before_ns: int | None = None
         self._tracker = Tracker(self.task) if self.task.tracks else None
+        of_own = self.task.observed
+        self._past = Past(self.task, "observed", 1, "a running robot") if of_own else None
 
     @property
     def topics(self) -> dict[str, str]:
@@ -298,7 +301,7 @@ class LiveObserver:
         segment = ClockSegment(samples, ClockMap.constant(offset_ns))
         at = [np.array(ticks, np.int64)]
         filling = Filling(AlignedInputs(self.profile, inputs, [segment], at))
-        signals = filling.fill(self._tracker)
+        signals = filling.fill(self._tracker, self._past)
         last = len(ticks) - 1
         before = last - int(filling.follows[last])
         now, then = (

@@ -77,7 +77,7 @@ from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.robot import Limiter, Robot, beyond_limits, refuse_beyond_steering
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import PLAN_SIGNALS, Noise, Task
-from restock.ingest.task.task_sql import own_reward, reward_terms
+from restock.ingest.task.task_sql import Past, own_sql, own_values
 from restock.renamed import PROFILE_KEYS
 from restock.toml import Checked, changed, parse_toml, read_toml, toml_value, typed
 
@@ -570,15 +570,19 @@ def _check_conditions(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=error.remedy,
             ) from error
+    task = profile.task
+    own = [*own_sql(task, "reward_terms"), *own_sql(task, "observed")]
     if profile.goal_source == "hindsight":
-        for name, plan in unseen(reward_terms(profile.task), PLAN_SIGNALS).items():
+        for name, plan in unseen(own, PLAN_SIGNALS).items():
             raise ConfigError(
-                f"`task.reward_terms.{name}` names {plan[0]}, and {DRIVEN_PLAN}",
+                f"the SQL of {name!r} in [task] names {plan[0]}, and {DRIVEN_PLAN}",
                 where=where,
                 remedy="leave it out: with goals in hindsight, nothing stood on the plan",
             )
     try:
-        own_reward(profile.task, steps)
+        own_values(task, "reward_terms", steps)
+        if task.observed:
+            Past(task, "observed", 1, "a running robot")
     except ConfigError as error:
         what = f"{error.where}: {error.what}"
         raise ConfigError(what, where=where, remedy=error.remedy) from error

@@ -32,7 +32,8 @@ from restock.ingest.steps.consistency import Finding, findings_of
 from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.filling import TOO_LARGE, Filling, Routing
 from restock.ingest.task.schema import Perturbed
-from restock.ingest.task.task import Signals, Task, nearest_action, terminated
+from restock.ingest.task.task import OBSERVED, Signals, Task, nearest_action, terminated
+from restock.ingest.task.task_sql import observed_in_log
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,10 @@ def changed_route(steps: Steps) -> Ints:
 def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) -> Signals:
     """Return the signals at these ticks as if this goal and plan were in force."""
     now = {name: column[ticks] for name, column in steps.signals.items()}
-    return now | steps.routing.signals(task, goal, plan, now)
+    now |= steps.routing.signals(task, goal, plan, now)
+    if task.observed:
+        now[OBSERVED] = observed_in_log(task, steps.signals, steps.follows, ticks, now)
+    return now
 
 
 def protective_stop(task: Task, steps: Steps) -> Bools:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.containers.storage import Fields
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
@@ -48,12 +48,14 @@ from restock.ingest.task.surroundings import (
     with_unseen,
 )
 from restock.ingest.task.task import (
+    OBSERVED,
     TRACK_SIGNALS,
     Signals,
     Task,
     clearance_ahead,
     localised_velocity,
 )
+from restock.ingest.task.task_sql import Past, observed_in_log
 from restock.ingest.task.tracks import SECTORS as FINE_SECTORS
 from restock.ingest.task.tracks import Tracker
 
@@ -195,11 +197,11 @@ class Filling:
         self.notes: list[str] = []
         self.stand_ins: dict[str, str] = {}  # of inputs none of whose messages has an estimate
 
-    def fill(self, tracker: Tracker | None = None) -> Signals:
+    def fill(self, tracker: Tracker | None = None, past: Past | None = None) -> Signals:
         """Compute every signal; the attributes then hold what else is known of the ticks.
 
-        `tracker` knows the ticks before the last one, as a running robot's does; only the last one
-        then has tracks.
+        `tracker` and `past` know the ticks before the last one, as a running robot's do; only the
+        last one then has tracks, and entries of the task's own.
         """
         self._numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
@@ -252,7 +254,20 @@ class Filling:
         signals["came_nearer_m"] = np.concatenate([np.zeros(0), *came])
         if self.task.tracks:
             signals |= self._tracks(signals, tracker)
+        if self.task.observed:
+            signals[OBSERVED] = self._observed(signals, past)
         return signals
+
+    def _observed(self, signals: Signals, past: Past | None) -> F32:
+        """Compute the task's own entries of the observation."""
+        if past is None:
+            return observed_in_log(self.task, signals, self.follows)
+        one, now = np.array([0]), {name: column[-1:] for name, column in signals.items()}
+        if self.follows[-1]:
+            past.step(now)
+        else:
+            past.begin(one, now)
+        return np.repeat(past.now(one), len(self.tick_ns), axis=0)
 
     def _tracks(self, signals: Signals, tracker: Tracker | None) -> Signals:
         """Track who moves, tick by tick; anew where one does not follow the tick before."""

@@ -98,6 +98,9 @@ SIGNALS: tuple[Signal, ...] = (
 # places in the body frame, ground velocity along the body's axes, seconds since first seen.
 TRACK_SIGNALS = ("track_x_m", "track_y_m", "track_vx_mps", "track_vy_mps", "track_age_s")
 
+OBSERVED = "observed"  # beside them: the task's own entries, see `restock.ingest.task.task_sql`
+OWN_LIMIT = 20.0  # of such an entry, either way
+
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
 OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # rest on it
@@ -217,6 +220,7 @@ class Task(Checked, frozen=True):
     rewards: Rewards = Rewards()
     # Terms of its own beside them: name -> (weight, SQL); see `restock.ingest.task.task_sql`.
     reward_terms: dict[str, tuple[float, str]] | msgspec.UnsetType = msgspec.UNSET
+    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # entries of its own: name -> SQL
 
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
@@ -235,13 +239,13 @@ class Task(Checked, frozen=True):
                 f"range_max_m must be above range_min_m, got {self.range_max_m:g} and"
                 f" {self.range_min_m:g}"
             )
-        for name in self.reward_terms or {}:
-            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-                raise ValueError(f"reward_terms: a name is letters, digits and _, got {name!r}")
-            if name in Rewards.__struct_fields__:
-                raise ValueError(
-                    f"reward_terms: {name!r} is in [task.rewards]: choose another name"
-                )
+        taken = {"reward_terms": Rewards.__struct_fields__, "observed": self._shipped_names}
+        for table, names in taken.items():
+            for name in getattr(self, table) or {}:
+                if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+                    raise ValueError(f"{table}: a name is letters, digits and _, got {name!r}")
+                if name in names:
+                    raise ValueError(f"{table}: {name!r} is one of Restock's: choose another name")
 
     @property
     def lidar(self) -> bool:
@@ -251,6 +255,10 @@ class Task(Checked, frozen=True):
     @property
     def observation_names(self) -> list[str]:
         """Return the name of every entry of the observation, in order."""
+        return [*self._shipped_names, *(self.observed or ())]
+
+    @property
+    def _shipped_names(self) -> list[str]:
         bearings = (np.arange(self.sectors) + 0.5) * (360 / max(self.sectors, 1)) - 180
         return [
             *("near_sin", "near_cos", "far_sin", "far_cos", "goal_distance"),
@@ -269,7 +277,8 @@ class Task(Checked, frozen=True):
 
     @property
     def observation_size(self) -> int:
-        return 12 + len(self.actions) + 2 * self.sectors + 3 + 6 * (self.tracks or 0)
+        own = len(self.observed or ())
+        return 12 + len(self.actions) + 2 * self.sectors + 3 + 6 * (self.tracks or 0) + own
 
     @property
     def scaled_actions(self) -> NDArray[np.float64]:
@@ -331,6 +340,8 @@ class Mirror:
     @classmethod
     def of(cls, task: Task) -> Mirror:
         """Build the mirror image; raise ValueError if an action has no equal turn the other way."""
+        if task.observed:
+            raise ValueError("nothing says how its [task.observed] looks in a mirror")
         table = np.asarray(task.actions, np.float64)
         gap = np.abs(table[:, None] - table[None] * (1, -1)).max(axis=2)
         opposite = gap.argmin(axis=1)
@@ -362,7 +373,8 @@ class Mirror:
 def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) -> F32:
     """Compute the observation at t, (N, D) float32, by signals at t, t - 1 and the last action.
 
-    Of the signals at t - 1 it takes `sector_clearance_m` alone.
+    Of the signals at t - 1 it takes `sector_clearance_m` alone. The task's own entries (N, E) are
+    `now[OBSERVED]`.
     """
     near = np.arctan2(now["waypoint_near_y_m"], now["waypoint_near_x_m"])
     far = np.arctan2(now["waypoint_far_y_m"], now["waypoint_far_x_m"])
@@ -391,6 +403,8 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
     parts = [scalars, one_hot, clearance, closing, proposed]
     if task.tracks:
         parts.append(_tracked(task, now))
+    if task.observed:
+        parts.append(now[OBSERVED])
     return np.concatenate(parts, axis=-1).astype(np.float32)
 
 

@@ -1,106 +1,170 @@
-"""SQL of a task's own: terms of its reward, evaluated as conditions are, on logs and in the twin.
+"""SQL of a task's own: terms of its reward, and entries of its observation.
 
-A term is an expression over the steps that passes the check of a `pre` condition, and gives a
-number. It is evaluated at the step that ends a transition: `bumped` is the bumper at t + 1,
-`lag(x) OVER episode` the signal at t. So no more is needed than the episode up to there.
+Each is an expression over the steps that passes the check of a `pre` condition, gives a number, and
+is evaluated as conditions are, by the same code on logs, in the twin and on a running robot.
+
+- A reward term is evaluated at the step that ends a transition: `bumped` is the bumper at t + 1,
+  `lag(x) OVER episode` the signal at t. Its window is the episode up to there.
+- An entry of the observation is evaluated at the step that is observed. A running robot does not
+  know where ingest will cut its drive, so its window is the steps that follow each other without a
+  break, and it looks back on a limited number of them.
 """
 
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.condition_sql import names_in, steps_back
 from restock.ingest.task.conditions import NO_LIDAR, Condition, numbers, unseen
 from restock.ingest.task.schema import SIGNAL_COLUMNS, signal_arrays, steps_schema
-from restock.ingest.task.task import Signals, Task
+from restock.ingest.task.task import OWN_LIMIT, Signals, Task
 from restock.state import Stateful
 
+Table = Literal["reward_terms", "observed"]  # of [task]
+MAX_VALUE = 1e9  # more is no reward, and no reading of a sensor
 _COMMANDS = {"command_speed_mps", "command_yaw_rate_radps"}
 _UNFILLED = re.compile(r'column (?:named )?"(\w+)"')  # in DuckDB's words, of one that is not there
 
 
-def reward_terms(task: Task) -> list[Condition]:
-    """Return the terms of the task's own, with the constants of the robot's task."""
-    terms, limits = task.reward_terms or {}, task.condition_limits
-    return [Condition(name, "pre", sql).with_constants(limits) for name, (_, sql) in terms.items()]
+def own_sql(task: Task, table: Table) -> list[Condition]:
+    """Return the task's own SQL of one table, with the constants of the robot's task."""
+    given = getattr(task, table) or {}
+    sql = {name: one if isinstance(one, str) else one[1] for name, one in given.items()}
+    limits = task.condition_limits
+    return [Condition(name, "pre", text).with_constants(limits) for name, text in sql.items()]
+
+
+def own_values(task: Task, table: Table, steps: pa.Table) -> dict[str, F64]:
+    """Evaluate the SQL of one table at each step (N,); 0 for null.
+
+    `steps` are as `restock.ingest.task.conditions.label` takes them.
+
+    Raises:
+        ConfigError: an expression does not run, may look ahead, names the command, which is chosen
+            after the step, or gives no number; names it.
+    """
+
+    def refused(name: str, what: str, remedy: str | None) -> ConfigError:
+        return ConfigError(what, where=f"`task.{table}.{name}`", remedy=remedy)
+
+    own = own_sql(task, table)
+    for name, signals in ({} if task.lidar else unseen(own)).items():
+        raise refused(name, f"its SQL names {signals[0]}, and there is {NO_LIDAR}", "leave it out")
+    try:
+        values = numbers(steps, own)
+    except ConfigError as error:
+        raise refused((error.where or "").split("'")[1], error.what, error.remedy) from error
+    for one in own:
+        if early := sorted(_COMMANDS & names_in(one.sql)):
+            what = f"its SQL names {early[0]}, which is chosen only after the step"
+            raise refused(one.name, what, "use the measured motion, such as wheel_speed_mps")
+        if table == "observed" and steps_back(one.sql) is None:
+            what = "its SQL looks back without limit, and a running robot cannot"
+            remedy = "begin its frame at a number of steps: ROWS BETWEEN {2 s} PRECEDING AND …"
+            raise refused(one.name, what, remedy)
+        if table == "observed" and re.search(r"\b(step|episode)_index\b", one.sql):
+            what = "its SQL names the step or episode, which a running robot does not number"
+            raise refused(one.name, what, "use the signals alone")
+        if len(wrong := values[one.name][np.abs(values[one.name]) > MAX_VALUE]):
+            raise refused(one.name, f"it is {wrong[0]:.4g} at a step", "bound it with least()")
+    return {name: np.nan_to_num(value) for name, value in values.items()}
 
 
 def own_reward(task: Task, steps: pa.Table) -> F32:
     """Return what the task's own terms pay (N,) for the transitions that end at steps (N,).
 
-    A term that is null pays nothing. `steps` are as `restock.ingest.task.conditions.label` takes
-    them.
-
     Raises:
-        ConfigError: a term's SQL does not run, may look ahead, names the command, which is chosen
-            after the step, or gives other than finite numbers; names the term.
+        ConfigError: as `own_values`.
     """
-    terms, total = reward_terms(task), np.zeros(len(steps))
-    for name, signals in ({} if task.lidar else unseen(terms)).items():
-        what = f"its SQL names {signals[0]}, and there is {NO_LIDAR}"
-        raise ConfigError(what, where=_where(name), remedy="leave it out")
-    try:
-        values = numbers(steps, terms)
-    except ConfigError as error:
-        name = (error.where or "").split("'")[1]
-        raise ConfigError(error.what, where=_where(name), remedy=error.remedy) from error
-    for term in terms:
-        if early := sorted(_COMMANDS & names_in(term.sql)):
-            raise ConfigError(
-                f"its SQL names {early[0]}, which is chosen only after the step that it judges",
-                where=_where(term.name),
-                remedy="use the measured motion, such as wheel_speed_mps",
-            )
-        value = np.where(np.isnan(values[term.name]), 0.0, values[term.name])
-        paid = (task.reward_terms or {})[term.name][0] * value
-        if len(wrong := paid[np.abs(paid) > np.finfo(np.float32).max]):
-            what = f"it pays {wrong[0]:.4g} for a step"
-            raise ConfigError(what, where=_where(term.name), remedy="bound it with least()")
-        total += paid
+    total, terms = np.zeros(len(steps)), task.reward_terms or {}
+    for name, value in own_values(task, "reward_terms", steps).items():
+        total += terms[name][0] * value
     return total.astype(np.float32)
 
 
-def _where(term: str) -> str:
-    return f"`task.reward_terms.{term}`"
+def own_observation(task: Task, steps: pa.Table) -> F32:
+    """Return the task's own entries of the observation (N, E), within +-OWN_LIMIT.
+
+    Raises:
+        ConfigError: as `own_values`; its SQL looks back without limit.
+    """
+    values = own_values(task, "observed", steps)
+    entries = np.stack(list(values.values()), axis=-1)
+    return np.clip(entries, -OWN_LIMIT, OWN_LIMIT).astype(np.float32)
+
+
+def observed_in_log(
+    task: Task, signals: Signals, follows: Bools, at: Ints | None = None, now: Signals | None = None
+) -> F32:
+    """Return the task's own entries (T, E) at each tick of a recording.
+
+    With `at` (n,) only at these ticks, where `now` (n,) is seen in place of `signals`.
+    """
+    run = np.cumsum(~follows, dtype=np.int64)
+    if at is None:
+        tick, of, last = np.arange(len(run)), run, np.arange(len(run))
+    else:
+        near = at[:, None] + np.arange(-_longest(task, "observed"), 1)  # (n, steps kept)
+        of, place = np.nonzero((near >= 0) & (run[near] == run[at][:, None]))
+        tick, last = near[of, place], np.flatnonzero(place == near.shape[1] - 1)
+    columns = {name: signals[name][tick] for name in _named(task, "observed")}
+    if now is not None:
+        for name, column in columns.items():
+            column[last] = now[name]
+    return own_observation(task, _steps(columns, of, tick))[last]
+
+
+def _longest(task: Task, table: Table) -> int:
+    """Return how many steps the SQL of a table looks back on, at most an episode."""
+    back = [steps_back(one.sql) for one in own_sql(task, table)]
+    most = task.time_limit_steps
+    return min(max(most if steps is None else steps for steps in back), most)
+
+
+def _named(task: Task, table: Table) -> dict[str, pa.DataType]:
+    """Return the signals that the SQL of a table names, with their types in the store."""
+    named = {name for one in own_sql(task, table) for name in names_in(one.sql)}
+    return {column.name: column.type for column in SIGNAL_COLUMNS if column.name in named}
+
+
+def _steps(columns: Signals, episode: Ints, step: Ints) -> pa.Table:
+    types = {column.name: column.type for column in SIGNAL_COLUMNS}
+    arrays = {n: a.cast(types[n], safe=False) for n, a in signal_arrays(columns).items()}
+    return pa.table({"episode_index": episode, "step_index": step} | arrays)
 
 
 class Past(Stateful):
-    """The last steps of N robots in the twin, as many as the task's own SQL looks back on.
+    """The last steps of N robots, as many as the SQL of a table looks back on.
 
     Raises:
-        ConfigError: a term names what the twin does not fill, such as a profile's `[signals.*]`.
+        ConfigError: it names what `who` does not fill, such as a profile's `[signals.*]`.
     """
 
     STATE = ("steps", "columns")
 
-    def __init__(self, task: Task, robots: int) -> None:
-        self._task, terms = task, reward_terms(task)
+    def __init__(self, task: Task, table: Table, robots: int, who: str = "the twin") -> None:
+        self._task, self._table = task, table
         try:
-            own_reward(task, steps_schema().empty_table())
+            own_values(task, table, steps_schema().empty_table())
         except ConfigError as error:
             if (unfilled := _UNFILLED.search(error.what)) is None:
                 raise
             raise ConfigError(
-                f"{error.where} uses {unfilled[1]}, which the twin does not fill",
-                where="the twin",
-                remedy="write the term with Restock's own signals, or leave it out of the profile"
-                " and ingest again",
+                f"uses {unfilled[1]}, which {who} does not fill",
+                where=error.where,
+                remedy=f"{error.remedy}; or leave it out of the profile, and ingest again",
             ) from error
-        back = [steps_back(term.sql) for term in terms]
-        longest = max(task.time_limit_steps if steps is None else steps for steps in back)
-        named = {name for term in terms for name in names_in(term.sql)}
-        self._kept = min(longest, task.time_limit_steps) + 1
+        self._kept = _longest(task, table) + 1
         self.columns: dict[str, NDArray[Any]] = {  # (N, steps kept), the newest last
-            column.name: np.zeros((robots, self._kept), column.type.to_pandas_dtype())
-            for column in SIGNAL_COLUMNS
-            if column.name in named
+            name: np.zeros((robots, self._kept), kind.to_pandas_dtype())
+            for name, kind in _named(task, table).items()
         }
         self.steps = np.zeros(robots, np.int64)  # that each episode has had
 
@@ -110,16 +174,19 @@ class Past(Stateful):
         for name, column in self.columns.items():
             column[ids, -1] = signals[name]
 
-    def reward(self, signals: Signals) -> F32:
-        """Take the signals (N,) of the next step; return what the terms pay for it, (N,)."""
+    def step(self, signals: Signals) -> None:
+        """Take the signals (N,) of the next step."""
         self.steps += 1
         for name, column in self.columns.items():
             column[:, :-1] = column[:, 1:]
             column[:, -1] = signals[name]
-        step = self.steps[:, None] + np.arange(1 - self._kept, 1)  # (N, steps kept)
+
+    def now(self, ids: Ints) -> F32:
+        """Return what the last step of robots `ids` (n,) is paid, (n,), or their entries (n, E)."""
+        step = self.steps[ids, None] + np.arange(1 - self._kept, 1)  # (n, steps kept)
         robot, place = np.nonzero(step >= 0)
-        known = {name: column[robot, place] for name, column in self.columns.items()}
-        keys = {"episode_index": robot, "step_index": step[robot, place]}
-        steps = pa.table(keys | signal_arrays(known))
-        paid: F32 = own_reward(self._task, steps)[place == self._kept - 1]
-        return paid
+        known = {name: column[ids[robot], place] for name, column in self.columns.items()}
+        steps = _steps(known, robot, step[robot, place])
+        compute = own_reward if self._table == "reward_terms" else own_observation
+        found: F32 = compute(self._task, steps)[place == self._kept - 1]
+        return found

@@ -48,8 +48,10 @@ def exported(folder: Path, profile: str = "warehouse_amr") -> Path:
 
 
 @pytest.mark.long
-def test_live_tracks_equal_those_of_ingest(tmp_path):
-    text = profile_toml(PROFILE).replace("\n[task]\n", "\n[task]\ntracks = 3\n")
+def test_live_tracks_and_own_entries_equal_those_of_ingest(tmp_path):
+    nearing = "lag(clearance_m, 2) OVER episode - clearance_m"
+    own = f'observed = {{ nearing = "{nearing}", go = "goal_distance_m" }}\n'
+    text = profile_toml(PROFILE).replace("\n[task]\n", f"\n[task]\ntracks = 3\n{own}")
     (tmp_path / "tracking.toml").write_text(text)
     profile = load_profile(tmp_path / "tracking.toml")
     policy = PolicyFile(exported(tmp_path, str(tmp_path / "tracking.toml")))
@@ -60,9 +62,10 @@ def test_live_tracks_equal_those_of_ingest(tmp_path):
             "SELECT observation, stamp_ns + clock_offset_ns AS log_time_ns FROM transitions"
             " JOIN (SELECT ingest_id, clock_offset_ns FROM recordings) USING (ingest_id)"
         ).to_arrow_table()
-    stored = np.stack(rows["observation"].to_pylist()).astype(np.float32)[:, -18:]
-    live = [decisions[at].observed.observation[-18:] for at in rows["log_time_ns"].to_pylist()]
-    assert stored[:, -3].sum() > 20  # steps with a track
+    stored = np.stack(rows["observation"].to_pylist()).astype(np.float32)[:, -20:]
+    live = [decisions[at].observed.observation[-20:] for at in rows["log_time_ns"].to_pylist()]
+    assert stored[:, -5].sum() > 20  # steps with a track
+    assert np.count_nonzero(stored[:, -2]) > 700
     # A running robot knows its clock's offset within microseconds.
     np.testing.assert_allclose(np.stack(live), stored, atol=1e-4)
 

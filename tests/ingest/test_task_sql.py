@@ -1,4 +1,4 @@
-"""Reward terms of a task's own, in SQL: on logs, in the twin, and what is refused."""
+"""A task's own SQL, of reward and observation: on logs, in the twin, and what is refused."""
 
 import re
 from pathlib import Path
@@ -13,8 +13,8 @@ from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
 from restock.ingest.task.schema import steps_schema
-from restock.ingest.task.task import STORED_SIGNALS, Task
-from restock.ingest.task.task_sql import own_reward
+from restock.ingest.task.task import STORED_SIGNALS, Mirror, Task
+from restock.ingest.task.task_sql import observed_in_log, own_reward
 from restock.replay.store.store import Store
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
@@ -22,6 +22,12 @@ TERMS = """
 [task.reward_terms]
 close = [-0.5, "clearance_m < 2 * tight_clearance_m AND wheel_speed_mps > 0.4"]
 swerve = [-0.2, "abs(gyro_yaw_rate_radps - lag(gyro_yaw_rate_radps, {0.4 s}) OVER episode)"]
+"""
+ENTRIES = """
+[task.observed]
+nearing = "lag(clearance_m) OVER episode - clearance_m"
+busy = "avg(abs(gyro_yaw_rate_radps)) OVER (episode ROWS BETWEEN {0.6 s} PRECEDING AND CURRENT ROW)"
+goal_m = "least(goal_distance_m, 5)"
 """
 BATTERY = """
 [task.reward_terms]
@@ -68,6 +74,33 @@ def test_terms_are_paid_by_the_step_that_a_transition_leads_to(plain, tmp_path):
     assert len(np.unique(expected.round(1))) > 3
 
 
+def test_entries_of_ones_own_end_the_observation(plain, tmp_path):
+    with ingested(tmp_path, ENTRIES) as store:
+        rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+    observed, following, shipped = (
+        np.stack(table[name].to_numpy())
+        for table, name in (
+            (rows, "observation"),
+            (rows, "next_observation"),
+            (plain, "observation"),
+        )
+    )
+    np.testing.assert_array_equal(observed[:, :-3], shipped)
+    step, near, turn, goal = (
+        rows[name].to_numpy()
+        for name in ("step_index", "clearance_m", "gyro_yaw_rate_radps", "goal_distance_m")
+    )
+    inside = np.flatnonzero(step >= 3)
+    turns = np.mean([np.abs(turn[inside - back]) for back in range(4)], axis=0)
+    expected = np.stack([near[inside - 1] - near[inside], turns, np.minimum(goal[inside], 5)], -1)
+    np.testing.assert_allclose(observed[inside, -3:], expected, atol=1e-6)
+    inside = np.flatnonzero(step[1:] == step[:-1] + 1)
+    np.testing.assert_array_equal(observed[inside + 1], following[inside])
+    # The goal is that of the episode, in its last observation, too.
+    ends = np.flatnonzero(rows["terminated"].to_numpy() & ~rows["bumped"].to_numpy())
+    assert (following[ends, -1] <= load_profile(tmp_path / "own.toml").task.goal_radius_m).any()
+
+
 def test_a_term_on_a_custom_signal_is_paid_on_logs_alone(plain, tmp_path):
     with ingested(tmp_path, BATTERY) as store:
         rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
@@ -79,75 +112,92 @@ def test_a_term_on_a_custom_signal_is_paid_on_logs_alone(plain, tmp_path):
 
 
 def drive(task: Task, steps: int, state: dict | None = None):
-    """Return rewards (steps, 2), signals before and after each, and a state half-way."""
+    """Return rewards (steps, 2), observations, signals before and after each, and a state."""
     env, rng = WarehouseVectorEnv(2, task=task, seed=3), np.random.default_rng(0)
     on_the_spot = [place for place, (speed, _) in enumerate(task.actions) if not speed]
     actions = rng.choice(on_the_spot, (steps, 2))
-    env.reset(seed=3)
+    observations, signals, rewards, middle = [env.reset(seed=3)[0]], [env.signals], [], {}
     if state is not None:
         env.load_state_dict(state)
         actions = actions[steps // 2 :]
-    rewards, signals, middle = [], [env.signals], {}
     for index, action in enumerate(actions):
         if index == steps // 2:
             middle = env.state_dict()
-        _, reward, terminated, truncated, info = env.step(action)
+        observation, reward, terminated, truncated, info = env.step(action)
         assert not (terminated | truncated).any()
         rewards.append(reward)
+        observations.append(observation)
         signals.append(info["signals"])
-    return np.array(rewards), signals, middle
+    return np.array(rewards), np.array(observations), signals, middle
 
 
-def test_the_twin_pays_what_ingest_would_and_resumes_to_the_bit():
-    with_terms = parse_profile(WAREHOUSE + TERMS, where="own.toml").task
-    rewards, signals, middle = drive(with_terms, 24)
-    without, same, _ = drive(load_profile("warehouse_amr").task, 24)
-    assert all(
-        np.array_equal(one["pose_x_m"], two["pose_x_m"])
-        for one, two in zip(signals, same, strict=True)
-    )
+def test_the_twin_does_as_ingest_would_and_resumes_to_the_bit():
+    own = parse_profile(WAREHOUSE + TERMS + ENTRIES, where="own.toml").task
+    rewards, observations, signals, middle = drive(own, 24)
+    plain_rewards, plain_observations, _, _ = drive(load_profile("warehouse_amr").task, 24)
+    np.testing.assert_array_equal(observations[..., :-3], plain_observations)
     for robot in range(2):
         keys = {"episode_index": np.zeros(25, np.int64), "step_index": np.arange(25)}
-        columns = {
-            s.name: np.array([now[s.name][robot] for now in signals]) for s in STORED_SIGNALS
-        }
-        logged = pa.table(keys | columns).cast(steps_schema())
-        expected = own_reward(with_terms, logged)[1:]
-        np.testing.assert_array_equal(rewards[:, robot], without[:, robot] + expected)
+        now = {s.name: np.array([one[s.name][robot] for one in signals]) for s in STORED_SIGNALS}
+        logged = pa.table(keys | now).cast(steps_schema())
+        expected = own_reward(own, logged)[1:]
+        np.testing.assert_array_equal(rewards[:, robot], plain_rewards[:, robot] + expected)
         assert np.count_nonzero(expected) > 12
-        assert np.array_equal(own_reward(with_terms, logged[:9])[1:], expected[:8])  # no future
-    np.testing.assert_array_equal(drive(with_terms, 24, middle)[0], rewards[12:])
+        entries = observed_in_log(own, now, np.arange(25) > 0)
+        np.testing.assert_array_equal(observations[:, robot, -3:], entries)
+        assert np.count_nonzero(entries) > 50
+        # Neither changes with what comes after.
+        np.testing.assert_array_equal(own_reward(own, logged[:9])[1:], expected[:8])
+        early = {name: column[:9] for name, column in now.items()}
+        np.testing.assert_array_equal(observed_in_log(own, early, np.arange(9) > 0), entries[:9])
+    resumed = drive(own, 24, middle)
+    np.testing.assert_array_equal(resumed[0], rewards[12:])
+    np.testing.assert_array_equal(resumed[1][1:], observations[13:])
 
 
 def test_without_terms_nothing_changes_and_each_word_counts():
     plain = load_profile("warehouse_amr")
-    own = parse_profile(WAREHOUSE + TERMS, where="own.toml")
-    assert "reward_terms" not in profile_toml(plain)
+    own = parse_profile(WAREHOUSE + TERMS + ENTRIES, where="own.toml")
+    assert not re.search("reward_terms|observed", profile_toml(plain))
+    assert own.task.observation_names[:-3] == plain.task.observation_names
+    assert own.task.observation_size == len(own.task.observation_names)
     assert parse_profile(profile_toml(own), where="carried") == own
-    other = WAREHOUSE + TERMS.replace("-0.5", "-0.6")
+    other = WAREHOUSE + TERMS.replace("-0.5", "-0.6") + ENTRIES
     hashes = {plain.task.hash, own.task.hash, parse_profile(other, where="other.toml").task.hash}
     assert len(hashes) == 3
 
 
 REFUSED = [
-    ('x = [1, "lead(clearance_m) OVER episode"]', "lead() may look at later steps"),
-    ('x = [1, "clearence_m < 1"]', 'Referenced column "clearence_m" not found'),
-    ("x = [1, \"'much'\"]", "its SQL gives VARCHAR, not a number"),
-    ('x = [1, "command_speed_mps"]', "which is chosen only after the step"),
-    ('x = [1, "(SELECT 1)"]', "it contains a query"),
-    ('x = [1, "random()"]', "reads data other than the steps"),
-    ('goal = [1, "true"]', "'goal' is in [task.rewards]: choose another name"),
-    ('"a b" = [1, "true"]', "a name is letters, digits and _"),
-    ("x = [nan, 'true']", "must be finite"),
+    ("reward_terms", 'x = [1, "lead(clearance_m) OVER episode"]', "may look at later steps"),
+    ("reward_terms", 'x = [1, "clearence_m < 1"]', 'Referenced column "clearence_m" not found'),
+    ("reward_terms", "x = [1, \"'much'\"]", "its SQL gives VARCHAR, not a number"),
+    ("reward_terms", 'x = [1, "command_speed_mps"]', "which is chosen only after the step"),
+    ("reward_terms", 'x = [1, "(SELECT 1)"]', "it contains a query"),
+    ("reward_terms", 'x = [1, "random()"]', "reads data other than the steps"),
+    ("reward_terms", 'goal = [1, "true"]', "'goal' is one of Restock's: choose another name"),
+    ("reward_terms", '"a b" = [1, "true"]', "a name is letters, digits and _"),
+    ("reward_terms", "x = [nan, 'true']", "must be finite"),
+    ("observed", 'x = "lead(clearance_m) OVER episode"', "lead() may look at later steps"),
+    ("observed", 'x = "max(clearance_m) OVER episode"', "its SQL looks back without limit"),
+    ("observed", 'x = "step_index"', "which a running robot does not number"),
+    ("observed", 'x = "command_speed_mps"', "which is chosen only after the step"),
+    ("observed", 'x = "battery_v"', "uses battery_v, which a running robot does not fill"),
+    ("observed", 'wheel_speed = "1"', "'wheel_speed' is one of Restock's"),
 ]
 
 
-@pytest.mark.parametrize(("term", "what"), REFUSED)
-def test_a_term_that_cannot_be_is_refused_by_name(term, what):
+@pytest.mark.parametrize(("table", "given", "what"), REFUSED)
+def test_sql_that_cannot_be_is_refused_by_name(table, given, what):
     with pytest.raises(ConfigError) as refused:
-        parse_profile(f"{WAREHOUSE}\n[task.reward_terms]\n{term}\n", where="own.toml")
+        parse_profile(f"{WAREHOUSE}\n[task.{table}]\n{given}\n", where="own.toml")
     assert what in str(refused.value)
-    assert "reward_terms" in str(refused.value)
+    assert table in str(refused.value)
+
+
+def test_what_a_task_observes_of_its_own_is_not_mirrored():
+    own = parse_profile(WAREHOUSE + ENTRIES, where="own.toml").task
+    with pytest.raises(ValueError, match="in a mirror"):
+        Mirror.of(own)
 
 
 def without(text: str, *inputs: str) -> str:
@@ -172,5 +222,5 @@ def test_a_term_on_what_is_unknown_is_refused(text, sql, what):
 def test_a_term_that_pays_without_bound_is_refused():
     task = parse_profile(f'{WAREHOUSE}\n[task.reward_terms]\nx = [1, "exp(710)"]\n', where="").task
     steps = pa.table({name: [0] for name in ("episode_index", "step_index")})
-    with pytest.raises(ConfigError, match="it pays inf for a step"):
+    with pytest.raises(ConfigError, match="it is inf at a step"):
         own_reward(task, steps)

@@ -33,6 +33,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.filling import Routing
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import (
+    OBSERVED,
     TRACK_SIGNALS,
     Signals,
     Task,
@@ -167,10 +168,12 @@ def one_step(
         parts = terms(twin, plans.progress_m(steps, rows, twin))
         reward = np.asarray(sum(parts.values()))
         twin |= {name: np.full((len(rows), task.tracks or 0), np.nan) for name in TRACK_SIGNALS}
+        own = len(task.observed or ())
+        twin[OBSERVED] = np.zeros((len(rows), own))
         seen = observe(task, twin, now, action)
-        if task.tracks:  # of one step there are none: not compared
-            first = task.observation_names.index("track_x_0")
-            seen[:, first:] = next_observed[:, first:]
+        # What needs the steps before is as logged: not compared.
+        first = task.observation_size - 6 * (task.tracks or 0) - own
+        seen[:, first:] = next_observed[:, first:]
         results[name] = StepResult(seen, reward, parts)
     return OneStep(
         rows=rows,

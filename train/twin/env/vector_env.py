@@ -35,11 +35,11 @@ from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Limits, Robot, limit, refuse_beyond_steering
-from restock.ingest.task.task import Signals, Task, nearest_action, observe, reward
+from restock.ingest.task.task import OBSERVED, Signals, Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
-from restock.ingest.task.task_sql import Past
+from restock.ingest.task.task_sql import Past, Table
 from restock.replay.fleet.missions_file import MissionOrder
-from restock.state import Stateful
+from restock.state import Stateful, saved
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
 from restock.train.twin.env.interface import Info, MadeAgain, Step
 from restock.train.twin.env.navigation import Navigation, Truth, info_after, info_now
@@ -260,7 +260,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
             planners = self.navigation.planners
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
             self.queue.follow(orders, missions_share)
-        self.past = Past(self.task, num_envs) if self.task.reward_terms else None
+        own: tuple[Table, ...] = ("reward_terms", OBSERVED)
+        self.past = {t: Past(self.task, t, num_envs) for t in own if getattr(self.task, t)}
         self.limits: Limits | None = None  # a limiter in front of whoever drives; None: none
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
@@ -332,8 +333,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.sensing.add_motion(ids, first)
         self.navigation.add_route(first, ids)
         self.navigation.propose(first)
-        if self.past is not None:
-            self.past.begin(ids, first)
+        for past in self.past.values():
+            past.begin(ids, first)
+        if OBSERVED in self.past:
+            first[OBSERVED] = self.past[OBSERVED].now(ids)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
         if self.signals:
@@ -411,8 +414,12 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.bumps += sim.bumped
         self.navigation.update(after, offset, self.sensing)
         self.navigation.propose(after)
-        if self.past is not None:
-            earned = earned + self.past.reward(after)
+        for past in self.past.values():
+            past.step(after)
+        if task.reward_terms:
+            earned = earned + self.past["reward_terms"].now(everyone)
+        if task.observed:
+            after[OBSERVED] = self.past[OBSERVED].now(everyone)
 
         terminated &= ~invalid
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
@@ -461,7 +468,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     def state_dict(self) -> dict[str, Any]:
         """Return all that a bit-exact continuation needs, and what it must be continued on."""
         floors = names_and_hashes(self.floors)
-        own = {} if self.past is None else {"past": self.past.state_dict()}
+        own = {"past": saved(self.past)} if self.past else {}
         return {"task_hash": self.task.hash, "floors": floors, **own, **super().state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -483,8 +490,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         refuse_other_floors(state["floors"], self.floors)
         for env, spec in enumerate(specs):
             self._lay_out(env, spec)
-        if self.past is not None:
-            self.past.load_state_dict(state["past"])
+        for table, past in self.past.items():
+            past.load_state_dict(state["past"][table])
         super().load_state_dict(state)
 
 
