@@ -22,7 +22,13 @@ from restock.files import building, expect_place
 from restock.process import expect_installed, interrupts_raised
 from restock.replay.export import FORMATS
 from restock.replay.export.selection import Selection, open_selection
-from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
+from restock.replay.export.trajectory import (
+    STATE,
+    Counts,
+    Trajectory,
+    count_episodes,
+    trajectories,
+)
 from restock.replay.panel.panel import HEADER
 
 READ = {
@@ -54,6 +60,7 @@ def card(selection: Selection, counts: Counts, contents: Contents, to: str) -> s
     """Return the text of the card; it says that no licence was given."""
     reported, task = counts.describe(), selection.task
     size = next((name for most, name in _SIZES if reported["transitions"] < most), "1M<n<10M")
+    observed = selection.provenance["observation_names"]
     front = [
         "task_categories: [robotics, reinforcement-learning]",
         f"tags: [{_HUB_TAG[to]}, robotics, offline-rl, mobile-robots, restock]",
@@ -83,8 +90,8 @@ def card(selection: Selection, counts: Counts, contents: Contents, to: str) -> s
         "",
         *("## Contents", ""),
         f"- Action: {action}.",
-        f"- Observation: {selection.observation_size} numbers, by name: "
-        + ", ".join(f"`{name}`" for name in task.observation_names)
+        f"- Observation: {len(observed)} numbers, by name: "
+        + ", ".join(f"`{name}`" for name in observed)
         + ".",
         "- Reward: the task's, recomputed from the logged signals.",
         *(
@@ -179,6 +186,11 @@ def export_dataset(
         continuous=continuous,
         cameras=cameras,
     ) as selection:
+        if selection.by_name and to not in WITH_IMAGES:
+            raise StoreError(
+                f"the format {to} holds the task's observation, and no {STATE}",
+                remedy=f"leave it out of the query, or export to {', '.join(WITH_IMAGES)}",
+            )
         counts.rows += sum(selection.left_out.values())
         counts.left_out.update(selection.left_out)
         contents = Contents()

@@ -6,7 +6,8 @@
     meta/restock.json                           where it is from
 
 A frame is an observation and the action taken there. The layout has no frame for the observation
-after the last action, so `next.observation.state` keeps it in every frame. A camera's frame in
+after the last action, so `next.observation.state` keeps it in every frame (not if a query chooses
+the state). A camera's frame in
 force at a step is its `observation.images.CAMERA`, a file within the table; there are no videos.
 """
 
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from restock.replay.export.images import ImageFeature, pictures
 from restock.replay.export.selection import Selection
-from restock.replay.export.trajectory import Counts, Trajectory, fixed_lists
+from restock.replay.export.trajectory import STATE, Counts, Trajectory, fixed_lists
 
 CODEBASE_VERSION = "v3.0"
 CHUNK_FILES, DATA_FILE_MB = 1000, 100
@@ -150,10 +151,11 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
     """Return an episode's columns, (T,) or (T, k) each."""
     steps = np.arange(len(t))
     last = steps == len(t) - 1
+    chosen = t.carried.get(STATE)  # what it is after the last step, no row says
     return {
-        "observation.state": t.observations[:-1],
+        STATE: t.observations[:-1] if chosen is None else chosen.astype(np.float32),
         "action": t.actions,
-        "next.observation.state": t.observations[1:],
+        **({"next.observation.state": t.observations[1:]} if chosen is None else {}),
         "next.reward": t.rewards,
         "next.done": last,
         "next.terminated": last & t.terminated,
@@ -163,6 +165,7 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
             if column.dtype == object
             else column
             for name, column in t.carried.items()
+            if name != STATE
         },
         "timestamp": (steps / fps).astype(np.float32),
         "frame_index": steps,
@@ -175,7 +178,7 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
 def _features(selection: Selection, columns: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return info.json's `features`: dtype, shape and entry names of every column."""
     names = {
-        "observation.state": selection.provenance["observation_names"],
+        STATE: selection.provenance["observation_names"],
         "next.observation.state": selection.provenance["observation_names"],
         "action": selection.provenance["action_names"] if selection.continuous else ["index"],
     }

@@ -23,6 +23,7 @@ from restock.replay.export.trajectory import (
     COMMAND,
     NEXT_IS_NEXT,
     REQUIRED,
+    STATE,
     missing_columns,
 )
 from restock.replay.panel.panel import HEADER, Panel
@@ -54,6 +55,7 @@ class Selection:
     store: Store | None = None  # that the rows are of, where frames of cameras go with them
     cameras: tuple[str, ...] = ()  # each row has a frame of each
     left_out: Mapping[str, int] = field(default_factory=dict)  # rows, by reason
+    by_name: bool = False  # each row has a state of chosen numbers
 
     @property
     def observation_size(self) -> int:
@@ -153,6 +155,12 @@ def _of_query(
         if expected is not None and not expected.fits(str(kind)):
             raise QueryError(f"its {name} is a {kind}, not {expected.words}", where=where)
     requested, left_out = text, dict[str, int]()
+    state = _state(columns, result.types, where)
+    if state:
+        known = " AND ".join(f"coalesce(isfinite({value}), false)" for value in state.values())
+        having = f"FROM ({text}) WHERE {known}"
+        left_out[f"{STATE} is not known"] = _fewer(connection, text, having, where)
+        text = having
     for camera in cameras:
         text, left_out[f"no frame of camera {camera}"] = _with_frames(
             connection, text, columns, camera, where
@@ -193,6 +201,8 @@ def _of_query(
     carried = {name: name for name in CARRIED if name in columns}
     if "primary_condition" in columns:
         carried["condition"] = "primary_condition AS condition"
+    if state:
+        carried[STATE] = f'[{", ".join(state.values())}] AS "{STATE}"'
     wanted = (*REQUIRED, *(COMMAND if continuous else ()), *carried.values())
     relation = run_query(
         connection,
@@ -214,7 +224,9 @@ def _of_query(
             "tags": _tags(store, facts[2] or []),
             **({"cameras": list(cameras)} if cameras else {}),
             **_of_task(task, continuous),
+            **({"observation_names": list(state)} if state else {}),
         },
+        by_name=bool(state),
         store=store,
         cameras=tuple(cameras),
         left_out={why: count for why, count in left_out.items() if count},
@@ -239,17 +251,47 @@ def _with_frames(
         f"FROM ({text}) WHERE transition_id IN"
         f" (SELECT transition_id FROM transition_frames WHERE camera = {literal(camera)})"
     )
+    fewer = _fewer(connection, text, having, where, f"a frame of camera {camera!r}")
+    return having, fewer
+
+
+def _fewer(
+    connection: duckdb.DuckDBPyConnection, text: str, having: str, where: str, what: str = STATE
+) -> int:
+    """Return how many rows of a query lack something; raise StoreError if all do."""
     counts = [
         fetch(connection, f"SELECT count(*) FROM ({one})", where=where)[1][0][0]
         for one in (text, having)
     ]
     if counts[0] and not counts[1]:
         raise StoreError(
-            f"none of the {counts[0]:,} rows has a frame of camera {camera!r}",
+            f"none of the {counts[0]:,} rows has {what}",
             where=where,
-            remedy="name the other cameras with --cameras, or none",
+            remedy="name the other cameras with --cameras, or none"
+            if what != STATE
+            else "choose signals that the store has: their values are all null",
         )
-    return having, counts[0] - counts[1]
+    return int(counts[0] - counts[1])
+
+
+def _state(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str, str]:
+    """Return the SQL of each number in a query's `observation.state`, by name; {} without it.
+
+    Raises:
+        QueryError: it is something else than numbers by name.
+    """
+    if STATE not in columns:
+        return {}
+    kind = types[list(columns).index(STATE)]
+    inner = dict(kind.children) if kind.id == "struct" else {}
+    if not inner or not all(_Kind("", _NUMBERS).fits(str(one)) for one in inner.values()):
+        raise QueryError(
+            f"its {STATE} is a {kind}, not numbers by name",
+            where=where,
+            remedy=f"""SELECT *, {{'x.vel': wheel_speed_mps}} AS "{STATE}" FROM transitions""",
+        )
+    names = {name: name.replace('"', '""') for name in inner}
+    return {name: f'CAST("{STATE}"."{quoted}" AS DOUBLE)' for name, quoted in names.items()}
 
 
 def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:

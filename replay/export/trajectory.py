@@ -30,6 +30,7 @@ CARRIED = (  # of a row, where the query has it
     *("transition_id", "stamp_ns", "condition", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "action_residual", "robot", "site"),
 )
+STATE = "observation.state"  # of a query: numbers by name, in place of the task's observation
 # A row of an n-step panel: whether `next_observation` is the one a single step later.
 NEXT_IS_NEXT = "next_is_next"
 
@@ -154,6 +155,8 @@ class _Rows:
             else np.ones(len(table), np.bool_)
         )
         self.carried = {name: _plain(table, name) for name in CARRIED if name in table.column_names}
+        if STATE in table.column_names:
+            self.carried[STATE] = observation_matrix(table[STATE], where)
 
     def starts(self) -> Ints:
         """Return the rows at which trajectories begin, ascending; the first is 0."""

@@ -26,6 +26,7 @@ from support.stores import TASK, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import ConfigError, ExitCode, PanelError, QueryError, StoreError
+from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.store.transitions import replaced
 from restock.process import install_command
 from restock.replay.export import FORMATS
@@ -317,6 +318,58 @@ def test_lerobot_reads_its_data_set(store_path, tmp_path, transitions):
     assert len(found["lengths"]) == found["episodes"]
     begin = found["lengths"][0]
     assert found["chunk"] == found["action"][begin : begin + 2]
+
+
+STATE = "{'x.vel': wheel_speed_mps, 'theta.vel': degrees(wheel_yaw_rate_radps)}"
+
+
+def test_lerobots_state_may_be_chosen_signals(store_path, tmp_path, transitions):
+    query = f'SELECT *, {STATE} AS "observation.state" FROM transitions'
+    document = export_dataset(store_path, "lerobot", tmp_path / "a", query=query, continuous=True)
+    info = json.loads((tmp_path / "a/meta/info.json").read_text())
+    assert info["features"]["observation.state"]["names"] == ["x.vel", "theta.vel"]
+    assert info["features"]["observation.state"]["shape"] == [2]
+    assert "next.observation.state" not in info["features"]
+    assert "2 numbers, by name: `x.vel`, `theta.vel`" in (tmp_path / "a/README.md").read_text()
+    rows = ordered(transitions)
+    with open_recording(tmp_path / "a") as recording:  # its own data set is a recording, too
+        state = recording.read({"/observation.state": ["x_vel", "theta_vel"]})["/observation.state"]
+        command = recording.read({"/action": ["command_speed_mps"]})["/action"]
+    assert document["transitions"] == len(state) == len(rows)
+    np.testing.assert_allclose(state.fields["x_vel"], rows["wheel_speed_mps"], rtol=1e-6)
+    turn = np.degrees(rows["wheel_yaw_rate_radps"])
+    np.testing.assert_allclose(state.fields["theta_vel"], turn, rtol=1e-6)
+    np.testing.assert_allclose(
+        command.fields["command_speed_mps"], rows["command_speed_mps"], rtol=1e-6
+    )
+
+
+def test_rows_whose_chosen_state_is_unknown_are_left_out(store_path, tmp_path, transitions):
+    speed = "CASE step_index WHEN 3 THEN NULL WHEN 4 THEN 'nan'::FLOAT ELSE wheel_speed_mps END"
+    query = f"""SELECT *, {{'v': {speed}}} AS "observation.state" FROM transitions"""
+    document = export_dataset(store_path, "lerobot", tmp_path / "a", query=query)
+    steps = np.asarray(transitions["step_index"])
+    unknown = int(((steps == 3) | (steps == 4)).sum())
+    assert document["left_out"] == {"observation.state is not known": unknown}
+    assert document["transitions"] == len(transitions) - unknown
+    assert document["cut"] > 0
+
+
+@pytest.mark.parametrize(
+    ("to", "state", "words"),
+    [
+        ("lerobot", "wheel_speed_mps", "its observation.state is a FLOAT, not numbers by name"),
+        ("lerobot", "{'zone': zone}", "not numbers by name"),
+        ("lerobot", "{'v': NULL::FLOAT}", "rows has observation.state"),
+        ("npz", STATE, "the format npz holds the task's observation"),
+    ],
+)
+def test_a_state_that_cannot_be_exported(store_path, tmp_path, to, state, words):
+    query = f'SELECT *, {state} AS "observation.state" FROM transitions'
+    out = tmp_path / ("a.npz" if to == "npz" else "a")
+    with pytest.raises((QueryError, StoreError), match=words):
+        export_dataset(store_path, to, out, query=query)
+    assert not out.exists()
 
 
 def test_lerobots_layout_is_complete_without_lerobot(store_path, tmp_path, monkeypatch):

@@ -37,8 +37,8 @@ class ExportCommand:
     """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata. With
     --alarm: the panel to take episodes from, in place of the run's."""
     query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
-    """An SQL query that selects transitions of a store, with all columns. Default: all
-    transitions."""
+    """An SQL query that selects transitions of a store, with all columns; for lerobot it may add
+    a struct "observation.state" of chosen signals. Default: all transitions."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
     cameras: Annotated[str, tyro.conf.arg(metavar="NAMES")] = "all"
