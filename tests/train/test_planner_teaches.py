@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -13,6 +14,7 @@ from support.paths import ROOT
 from support.toy_run import assert_same_run, config, run_to_end, session
 from torch import Tensor, tensor
 
+from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import nearest_action, proposal_reader
@@ -20,10 +22,12 @@ from restock.train.dqn.behaviour import ProposalNetwork, make_policy
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.network import members_of
-from restock.train.evaluation.policies import make_learner
+from restock.train.evaluation.evaluate import Score
+from restock.train.evaluation.policies import GreedyPolicy, load_agent, make_learner, save_agent
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
+from restock.train.run.run import Run
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
@@ -145,6 +149,55 @@ def test_onnx_deviates_where_torch_does() -> None:
         expected: Tensor = policy(torch.from_numpy(observation))
     np.testing.assert_allclose(values, expected.numpy(), atol=1e-5)
     np.testing.assert_array_equal(action, greedy_actions(policy, observation))
+
+
+def kept(path: Path, seed: int, **teacher: object) -> GreedyPolicy:
+    """Write a run with a policy of random weights; return the policy."""
+    document = {"teacher": teacher, "network": {"hidden": [16], "members": 2}, "seed": seed}
+    config = parse_config(document, where="test")
+    torch.manual_seed(seed)
+    network = make_learner(config, TASK).policy
+    about = {"config": msgspec.to_builtins(config), "task_hash": TASK.hash}
+    run = Run.create(path, about)
+    clocks = {"env_steps": 100, "gradient_steps": 7}
+    save_agent(run, network, TASK, Score({}, 0.0, 0.0), clocks)
+    return load_agent(run)
+
+
+def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, capsys) -> None:
+    one, other = (
+        kept(tmp_path / "runs" / name, seed, source="planner", margin=0.3)
+        for seed, name in enumerate("ab")
+    )
+    words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
+    assert main(words) == 0
+    assert "mean of runs of 200 steps together" in capsys.readouterr().out
+    made = load_agent(Run.open(tmp_path / "mean"))
+    observation = torch.from_numpy(observed(np.asarray(TASK.actions), np.arange(10) > 4))
+    with torch.no_grad():
+        mean = (one.network.values(observation) + other.network.values(observation)) / 2
+        torch.testing.assert_close(made.network.values(observation), mean)
+        margin = (made.network(observation) - mean).amax(dim=1)
+    torch.testing.assert_close(margin, torch.where(torch.arange(10) > 4, 0.3 / 2**0.5, 0.0))
+    assert main(words) == 2  # it exists
+
+
+@pytest.mark.parametrize(
+    ("teacher", "why"),
+    [
+        ({"source": "operator"}, "has a teacher's filter"),
+        ({"source": "none"}, "is not of the same task, network, algorithm and teacher"),
+        (None, "holds 1 run"),
+    ],
+)
+def test_runs_without_a_mean_are_refused(tmp_path: Path, capsys, teacher, why: str) -> None:
+    kept(tmp_path / "runs" / "a", 0, source="planner")
+    if teacher:
+        kept(tmp_path / "runs" / "b", 1, **teacher)
+    words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
+    assert main(words) == 2
+    assert why in capsys.readouterr().err
+    assert not (tmp_path / "mean").exists()
 
 
 def test_a_stopped_run_ends_as_a_whole_one(tmp_path: Path) -> None:

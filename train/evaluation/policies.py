@@ -10,7 +10,7 @@ action, so repeating it agrees often: the file also has the agreement of repeati
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -23,16 +23,29 @@ from restock.errors import ConfigError, PanelError, RunError, StoreError
 from restock.ingest.task.task import Task, proposal_reader
 from restock.replay.panel.panel import Panel
 from restock.state import first_mismatch
-from restock.train.dqn.behaviour import PolicyNetwork, make_policy
+from restock.train.dqn.behaviour import (
+    FilteredNetwork,
+    PolicyNetwork,
+    ProposalNetwork,
+    make_policy,
+)
 from restock.train.dqn.config import PLANNER, TrainConfig, parse_config
 from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_probabilities
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.network import QNetwork, UpdatePath
+from restock.train.dqn.network import Ensemble, QNetwork, UpdatePath, members_of
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.ope_dataset import MODEL_ROWS, held_out_rows
 from restock.train.run import checkpoint
 from restock.train.run.kept_evaluations import CloneQuality, keep_clone
-from restock.train.run.run import PolicyOrigin, Run, env_steps_of, latest_drives, resuming
+from restock.train.run.run import (
+    MEAN_OF,
+    PolicyOrigin,
+    Run,
+    chosen_policy,
+    env_steps_of,
+    latest_drives,
+    resuming,
+)
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.env.interface import Policy
 
@@ -122,7 +135,7 @@ def load_agent(run: Run) -> GreedyPolicy:
             remedy="put the settings back that were changed in config.json: network, teacher",
         ) from error
     env_steps, updates = state["env_steps"], state["gradient_steps"]
-    origin = PolicyOrigin("latest" if latest else "best", env_steps, updates, env_steps_of(run))
+    origin = PolicyOrigin(chosen_policy(run), env_steps, updates, env_steps_of(run))
     return GreedyPolicy(network.eval(), f"{run.path.name}@{updates}", origin)
 
 
@@ -190,6 +203,65 @@ def save_agent(
         "score": asdict(score),
     }
     checkpoint.save(run.best, state)
+
+
+def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
+    """Write a run that acts by the mean of the values of several runs' policies, and load it.
+
+    Runs that explored by themselves err differently, so their mean errs less (arXiv:1611.01929).
+    Where the planner taught them, the margin by which an action must be better than its proposal
+    falls with the errors, by the root of the number of runs. The run has no tables: it was fed
+    nothing itself.
+
+    Raises:
+        RunError: there are not two runs, they are not alike, or one has no policy.
+        ConfigError: a policy is of another kind of network, or has a teacher's filter.
+    """
+    runs = [Run.open(path) for path in places]
+    agents = [load_agent(run) for run in runs]
+    config = parse_config(runs[0].document["config"], where=str(runs[0].path))
+    first = agents[0].network
+    for run, agent in zip(runs, agents, strict=True):
+        if isinstance(agent.network, FilteredNetwork):
+            raise ConfigError(
+                "its policy has a teacher's filter, of which there is no mean",
+                where=str(run.path),
+                remedy='train with teacher.source = "planner" or "none"',
+            )
+        known = parse_config(run.document["config"], where=str(run.path))
+        alike = (known.network, known.loss.algorithm, known.teacher.source) == (
+            *(config.network, config.loss.algorithm, config.teacher.source),
+        )
+        if not alike or run.document["task_hash"] != runs[0].document["task_hash"]:
+            raise RunError(
+                f"is not of the same task, network, algorithm and teacher as {runs[0].path}",
+                where=str(run.path),
+                remedy="give runs that differ in their seeds alone",
+            )
+    networks = [
+        agent.network.values if isinstance(agent.network, ProposalNetwork) else agent.network
+        for agent in agents
+    ]
+    values = Ensemble([member for network in networks for member in members_of(network)])
+    network: PolicyNetwork = values
+    if isinstance(first, ProposalNetwork):
+        network = ProposalNetwork(values, None, 0.0)
+        buffers = {name: of for name, of in first.state_dict().items() if "." not in name}
+        network.load_state_dict({**network.state_dict(), **buffers})
+        network.lead /= len(runs) ** 0.5
+    document = {key: value for key, value in runs[0].document.items() if key != "format"}
+    whole = msgspec.to_builtins(config)
+    whole["network"]["members"] = len(values.members)
+    whole["teacher"]["margin"] /= len(runs) ** 0.5
+    document |= {"config": whole, MEAN_OF: [agent.version for agent in agents]}
+    steps, updates = (
+        sum(getattr(agent.origin, name) for agent in agents)
+        for name in ("env_steps", "gradient_steps")
+    )
+    made = Run.create(out, document)
+    clocks = {"env_steps": steps, "gradient_steps": updates}
+    save_agent(made, network, profile_of_run(made).task, Score({}, 0.0, 0.0), clocks)
+    return load_agent(made)
 
 
 CLONED = "cloned"

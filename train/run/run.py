@@ -48,6 +48,7 @@ from typing import Literal
 from safetensors import SafetensorError, safe_open
 
 FORMAT = "restock-run/3"
+MEAN_OF = "mean_of"  # in config.json: the policies whose mean this run's is; it learned nothing
 _EARLIER = ("restock-run/1", "restock-run/2")
 _LONG_TABLE = 4096  # rows
 _UNKNOWN = -1  # rows on disk: others than those in memory, so the next flush writes them
@@ -385,14 +386,16 @@ def _refused(run: Path, holder: str) -> RunError:
 class PolicyOrigin:
     """The training step that a policy is from, and why it is the one that drives."""
 
-    chosen: Literal["best", "latest"]
-    env_steps: int
+    chosen: Literal["best", "latest", "mean"]
+    env_steps: int  # of several runs together for their mean
     gradient_steps: int
     run_env_steps: int  # of the run so far; 0: it never drove
 
     @property
     def text(self) -> str:
         """Describe the origin: `policy of step 120,000 of 192,000, the best in training`."""
+        if self.chosen == "mean":
+            return f"mean of runs of {self.env_steps:,} steps together"
         if not self.run_env_steps:
             return f"policy of update {self.gradient_steps:,}, from the logs alone"
         of = "" if self.env_steps == self.run_env_steps else f" of {self.run_env_steps:,}"
@@ -408,7 +411,7 @@ class PolicyOrigin:
 
 def kept_policy(run: Run) -> PolicyOrigin | None:
     """Return the policy that would drive now; None without checkpoint and evaluation."""
-    chosen: Literal["best", "latest"] = "latest" if latest_drives(run) else "best"
+    chosen = chosen_policy(run)
     clocks = run_clocks(run) if chosen == "latest" else _values(run.best)
     if not clocks:
         best = [row for row in run.table("evaluations").to_pylist() if row["best"]]
@@ -416,6 +419,13 @@ def kept_policy(run: Run) -> PolicyOrigin | None:
             return None
         clocks = best[-1]
     return PolicyOrigin(chosen, clocks["env_steps"], clocks["gradient_steps"], env_steps_of(run))
+
+
+def chosen_policy(run: Run) -> Literal["best", "latest", "mean"]:
+    """Return which of its policies a run drives by."""
+    if MEAN_OF in run.document:
+        return "mean"
+    return "latest" if latest_drives(run) else "best"
 
 
 def latest_drives(run: Run) -> bool:

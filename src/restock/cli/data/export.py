@@ -13,7 +13,7 @@ from restock.cli import output
 from restock.cli.command_line import refuse
 from restock.replay.export import FORMATS
 
-TO = (*FORMATS, "onnx")
+TO = (*FORMATS, "onnx", "run")
 
 
 @dataclass
@@ -24,11 +24,12 @@ class ExportCommand:
     how each ended and the observation after its last step. If a query leaves out rows, an episode
     is cut where rows are missing and becomes several. The data set records its provenance: store
     version, query or panel, task, counts. See docs/libraries.md. The policy of a run is the best
-    one that it kept; the task is in the file's metadata. See docs/deploy.md.
+    one that it kept; the task is in the file's metadata. See docs/deploy.md. A folder of runs
+    becomes a run whose policy acts by the mean of theirs. See docs/train.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A store or a panel; for onnx, a run."""
+    """A store or a panel; for onnx, a run; for run, a folder of runs."""
     to: Annotated[str, tyro.conf.arg(constructor=Literal[TO], metavar=f"{{{','.join(TO)}}}")]
     """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
@@ -76,6 +77,11 @@ class ExportCommand:
                     output.print_text(_alarm_line(json.loads(made["alarm"])))
             return
         refuse(self, ["alarm"], "applies only to --to onnx", remedy="leave it out")
+        if self.to == "run":
+            of_rows = ["query", "action", "cameras", "panel"]
+            refuse(self, of_rows, "applies only to a data set", remedy="leave it out")
+            self._write_mean()
+            return
         from restock.replay.export.dataset import export_dataset
 
         with output.progress(f"writing {self.to}", None) as advance:
@@ -94,6 +100,25 @@ class ExportCommand:
             return
         for line in _summary(document):
             output.print_text(line)
+
+    def _write_mean(self) -> None:
+        from restock.cli import output
+        from restock.errors import RunError, counted
+        from restock.replay.places import kind_beside
+        from restock.train.evaluation.policies import write_mean
+
+        runs = sorted(place for place in self.source.glob("*") if kind_beside(place) == "run")
+        if len(runs) < 2:
+            raise RunError(
+                f"holds {counted(len(runs), 'run')}",
+                where=str(self.source),
+                remedy="give a folder of two runs or more that differ in their seeds",
+            )
+        made = write_mean(runs, self.out)
+        if self.json:
+            output.print_json({"path": str(self.out), "runs": [str(run) for run in runs]})
+        else:
+            output.print_text(f"{made.origin.text if made.origin else ''} -> {self.out}")
 
     def _cameras(self) -> list[str] | None:
         """Return cameras as `export_dataset` takes them."""
