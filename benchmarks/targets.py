@@ -9,7 +9,8 @@ operator, the same `--episodes` of each kind as they are; from ten minutes on, t
 also drive 60 of each under every perturbation, and 100 of each on floors that no run saw.
 With `--teacher planner` nobody but the planner teaches: runs are fed by quotas alone, and drive the
 missions as they are, from a seed on that chose nothing (the margin was chosen on the first 100 of
-the others). With Q constant such a policy is the planner, so what it is ahead by is Q's.
+the others). With Q constant such a policy is the planner, so what it is ahead by is Q's. Its hour
+is spent on the runs of ten minutes: the mean of their policies drives (`restock export --to run`).
 
 Intervals of the agent draw seeds and episodes again (five seeds: a little too narrow), those of
 planner and operator are Wilson's. "Ahead" is paired by episode, and by seed of the run fed
@@ -33,6 +34,8 @@ from numpy.typing import NDArray
 from twin_runs import trained
 
 from restock.stats import interval_text, wilson
+from restock.train.evaluation.policies import load_agent, write_mean
+from restock.train.run.run import Run
 
 LOGS = Path(__file__).parent.parent / "sample_logs"
 BUDGETS = {"demo": 48_000, "three-minutes": 128_000, "ten-minutes": 288_000, "hour": 1_800_000}
@@ -67,7 +70,10 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=300, help="of each kind, as they are")
     options = parser.parse_args()
     few = (4, 4, 4) if options.quick else (options.episodes, 60, 100)
-    steps, alone = BUDGETS[options.budget], options.teacher == "planner"
+    alone = options.teacher == "planner"
+    mean = alone and options.budget == "hour"
+    budget = "ten-minutes" if mean else options.budget
+    steps = BUDGETS[budget]
     if alone:  # nobody is queried, so as long a time has a third more steps
         steps = steps * 4 // 3
     settings = [*SETTINGS, f"schedule.env_steps={steps}"]
@@ -76,7 +82,7 @@ def main() -> int:
     if options.quick:
         settings += ["schedule.env_steps=2000", "schedule.offline_updates=200"]
         settings += ["evaluation.every_env_steps=1000", "evaluation.episodes=2"]
-    name = ("planner-" if alone else "") + ("quick" if options.quick else options.budget)
+    name = ("planner-" if alone else "") + ("quick" if options.quick else budget)
     runs: dict[str, list[Path]] = {"coverage": []} if alone else {"coverage": [], "uniform": []}
     further = not alone and BUDGETS[options.budget] >= BUDGETS["ten-minutes"]
     for seed, mixture in itertools.product(range(options.seeds), runs):
@@ -86,6 +92,9 @@ def main() -> int:
         if not there:
             spent = time.process_time() - began[0], time.monotonic() - began[1]
             print(f"{path.name}: {spent[0]:.0f} s of CPU in {spent[1]:.0f} s", file=sys.stderr)
+        runs[mixture].append(path)
+        if mean:
+            continue
         references = REFERENCES if (seed, mixture) == (0, "coverage") else ()
         _judge(
             path,
@@ -94,7 +103,12 @@ def main() -> int:
             *(("--seed", UNCHOSEN) if alone else ()),
             further=further and mixture == "coverage",
         )
-        runs[mixture].append(path)
+    if mean:
+        path = options.out / f"{name}-mean"
+        made = [load_agent(Run.open(run)).version for run in runs["coverage"]]
+        once(path / "made", made, partial(write_mean, runs["coverage"], path))
+        _judge(path, few, ["agent", *REFERENCES], "--seed", UNCHOSEN, further=False)
+        runs["coverage"] = [path]
     twins = ["none"]
     if further:
         twins += [*PERTURBATIONS.split(","), UNSEEN]
