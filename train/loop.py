@@ -32,7 +32,7 @@ from restock.train.feed.batch_record import LEAVE_OUT, TRAIN_SLOWER, refuse
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.logs import PROBE_ROWS, Probe
 from restock.train.feed.teacher import TeacherFailed
-from restock.train.feed.update_blocks import Made
+from restock.train.feed.update_blocks import LONGEST, Made, drawn_ahead
 from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
@@ -235,10 +235,13 @@ def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
     """Make `count` gradient steps, record each, and advance the target."""
     while count > 0:
         made = _until_due(session, count)
-        sync = session.learner.target.last_sync
-        for batch, loss, tail in _made(session, made, phase):
+        target = session.learner.target
+        sync = target.last_sync
+        for number, (batch, loss, tail) in enumerate(_made(session, made, phase), start=1):
             _note(session, batch, loss, sync, tail, phase)
-            sync = session.learner.target.last_sync
+            if number < made:  # the last one's is `_follow`'s
+                target.after(session.learner.gradient_steps)
+            sync = target.last_sync
         _follow(session, phase, notify)
         count -= made
 
@@ -246,7 +249,7 @@ def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
 def _until_due(session: Session, count: int) -> int:
     """Return how many of `count` updates come before an interval ends or a target is copied."""
     if session.blocks is None:
-        return 1
+        count = 1 if session.batches.needs_td else min(count, LONGEST)
     step, rule = session.learner.gradient_steps, session.learner.target.rule
     due = [session.config.record.every_updates]
     if isinstance(rule, Hard):
@@ -270,8 +273,10 @@ def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
             count, draw, conservative=conservative, labelled=imitation is not None
         )
         return
-    for _ in range(count):
-        batch = draw()
+    # Drawn together: after an update the caches no longer hold what draws need.
+    drawn, failed = drawn_ahead(draw, count)
+    labelled = [None if imitation is None else imitation.draw_online() for _ in drawn]
+    for batch, labels in zip(drawn, labelled, strict=True):
         expert = session.log_terms.expert_rows(batch.log_rows)
         loss = learner.update(
             batch.rows,
@@ -279,9 +284,11 @@ def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
             logged=batch.logged,
             conservative=conservative,
             expert=expert,
-            labelled=None if imitation is None else imitation.draw_online(),
+            labelled=labels,
         )
         yield batch, loss, None
+    if failed is not None:
+        raise failed
 
 
 def _note(

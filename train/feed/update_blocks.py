@@ -117,7 +117,7 @@ class UpdateBlocks:
         waiting: list[ReplayBatch] = []
         launched: Launched | None = None
         while count:
-            drawn, failed = _drawn(draw, min(longest, count))
+            drawn, failed = drawn_ahead(draw, min(longest, count))
             before, made = waiting, launched
             if drawn:
                 launched = self._launch(drawn, conservative, labelled, ahead=len(before))
@@ -166,7 +166,7 @@ class UpdateBlocks:
             yield batch, Loss(outcome.loss[k], outcome.td[k], outcome.q[k]), outcome.tail[k]
 
 
-def _drawn(
+def drawn_ahead(
     draw: Callable[[], ReplayBatch], count: int
 ) -> tuple[list[ReplayBatch], MixtureError | None]:
     """Draw batches; return them, and the error that ended them early, if any."""
