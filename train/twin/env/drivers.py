@@ -28,7 +28,7 @@ from restock.state import Stateful
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.layout import PALLET_HALF_M, pallet_half_m
+from restock.train.twin.floors.layout import PALLET_HALF_M, Warehouse, pallet_half_m
 from restock.train.twin.floors.planner import PLAN_POINTS
 from restock.train.twin.floors.state_lattice import (
     Motion,
@@ -260,30 +260,49 @@ def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> t
     return ends, speed
 
 
+def _room_m(floor: Warehouse, pallets: F64, x: F64, y: F64, within_m: float) -> F64:
+    """Return how far points (n, …) are from racks, walls and their pallets (n, K, 3).
+
+    Exact if it is below `within_m`.
+    """
+    room = near_floor_gap(floor, x, y, within_m)
+    each = (-1, *(1,) * (x.ndim - 1))
+    for column in range(pallets.shape[1]):
+        rows = np.flatnonzero(pallets[:, column, 0] > 0)
+        if len(rows):
+            middle, half = (
+                part.T.reshape(2, *each)
+                for part in (pallets[rows, column, :2], pallet_half_m(pallets[rows, column, 2]))
+            )
+            room[rows] = np.minimum(room[rows], box_gap(x[rows], y[rows], middle, half))
+    return room
+
+
+def _outlines(poses: F64, outline: F64) -> tuple[F64, F64]:
+    """Return x and y (..., K) of the points of an outline (K, 2) at poses (..., 3)."""
+    cos, sin = np.cos(poses[..., 2, None]), np.sin(poses[..., 2, None])
+    return (
+        poses[..., 0, None] + cos * outline[:, 0] - sin * outline[:, 1],
+        poses[..., 1, None] + sin * outline[:, 0] + cos * outline[:, 1],
+    )
+
+
 def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     """Return clearances (n, A, T) to racks, walls and pallets, and to people's future places.
 
     Clearances are exact below `ROOMY_M`; larger ones all count the same.
     """
     outline = outline_of(env, points=3)
-    cos, sin = np.cos(ends[..., 2, None]), np.sin(ends[..., 2, None])
-    x = ends[..., 0, None] + cos * outline[:, 0] - sin * outline[:, 1]  # (n, A, T, K)
-    y = ends[..., 1, None] + sin * outline[:, 0] + cos * outline[:, 1]
-    room = np.empty_like(x)
-    on = env.layout[ids]
+    beyond_m = float(np.hypot(*outline.T).max()) + ROOMY_M  # of a middle: all of it has room
+    room = np.full(ends.shape[:3], ROOMY_M)
+    on, pallets = env.layout[ids], env.simulation.pallets[ids]
     for index in np.unique(on):
         rows = np.flatnonzero(on == index)
-        room[rows] = near_floor_gap(env.floors[index], x[rows], y[rows], ROOMY_M)
-    pallets = env.simulation.pallets[ids]
-    for column in range(pallets.shape[1]):
-        rows = np.flatnonzero(pallets[:, column, 0] > 0)
-        if len(rows):
-            middle = pallets[rows, column, :2][:, None, None, None]
-            half = pallet_half_m(pallets[rows, column, 2])[:, None, None, None]
-            gap = box_gap(
-                x[rows], y[rows], (middle[..., 0], middle[..., 1]), (half[..., 0], half[..., 1])
-            )
-            room[rows] = np.minimum(room[rows], gap)
+        floor, pose = env.floors[index], ends[rows]
+        close = _room_m(floor, pallets[rows], pose[..., 0], pose[..., 1], beyond_m) < beyond_m
+        robot, *plan = np.nonzero(close)
+        gap = _room_m(floor, pallets[rows[robot]], *_outlines(pose[close], outline), ROOMY_M)
+        room[rows[robot], *plan] = gap.min(axis=1)
     people = np.full(ends.shape[:3], 9.0)
     traffic = env.simulation.traffic
     rows = np.flatnonzero(traffic.active[ids])
@@ -297,15 +316,13 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
         heading = traffic.heading_rad[about][..., None]
         px = traffic.position_m[about, :, 0, None] + np.cos(heading) * walked
         py = traffic.position_m[about, :, 1, None] + np.sin(heading) * walked
-        gap = np.hypot(
-            x[rows][:, None] - px[:, :, None, :, None],
-            y[rows][:, None] - py[:, :, None, :, None],
-        )
+        x, y = _outlines(ends[rows], outline)
+        gap = np.hypot(x[:, None] - px[:, :, None, :, None], y[:, None] - py[:, :, None, :, None])
         gap = gap.min(axis=4) - traffic.radius_m[None, :, None, None]
         standing = sign == 0.0  # one may pass nearer to who stands
         gap += np.where(standing, PERSON_MARGIN_M - STANDING_MARGIN_M, 0.0)[:, :, None, None]
         people[rows] = gap.min(axis=1)
-    return room.min(axis=3), people
+    return room, people
 
 
 def steps_of(env: WarehouseVectorEnv, seconds: float) -> int:
@@ -450,11 +467,11 @@ class Operator(SoftPolicy, Stateful):
         arrived = self._arrived(env, ids, ends)
         room[arrived] = 9.0
         touched = np.logical_or.accumulate(room < touch_m, axis=2)
-        left_s = np.empty(room.shape)
+        left_s = np.zeros(room.shape)
         for row, index in enumerate(ids.tolist()):
             lattice = self._lattices[index][1]
             assert lattice is not None
-            left_s[row] = lattice.time_s(ends[row])
+            left_s[row, :, begun:] = lattice.time_s(ends[row, :, begun:])
         steps = (np.arange(horizon) + 1) * env.task.control_period_s
         score = -np.where(arrived, 0.0, left_s) - 0.5 * steps - 50.0 * touched
         score = score[:, :, begun:].max(axis=2)

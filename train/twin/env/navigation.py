@@ -496,10 +496,10 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
     return np.asarray((gap <= half).all(axis=-1).any(axis=-1), np.bool_)
 
 
-def info_now(env: WarehouseVectorEnv) -> Info:
-    """Return the episodes now running and the current signals."""
+def info_now(env: WarehouseVectorEnv, signals: Signals | None = None) -> Info:
+    """Return the episodes now running and their signals; None: a copy of the current ones."""
     return {
-        "signals": {name: column.copy() for name, column in env.signals.items()},
+        "signals": signals or {name: column.copy() for name, column in env.signals.items()},
         "episode_condition": env.episode_condition.copy(),
         "block": env.block.copy(),
         "episode_seed": env.episode_seed.copy(),
@@ -524,8 +524,7 @@ def info_after(
 ) -> Info:
     """Return the info of a step that led to the signals `after` under true `condition` (N,)."""
     sim = env.simulation
-    return info_now(env) | {
-        "signals": after,
+    return info_now(env, after) | {
         "progress_m": progress_m,
         "true_condition": condition,
         "true_exposure": env.truth.exposure(),

@@ -9,6 +9,7 @@ planner's cells, both in one Dijkstra tree from the goal.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -44,6 +45,7 @@ class Motion:
     turn_radps: float  # on the spot
 
 
+@cache
 def rectangle(length_m: float, width_m: float, axle_x_m: float = 0.0, points: int = 5) -> F64:
     """Return points on a rectangle's outline, (4 * points - 4, 2), about an axle off its centre."""
     side = np.linspace(-1.0, 1.0, points)[:-1]
@@ -54,7 +56,9 @@ def rectangle(length_m: float, width_m: float, axle_x_m: float = 0.0, points: in
             for pair in ((one, side), (-side, one), (-one, -side), (side, -one))
         ]
     )
-    return corners * (length_m / 2, width_m / 2) - (axle_x_m, 0.0)
+    outline: F64 = corners * (length_m / 2, width_m / 2) - (axle_x_m, 0.0)
+    outline.setflags(write=False)
+    return outline
 
 
 @dataclass(frozen=True)

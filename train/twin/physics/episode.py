@@ -21,7 +21,7 @@ from restock.errors import ConfigError, RunError
 from restock.ingest.task.task import Body
 from restock.train.twin.floors.layout import AGENTS, NO_PATCH, PATCHES, Walk, Warehouse, no_pallets
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.floors.state_lattice import floor_gap
+from restock.train.twin.floors.state_lattice import near_floor_gap
 from restock.train.twin.missions import KINDS, MISSIONS
 from restock.train.twin.missions.mission import length_m, point_along
 from restock.train.twin.physics.perturbation import Perturbation
@@ -115,7 +115,7 @@ def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode
         for heading in (yaw, ahead, *square.tolist()):
             cos, sin = np.cos(heading), np.sin(heading)
             points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + place
-            if floor_gap(warehouse, *points.T).min() > 0:
+            if near_floor_gap(warehouse, *points.T[:, None], AISLE_ROOM_M).min() > 0:
                 return replace(episode, start=(*place, heading))
     return episode
 
