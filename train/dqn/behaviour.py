@@ -231,6 +231,5 @@ class Behaviour(Stateful):
     @torch.no_grad()
     def preference(self, observation: Tensor) -> Tensor:
         """Return 0 for plausible actions (B, A) in observations (B, D), -inf for others."""
-        logits = self._logits(observation)
-        plausible = plausible_actions(logits, self.ratio)
-        return torch.zeros_like(logits).masked_fill_(~plausible, -torch.inf)
+        plausible = plausible_actions(self._logits(observation), self.ratio)
+        return torch.where(plausible, 0.0, -torch.inf)

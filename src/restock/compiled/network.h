@@ -18,11 +18,10 @@ typedef struct {
     Size bias[MAX_LAYERS + 1], end;    /* … its bias, its gain and shift behind it */
     Hidden layer[MAX_LAYERS];
     Size room, given; /* rows that `memory` is for; of the last first input, -1: none */
-    float *memory, *input, *down, *spare, *packed;
+    float *memory, *input, *down, *spare, *panel;
 } Network;
 
 static Size aligned(Size count) { return (count + LANES - 1) / LANES * LANES; }
-static Size in_panels(Size count) { return (count + PANEL - 1) / PANEL * PANEL; }
 
 static void lay_out(Network *self) {
     const float *values = self->values.buf;
@@ -49,21 +48,18 @@ static int make_room(Network *self, Size rows) {
         return -1;
     }
     rows = rows ? rows : 1;
-    Size floats = 0, widest = 0, packed = 0;
+    Size floats = 0, widest = 0;
     for (int l = 0; l <= self->hidden; l++) {
         Size below = self->width[l], above = self->width[l + 1];
         if (below > widest)
             widest = below;
-        Size most = rows > above ? rows : above;
-        Size needs = most * in_panels(below), forward = below * in_panels(above);
-        if (forward > needs)
-            needs = forward;
-        if (needs > packed)
-            packed = needs;
+        if (above > widest)
+            widest = above;
         if (l < self->hidden)
             floats += (1 + self->norm) * aligned(rows * above) + aligned(rows);
     }
-    floats += aligned(rows * self->width[0]) + 2 * aligned(rows * widest) + packed + LANES;
+    Size deepest = rows > widest ? rows : widest; /* of a panel */
+    floats += aligned(rows * self->width[0]) + 2 * aligned(rows * widest) + deepest * PANEL + LANES;
     float *memory = malloc(sizeof(float) * (size_t)floats);
     if (!memory) {
         PyErr_NoMemory();
@@ -81,7 +77,7 @@ static int make_room(Network *self, Size rows) {
     }
     self->down = at, at += aligned(rows * widest);
     self->spare = at, at += aligned(rows * widest);
-    self->packed = at;
+    self->panel = at;
     self->room = rows;
     self->given = -1;
     return 0;
@@ -94,7 +90,7 @@ static void run_forward(Network *self, Size rows, float *out) {
         int head = l == self->hidden;
         float *z = head ? out : self->norm ? self->layer[l].normed : self->layer[l].after;
         multiply(self->tiles, x, below, 1, values + self->weight[l], 1, below, z, rows, above, below,
-                 self->packed);
+                 self->panel);
         if (head) {
             for (Size row = 0; row < rows; row++)
                 for (Size i = 0; i < above; i++)
@@ -108,7 +104,7 @@ static void run_forward(Network *self, Size rows, float *out) {
 
 static void run_backward(Network *self, const float *gradient, Size rows) {
     const float *values = self->values.buf;
-    float *into = self->gradient.buf, *packed = self->packed;
+    float *into = self->gradient.buf, *panel = self->panel;
     for (int l = self->hidden; l >= 0; l--) {
         Size below = self->width[l], above = self->width[l + 1];
         const float *x = l ? self->layer[l - 1].after : self->input, *g = gradient;
@@ -123,10 +119,10 @@ static void run_backward(Network *self, const float *gradient, Size rows) {
             g = self->down;
         }
         multiply(self->tiles, g, 1, above, x, below, 1, into + self->weight[l], above, below, rows,
-                 packed);
+                 panel);
         if (l) {
             multiply(self->tiles, g, above, 1, values + self->weight[l], below, 1, self->spare, rows,
-                     below, above, packed);
+                     below, above, panel);
             float *made = self->spare;
             self->spare = self->down, self->down = made;
         }

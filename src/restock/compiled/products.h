@@ -63,44 +63,40 @@ WIDE_TILE(1)
 NARROW_TILE(6)
 NARROW_TILE(1)
 
-/* The right matrix (depth, width), whose element (k, n) is b[k * row + n * column], to panels of
- * PANEL columns one after the other, (depth, PANEL) each, filled up with zeros. One of `row` and
- * `column` is 1. */
-static void pack(const float *b, Size row, Size column, Size depth, Size width, float *to) {
-    for (Size n = 0; n < width; n += PANEL, to += depth * PANEL) {
-        Size count = width - n < PANEL ? width - n : PANEL;
-        if (count < PANEL)
-            memset(to, 0, sizeof(float) * (size_t)(depth * PANEL));
-        if (column == 1) {
-            for (Size k = 0; k < depth; k++)
-                memcpy(to + k * PANEL, b + k * row + n, sizeof(float) * (size_t)count);
+/* `count` columns of the right matrix, whose element (k, n) is b[k * row + n * column], to one panel
+ * (depth, PANEL), filled up with zeros. One of `row` and `column` is 1. */
+static void pack(const float *b, Size row, Size column, Size depth, Size count, float *to) {
+    if (count < PANEL)
+        memset(to, 0, sizeof(float) * (size_t)(depth * PANEL));
+    if (column == 1) {
+        for (Size k = 0; k < depth; k++)
+            memcpy(to + k * PANEL, b + k * row, sizeof(float) * (size_t)count);
+        return;
+    }
+    for (Size j = 0; j < count;) {
+        const float *from = b + j * column;
+        Size k = 0;
+        if (j + 4 > count) {
+            for (; k < depth; k++)
+                to[k * PANEL + j] = from[k];
+            j++;
             continue;
         }
-        for (Size j = 0; j < count;) {
-            const float *from = b + (n + j) * column;
-            Size k = 0;
-            if (j + 4 > count) {
-                for (; k < depth; k++)
-                    to[k * PANEL + j] = from[k];
-                j++;
-                continue;
-            }
-            for (; k + 4 <= depth; k += 4) {
-                __m128 p = _mm_loadu_ps(from + k), q = _mm_loadu_ps(from + column + k);
-                __m128 r = _mm_loadu_ps(from + 2 * column + k);
-                __m128 s = _mm_loadu_ps(from + 3 * column + k);
-                _MM_TRANSPOSE4_PS(p, q, r, s);
-                float *at = to + k * PANEL + j;
-                _mm_storeu_ps(at, p);
-                _mm_storeu_ps(at + PANEL, q);
-                _mm_storeu_ps(at + 2 * PANEL, r);
-                _mm_storeu_ps(at + 3 * PANEL, s);
-            }
-            for (; k < depth; k++)
-                for (int i = 0; i < 4; i++)
-                    to[k * PANEL + j + i] = from[i * column + k];
-            j += 4;
+        for (; k + 4 <= depth; k += 4) {
+            __m128 p = _mm_loadu_ps(from + k), q = _mm_loadu_ps(from + column + k);
+            __m128 r = _mm_loadu_ps(from + 2 * column + k);
+            __m128 s = _mm_loadu_ps(from + 3 * column + k);
+            _MM_TRANSPOSE4_PS(p, q, r, s);
+            float *at = to + k * PANEL + j;
+            _mm_storeu_ps(at, p);
+            _mm_storeu_ps(at + PANEL, q);
+            _mm_storeu_ps(at + 2 * PANEL, r);
+            _mm_storeu_ps(at + 3 * PANEL, s);
         }
+        for (; k < depth; k++)
+            for (int i = 0; i < 4; i++)
+                to[k * PANEL + j + i] = from[i * column + k];
+        j += 4;
     }
 }
 
@@ -112,15 +108,15 @@ typedef struct {
 static const Tiles WIDE_TILES = {MAX_ROWS, wide_tile_8, wide_tile_1};
 static const Tiles NARROW_TILES = {6, narrow_tile_6, narrow_tile_1};
 
-/* out (rows, width) = left (rows, depth) right (depth, width); see `Tile` and `pack`. */
+/* out (rows, width) = left (rows, depth) right (depth, width); see `Tile` and `pack`. A panel at a
+ * time is packed, into the same memory: more would push what follows an update out of the caches. */
 static void multiply(const Tiles *by, const float *left, Size left_row, Size left_column,
                      const float *right, Size right_row, Size right_column, float *out, Size rows,
-                     Size width, Size depth, float *packed) {
+                     Size width, Size depth, float *panel) {
     float narrow[MAX_ROWS * PANEL];
-    pack(right, right_row, right_column, depth, width, packed);
     for (Size n = 0; n < width; n += PANEL) {
-        const float *panel = packed + n * depth;
         Size count = width - n < PANEL ? width - n : PANEL;
+        pack(right + n * right_column, right_row, right_column, depth, count, panel);
         for (Size m = 0, made; m < rows; m += made) {
             const float *from = left + m * left_row;
             float *to = count == PANEL ? out + m * width + n : narrow;
