@@ -76,7 +76,7 @@ class DiscreteActions:
 
     def read(self, actions: NDArray[Any]) -> Chosen:
         """Convert action indices (N,). Raises ConfigError for one outside the table."""
-        given = _shaped(actions, (self._num_envs,))
+        given = np.asarray(actions).reshape(self._num_envs)
         with np.errstate(invalid="ignore"):
             action = given.astype(np.int64)
         wrong = (action != given) | (action < 0) | (action >= len(self._table))
@@ -104,7 +104,7 @@ class ContinuousActions:
 
     def read(self, actions: NDArray[Any]) -> Chosen:
         """Convert commands (N, 2). Raises ConfigError for one that is not finite."""
-        requested = _shaped(actions, (self._num_envs, 2)).astype(np.float64)
+        requested = np.asarray(actions, np.float64).reshape(self._num_envs, 2)
         if not np.isfinite(requested).all():
             row = int(np.flatnonzero(~np.isfinite(requested).all(axis=1))[0])
             raise ConfigError(
@@ -117,20 +117,10 @@ class ContinuousActions:
         return action, command, {"action": action, "action_residual": residual}
 
 
-def _shaped(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return actions in this shape."""
-    return np.asarray(actions).reshape(shape)
-
-
-def action_space(
-    kind: ActionKind, task: Task, num_envs: int
-) -> DiscreteActions | ContinuousActions:
-    """Return the action space by name."""
-    kinds: dict[str, type[DiscreteActions | ContinuousActions]] = {
-        "discrete": DiscreteActions,
-        "continuous": ContinuousActions,
-    }
-    return kinds[kind](task, num_envs)
+ACTIONS: Mapping[str, type[DiscreteActions | ContinuousActions]] = {
+    "discrete": DiscreteActions,
+    "continuous": ContinuousActions,
+}
 
 
 def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
@@ -243,7 +233,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
             refuse_beyond_steering(robot, self.task.actions, where="the twin")
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
-        self._actions = action_space(action, self.task, num_envs)
+        self._actions = ACTIONS[action](self.task, num_envs)
         self.single_action_space = self._actions.space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -348,8 +348,8 @@ def near_floor_gap(floor: Warehouse, x: F64, y: F64, within_m: float) -> F64:
 def box_gap(
     x: F64,
     y: F64,
-    center: tuple[float | F64, float | F64],
-    half: tuple[float | F64, float | F64],
+    center: tuple[float | F64, float | F64] | F64,
+    half: tuple[float | F64, float | F64] | F64,
 ) -> F64:
     """Return the distance from points to an axis-aligned box; negative inside."""
     dx, dy = np.abs(x - center[0]) - half[0], np.abs(y - center[1]) - half[1]
