@@ -21,10 +21,7 @@ from restock.process import interrupts_raised
 from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.config import GIVEN, Hard
 from restock.train.dqn.network import clone
-from restock.train.evaluation.evaluate import (
-    Score,
-    score,
-)
+from restock.train.evaluation.evaluate import Score, score
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of, notes_of
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy

@@ -240,11 +240,7 @@ class Session(Stateful):
 
     def save_best(self, results: Score) -> None:
         """Keep the current policy as the run's best."""
-        clocks = {
-            "env_steps": self.progress.env_steps,
-            "gradient_steps": self.learner.gradient_steps,
-        }
-        save_agent(self.run, self.learner.policy, self.task, results, clocks)
+        save_agent(self.run, self.learner.policy, self.task, results, self.steps)
 
     def close(self) -> None:
         """Release the thread, the event files and the run."""
@@ -354,12 +350,7 @@ def open_session(
         executor=executor,
         logs=logs,
         log_terms=LogTerms.of(config, logs, learner.device),
-        practice=Practice.of(
-            config.practice,
-            env,
-            config.env.conditions,
-            goal=task.goal != "none",
-        ),
+        practice=Practice.of(config.practice, env, config.env.conditions, goal=task.goal != "none"),
         imitation=Imitation(
             config.teacher,
             logs,

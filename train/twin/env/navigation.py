@@ -265,12 +265,10 @@ class Navigation(Stateful):
 
     def propose(self, signals: Signals) -> None:
         """Add navigation's next command to the signals, by the current plan and scan."""
+        command: F64 = np.full((len(signals["stamp_ns"]), 2), np.nan)
         if self._follower is not None:
             command = self._follower.table[self._follower.choose(signals)]
-            signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
-        else:
-            unknown = np.full(len(signals["stamp_ns"]), np.nan)
-            signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = unknown, unknown.copy()
+        signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
 
     def _find_blocks(self, signals: Signals, sensing: Sensing) -> set[int]:
         """Look for blocked aisles if something is near ahead; return whose map changed."""
