@@ -22,7 +22,8 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from restock.ingest.containers.storage import Watch
     from restock.ingest.pipeline import CommitGroup, IngestResult, OnRepeat, Prepared
     from restock.ingest.profile.profile import Profile
+    from restock.ingest.store.writer import StoreWriter
 
 Result = tuple[Path, Union["IngestResult", RestockError]]
 Engine = Literal["processes", "ray"]
@@ -59,6 +61,13 @@ class IngestJob:
     repeated: OnRepeat = "keep"  # a recording that is in the store under another id
     tags: Mapping[str, str] = field(default_factory=dict)  # of every recording
 
+    @cached_property
+    def writer(self) -> StoreWriter | None:
+        """Return the store for writing; `replace` makes a job that has read nothing of it yet."""
+        from restock.ingest.store.writer import StoreWriter
+
+        return StoreWriter(self.store) if self.store is not None else None
+
     def prepare(
         self,
         path: Path,
@@ -67,14 +76,12 @@ class IngestJob:
     ) -> Prepared | RestockError:
         """Read one recording and write its files; an error is returned: the others go on."""
         from restock.ingest.pipeline import prepare
-        from restock.ingest.store.writer import StoreWriter
 
         try:
-            store = StoreWriter(self.store) if self.store is not None else None
             return prepare(
                 path,
                 self.profile,
-                store=store,
+                store=self.writer,
                 force=self.force,
                 salvage=self.salvage,
                 definitions=self.definitions,
@@ -125,15 +132,15 @@ def ingest_all(
         ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
     """
     from restock.ingest.pipeline import CommitGroup
-    from restock.ingest.store.writer import StoreWriter
 
     taken = [Path(path) for path in paths]
-    group = CommitGroup(StoreWriter(job.store) if job.store is not None else None)
+    here = replace(job)  # others get the job without what its writer has read
+    group = CommitGroup(here.writer)
     some = min(workers, len(taken))
     if engine == "ray":
         read = prepare_on_ray(job, taken, workers=workers, patience_s=group.due_in_s)
     elif some <= 1:
-        read = _one_by_one(job, taken, group, watch)
+        read = _one_by_one(here, taken, group, watch)
     else:
         read = side_by_side(job.prepare, taken, some, died=_died, patience_s=group.due_in_s)
     next_up = 0

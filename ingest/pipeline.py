@@ -56,7 +56,7 @@ from restock.ingest.store.manifest import (
 from restock.ingest.store.removal import remove_recordings
 from restock.ingest.store.summary import RepeatedDrive
 from restock.ingest.store.transitions import Provenance, recording_table, replaced
-from restock.ingest.store.writer import Staged, StoreWriter
+from restock.ingest.store.writer import Staged, StoreWriter, fold_if_many
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.schema import recording_schema
 from restock.process import interrupts_raised
@@ -174,7 +174,7 @@ def prepare(
         renamed = renamed_inputs(profile, recording.topics)
         profile = as_recorded(profile, recording.topics)
         settle(recording.recording_id)
-        before = _before(store, recording)
+        before = store.manifest(recording.recording_id) if store is not None else None
         tagged = (before or {}).get("tags") or {}
         reported = resolve_tags(profile.tags, Path(path), recording.metadata, tags, tagged)
         if store is not None and before is not None and not force and _unchanged(before, profile):
@@ -194,14 +194,6 @@ def prepare(
             if error.where:
                 raise
             raise RecordingError(error.what, where=str(path), remedy=error.remedy) from error
-
-
-def _before(store: StoreWriter | None, recording: Recording) -> dict[str, Any] | None:
-    """Return the manifest row of the same recording if it is in the store."""
-    if store is None:
-        return None
-    rows = store.live(recording.recording_id).to_pylist(maps_as_pydicts="strict")
-    return dict(rows[0]) if rows else None
 
 
 def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
@@ -433,7 +425,7 @@ def commit_all(
 ) -> list[IngestResult | StoreError | RecordingError]:
     """Commit recordings, several in one; return the result of each, in their order.
 
-    If one cannot be committed, the others still are.
+    If one cannot be committed, the others still are. Their manifests are joined once they are many.
     """
     outcomes: dict[int, IngestResult | StoreError | RecordingError] = {}
     group: dict[int, Prepared] = {}
@@ -450,6 +442,7 @@ def commit_all(
         else:
             group[place] = one
     outcomes |= _commit(store, group)
+    fold_if_many(store)
     return [outcomes[place] for place in range(len(prepared))]
 
 

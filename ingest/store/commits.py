@@ -36,7 +36,6 @@ from restock.ingest.store.lineage import (
     damage_named,
     own_path,
     packed_ingests,
-    stored_files,
 )
 from restock.ingest.store.location import (
     RECORDINGS,
@@ -290,7 +289,7 @@ class TableCommits(StoreReader):
 
         def attempt() -> int:
             table = self.path.open_table(name)
-            active = stored_files(self.path, name, table)
+            active = self._listed(name, table).files
             if {file.path for file in added} <= {file.path for file in active}:
                 return table.version()  # by the attempt before, whose answer was lost
             self._still(instead_of)
@@ -328,7 +327,7 @@ class TableCommits(StoreReader):
 
         def attempt() -> int:
             table = self.path.open_table(TRANSITIONS)
-            active = stored_files(self.path, TRANSITIONS, table)
+            active = self._listed(TRANSITIONS, table).files
             self.discard_uncommitted(TRANSITIONS, rewritten)  # of an attempt before
             rewritten.clear()
             if before and not _held(active, ingests):
@@ -426,7 +425,7 @@ class TableCommits(StoreReader):
             now_ms = time.time_ns() // 1_000_000
             actions = [
                 RemoveAction(file.path, True, now_ms)
-                for file in stored_files(self.path, name, table)
+                for file in self._listed(name, table).files
                 if file.path in paths
             ]
             if actions:

@@ -15,9 +15,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import pyarrow as pa
@@ -28,7 +28,7 @@ from restock.files import first_line
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
 from restock.ingest.store.summary import UNREADABLE, Hashes, Sketch, read_sketch, with_ends
 from restock.ingest.store.version import Version
-from restock.ingest.task.schema import recording_schema
+from restock.ingest.task.schema import DOCUMENTS, recording_schema
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
@@ -67,27 +67,37 @@ def own_path(recording_id: str, ingest_id: str) -> str:
 
 
 def stored_files(
-    place: Location, name: str, table: DeltaTable, *, without: Collection[str] = ()
+    place: Location,
+    name: str,
+    table: DeltaTable,
+    *,
+    without: Collection[str] = (),
+    known: Iterable[StoredFile] = (),
 ) -> list[StoredFile]:
     """Return the active files of table `name`, with what each holds; `without` those paths.
+
+    What is `known` of an earlier version is taken from there.
 
     Raises:
         StoreError: one is of another kind, or it cannot be read.
     """
     adds = [one for one in active_files(table) if one[0] not in without]
-    held: dict[str, tuple[tuple[Ingest, ...], bool]] = {
-        path: (one, True) for path, rows, *_ in adds if (one := _named(path, rows))
-    }
-    others = [path for path, *_ in adds if path not in held]
-    with ThreadPoolExecutor(READERS) as pool:
-        held |= zip(others, pool.map(lambda path: _read(place, name, path), others), strict=True)
-    return [
-        StoredFile(
-            path, sum(one.rows for one in ingests), size or 0, added_ms or 0, ingests, listed
-        )
-        for path, _, size, added_ms in adds
-        for ingests, listed in (held[path],)
-    ]
+    found = {(one.path, one.bytes, one.added_ms): one for one in known}
+    new: list[tuple[str, int, int]] = []
+    for path, rows, size, added_ms in adds:
+        if (key := (path, size or 0, added_ms or 0)) in found:
+            continue
+        if own := _named(path, rows):
+            found[key] = StoredFile(path, own[0].rows, *key[1:], own)
+        else:
+            new.append(key)
+    if new:
+        with ThreadPoolExecutor(READERS) as pool:
+            held = pool.map(lambda key: _read(place, name, key[0]), new)
+            for key, (ingests, listed) in zip(new, held, strict=True):
+                rows = sum(one.rows for one in ingests)
+                found[key] = StoredFile(key[0], rows, *key[1:], ingests, listed)
+    return [found[path, size or 0, added_ms or 0] for path, _, size, added_ms in adds]
 
 
 def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -> dict[str, int]:
@@ -235,13 +245,39 @@ def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bo
 _SKETCHES: dict[tuple[Location, str], Sketch] = {}  # by ingest, which never changes; 2 kB each
 
 
+@dataclass(frozen=True)
+class _Listing:
+    """The active files of a table, as they were read last."""
+
+    table: DeltaTable
+    at: tuple[str, int]  # which table it is, and its version
+    files: list[StoredFile]
+
+    @cached_property
+    def paths(self) -> dict[str, list[str]]:
+        """Return the files that hold rows of each ingest."""
+        paths: dict[str, list[str]] = {}
+        for file in self.files:
+            for one in file.ingests:
+                paths.setdefault(one.ingest_id, []).append(file.path)
+        return paths
+
+    @cached_property
+    def by_recording(self) -> dict[str, Ingest]:
+        """Return an ingest of each recording."""
+        return {one.recording_id: one for file in self.files for one in file.ingests}
+
+
 class StoreReader:
-    """What is in a store, at its newest version or at an older one."""
+    """What is in a store, at its newest version or at an older one.
+
+    What it has read of the log and of joined manifests it keeps, and reads on from there.
+    """
 
     def __init__(self, path: str | Path | Location) -> None:
         self.path = Location.of(path)
-        self._opened: DeltaTable | None = None  # transitions, as `_files_of` read them
-        self._by_ingest: dict[str, list[str]] = {}
+        self._listings: dict[str, _Listing] = {}
+        self._joined: dict[str, tuple[pa.Table, dict[str, int]]] = {}
 
     def reach(self) -> None:
         """Check that the place can be reached, and what is there is no part of a store.
@@ -268,48 +304,76 @@ class StoreReader:
             )
         return found
 
-    def manifests(
+    def manifest(self, recording_id: str) -> dict[str, Any] | None:
+        """Return the manifest row of a recording whose transitions are in the store, or None.
+
+        A joined file is read once, for all that are looked up in it.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        if TRANSITIONS not in self._listings and not self.path.has_table(TRANSITIONS):
+            return None
+        if (one := self._listing(TRANSITIONS).by_recording.get(recording_id)) is None:
+            return None
+        path = self._listing(RECORDINGS).paths.get(one.ingest_id, [own_path(*one[:2])])[-1]
+        if OWN_PATH.fullmatch(path):
+            rows, row = self.manifests([one], recording_schema()), 0
+        else:
+            if path not in self._joined:
+                place = f"{RECORDINGS}/{path}"
+                names = recording_schema().names
+                with damage_named(self.path, place):
+                    rows = self.path.read(place, columns=names, repeated=DOCUMENTS)
+                ids = rows["ingest_id"].to_pylist()
+                self._joined[path] = rows, {ingest_id: row for row, ingest_id in enumerate(ids)}
+            rows, places = self._joined[path]
+            row = places.get(one.ingest_id, len(rows))
+        return next(iter(rows.slice(row, 1).to_pylist(maps_as_pydicts="strict")), None)
+
+    def manifests(self, ingests: Sequence[Ingest], schema: pa.Schema) -> pa.Table:
+        """Return these columns of the manifests of ingests.
+
+        An ingest whose manifest the store does not have any more is left out.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        import pyarrow.compute as pc  # slow to import
+
+        parts = [schema.empty_table(), *self._manifest_files(ingests, schema)]
+        wanted = pa.array([one.ingest_id for one in ingests], pa.string())
+        found = pa.concat_tables(parts, promote_options="default")
+        return found.filter(pc.is_in(found["ingest_id"], wanted)).combine_chunks()
+
+    def _manifest_files(
         self,
         ingests: Sequence[Ingest],
         schema: pa.Schema,
         *,
         skip: tuple[type[Exception], ...] = (),
-    ) -> pa.Table:
-        """Return these columns of the manifests of ingests.
+    ) -> Iterator[pa.Table]:
+        """Yield these columns of each file that has manifests of these ingests, or of others too.
 
-        An ingest whose manifest the store does not have any more is left out, and so is a file at
-        which one of `skip` is raised.
-
-        Raises:
-            StoreError: a file is missing or damaged, or the place cannot be reached.
+        A file at which one of `skip` is raised is left out.
         """
-        parts = [schema.empty_table()]
-        if ingests:
-            at = {
-                one.ingest_id: file.path for file in self.files(RECORDINGS) for one in file.ingests
-            }
-            paths = {
-                at.get(one.ingest_id, own_path(one.recording_id, one.ingest_id)): None
-                for one in ingests
-            }
-            listed = set(at.values())
+        if not ingests:
+            return
+        listing = self._listing(RECORDINGS)
+        paths = {
+            listing.paths.get(one.ingest_id, [own_path(*one[:2])])[-1]: None for one in ingests
+        }
+        listed = {file.path for file in listing.files}
 
-            def read(path: str) -> pa.Table:
-                absent = () if path in listed else (FileNotFoundError,)
-                place = f"{RECORDINGS}/{path}"
-                with suppress(*skip), damage_named(self.path, place), suppress(*absent):
-                    return self.path.read(place, columns=schema.names)
-                return schema.empty_table()
+        def read(path: str) -> pa.Table:
+            absent = () if path in listed else (FileNotFoundError,)
+            place = f"{RECORDINGS}/{path}"
+            with suppress(*skip), damage_named(self.path, place), suppress(*absent):
+                return self.path.read(place, columns=schema.names).replace_schema_metadata(None)
+            return schema.empty_table()
 
-            with ThreadPoolExecutor(READERS) as pool:
-                parts += pool.map(read, paths)
-        import pyarrow.compute as pc  # slow to import
-
-        wanted = pa.array([one.ingest_id for one in ingests], pa.string())
-        found = pa.concat_tables(
-            [part.replace_schema_metadata(None) for part in parts], promote_options="default"
-        )
-        return found.filter(pc.is_in(found["ingest_id"], wanted)).combine_chunks()
+        with ThreadPoolExecutor(READERS) as pool:
+            yield from pool.map(read, paths)
 
     def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
         """Return one recording's transitions as they were written.
@@ -337,24 +401,10 @@ class StoreReader:
         return with_ends(rows, reported.get(ingest_id))
 
     def _files_of(self, ingest_id: str) -> list[str]:
-        """Return the active files of transitions that hold rows of an ingest.
-
-        The log is read again only if it went on.
-        """
-        if self._opened is None and not self.path.has_table(TRANSITIONS):
+        """Return the active files of transitions that hold rows of an ingest."""
+        if TRANSITIONS not in self._listings and not self.path.has_table(TRANSITIONS):
             return []
-        version = None
-        if self._opened is not None:
-            version = self._opened.version()
-            with self.path.translate_errors():
-                self._opened.update_incremental()
-        if self._opened is None or self._opened.version() != version:
-            self._opened = self.path.open_table(TRANSITIONS)
-            self._by_ingest = {}
-            for file in stored_files(self.path, TRANSITIONS, self._opened):
-                for one in file.ingests:
-                    self._by_ingest.setdefault(one.ingest_id, []).append(file.path)
-        return self._by_ingest.get(ingest_id, [])
+        return self._listing(TRANSITIONS).paths.get(ingest_id, [])
 
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
         """Yield the recording of each of these ingests and the ends of its episodes.
@@ -377,7 +427,28 @@ class StoreReader:
 
     def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
         """Return the active files of one of its tables, and which ingests they hold."""
-        return stored_files(self.path, name, self.path.open_table(name, version))
+        if version is not None:
+            return stored_files(self.path, name, self.path.open_table(name, version))
+        return self._listing(name).files
+
+    def _listing(self, name: str) -> _Listing:
+        """Return what the newest version of a table has; its log is read again if it went on."""
+        known = self._listings.get(name)
+        if known is not None:
+            with self.path.translate_errors():
+                known.table.update_incremental()
+            if known.table.version() == known.at[1]:
+                return known
+        return self._listed(name, self.path.open_table(name))
+
+    def _listed(self, name: str, table: DeltaTable) -> _Listing:
+        """Return what a table that was just opened has."""
+        known, at = self._listings.get(name), (str(table.metadata().id), table.version())
+        if known is None or known.at != at:
+            same = known.files if known is not None and known.at[0] == at[0] else ()
+            known = _Listing(table, at, stored_files(self.path, name, table, known=same))
+            self._listings[name] = known
+        return known
 
     def shown(self, version: Version | None = None) -> list[Ingest]:
         """Return the ingests whose transitions are in the store."""
@@ -388,12 +459,14 @@ class StoreReader:
         """Read their sketches, each once, however many recordings ask for them."""
         names = ("recording_id", "ingest_id", "sketch")
         schema = pa.schema([(name, pa.string()) for name in names])
-        new = [one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES]
+        new = {one.ingest_id: one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES}
         # What cannot be read is another recording's, which `restock sql` reports.
-        for reported in self.manifests(new, schema, skip=UNREADABLE).to_pylist():
-            hashes = read_sketch(reported["sketch"] or "")
-            sketch = Sketch(reported["recording_id"], reported["ingest_id"], hashes)
-            _SKETCHES[self.path, sketch.ingest_id] = sketch
+        for part in self._manifest_files(list(new.values()), schema, skip=UNREADABLE):
+            columns = (part[name].to_pylist() for name in names)
+            for recording_id, ingest_id, text in zip(*columns, strict=True):
+                if ingest_id in new:
+                    sketch = Sketch(recording_id, ingest_id, read_sketch(text or ""))
+                    _SKETCHES[self.path, ingest_id] = sketch
         keys = [(self.path, one.ingest_id) for one in ingests]
         return [_SKETCHES[key] for key in keys if key in _SKETCHES]
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -341,6 +341,17 @@ def _hashes(rows: pa.Table) -> Hashes:
     return splitmix64(total)  # mixed: the smallest are a random sample of the rows
 
 
+def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
+    """Return the sketches that have MIN_HASHES of a recording's hashes (N,), ascending."""
+    if not len(mine):
+        return []
+    hashes = np.concatenate([one.hashes for one in sketches] or [mine[:0]])
+    nearest = mine[np.minimum(np.searchsorted(mine, hashes), len(mine) - 1)]
+    which = np.repeat(np.arange(len(sketches)), [len(one.hashes) for one in sketches])
+    shared = np.bincount(which[nearest == hashes], minlength=len(sketches))
+    return [sketches[place] for place in np.flatnonzero(shared >= MIN_HASHES).tolist()]
+
+
 def looks_alike(mine: Hashes, other: Sketch) -> bool:
     """Return whether the rows (N,) and a sketch may be largely the same."""
     if not len(other.hashes):
@@ -393,7 +404,7 @@ def find_repeat(
     whose sketch looks alike, are asked for where there is one.
     """
     found = []
-    for one in sketches:
+    for one in sharing(mine, list(sketches)):
         if looks_alike(mine, one):
             with suppress(*UNREADABLE):
                 other = read(one.recording_id, one.ingest_id)

@@ -19,6 +19,7 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,6 @@ from restock.ingest.store.lineage import (
     changed_by_others,
     frame_files,
     own_path,
-    stored_files,
 )
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.summary import (
@@ -292,6 +292,10 @@ class StoreWriter(TableCommits):
         for name in (RECORDINGS, TRANSITIONS):
             if not self.path.has_table(name):
                 continue
+            # Files of versions within the window are among them, which the log knows.
+            stale = self._written_before(name, retention_hours)
+            if not stale.difference(file.path for file in self.files(name)):
+                continue
             with self.path.translate_errors():
                 unneeded = self.path.open_table(name).vacuum(
                     retention_hours=retention_hours,
@@ -300,8 +304,7 @@ class StoreWriter(TableCommits):
                     full=True,
                 )
             # It names removed files for as long as the log does, there or not.
-            stale = sorted(set(unneeded) & self._written_before(name, retention_hours))
-            deleted += [f"{name}/{file}" for file in stale]
+            deleted += [f"{name}/{file}" for file in sorted(stale.intersection(unneeded))]
         # Without commits of its own: cleaning changes no version of a table.
         self.path.delete(deleted)
         frames = self._unnamed_frames(retention_hours)
@@ -335,12 +338,12 @@ class StoreWriter(TableCommits):
         """Return manifests that join nothing and are too old for a writer to be about to commit."""
         if not self.path.has_table(RECORDINGS) or not self.path.has_table(TRANSITIONS):
             return []
-        manifests = self.path.open_table(RECORDINGS)  # before the transitions that may join them
+        manifests = self.files(RECORDINGS)  # before the transitions that may join them
         shown = {one.ingest_id for one in self.shown()}
         before_ms = (time.time() - retention_hours * 3600) * 1000
         return [
             file.path
-            for file in stored_files(self.path, RECORDINGS, manifests)
+            for file in manifests
             # A joined file was of recordings that were there: versions before need it still.
             if file.own
             and file.added_ms < before_ms
@@ -363,8 +366,8 @@ class StoreWriter(TableCommits):
 
 FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writes again, at most
 MIN_FILES = 2
-FOLD_FILES = 50  # manifests of a file each, which cost each opening 5 ms; joining one costs 20 ms
-FULL_MANIFESTS = 2_000  # a file of so many is left alone: else each fold would write all of them
+FOLD_FILES = 16  # manifests of a file each, which cost each opening 10 ms, and joining one as much
+FULL_MANIFESTS = 500  # a file of so many is left alone; joining them again would take a second
 OPERATION = "restock store compact"
 
 
@@ -409,8 +412,14 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
     return done
 
 
-def fold(store: StoreWriter, done: Compacted | None = None, changed: Collection[str] = ()) -> None:
-    """Make one file of the manifests of all recordings.
+def fold(
+    store: StoreWriter,
+    done: Compacted | None = None,
+    changed: Collection[str] = (),
+    *,
+    small: bool = False,
+) -> None:
+    """Make one file of the manifests of all recordings; if `small`, of those in small files.
 
     Ingests whose rows another tool `changed` get new summaries.
 
@@ -423,7 +432,7 @@ def fold(store: StoreWriter, done: Compacted | None = None, changed: Collection[
         return
     store.create(RECORDINGS, recording_columns())
     for _ in range(ATTEMPTS):
-        plan = _Fold.of(store, changed)
+        plan = _Fold.of(store, changed, small=small)
         if not plan.worth_it:
             break
         _summarise(store, [one for one in plan.lacking if one.ingest_id not in made], made)
@@ -453,7 +462,7 @@ def fold_if_many(store: StoreWriter) -> None:
         return
     if sum(file.own for file in store.files(RECORDINGS)) >= FOLD_FILES:
         with suppress(StoreError):  # the ingest before it is done; queries say what is damaged
-            fold(store)
+            fold(store, small=True)
 
 
 @dataclass
@@ -466,7 +475,11 @@ class _Fold:
     lacking: list[Ingest]  # of these, those whose summary is of other rows
 
     @classmethod
-    def of(cls, store: StoreWriter, changed: Collection[str]) -> _Fold:
+    def of(cls, store: StoreWriter, changed: Collection[str], *, small: bool = False) -> _Fold:
+        """Plan it. If `small`, a file is left that holds more than all smaller ones together.
+
+        So a manifest is written again a few times only, however many follow.
+        """
         shown = {one.ingest_id for one in store.shown()}
         files = store.files(RECORDINGS)
         chosen = []
@@ -475,6 +488,15 @@ class _Fold:
             full = len(held) >= FULL_MANIFESTS and held.isdisjoint(changed)
             if not full and (held or not file.own):
                 chosen.append(file)
+        if small:
+            chosen.sort(key=lambda file: len(file.ingests))
+            before = accumulate((len(file.ingests) for file in chosen), initial=0)
+            larger = (
+                place
+                for place, (file, held) in enumerate(zip(chosen, before, strict=False))
+                if not file.own and len(file.ingests) > held
+            )
+            chosen = chosen[: next(larger, None)]
         live = [one for file in chosen for one in file.ingests if one.ingest_id in shown]
         lacking = [one for one in live if one.ingest_id in changed]
         return cls(len(files), chosen, live, lacking)

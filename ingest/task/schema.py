@@ -369,6 +369,9 @@ def frame_schema() -> pa.Schema:
     return pa.schema([pa.field(one.name, one.type, nullable=False) for one in FRAME_COLUMNS])
 
 
+DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")  # many share one
+
+
 def recording_schema() -> pa.Schema:
     """Return the Arrow schema of the `recordings` table."""
     return pa.schema(

@@ -29,6 +29,7 @@ from restock.ingest.store.lineage import (
 )
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
+from restock.ingest.task.schema import DOCUMENTS
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
@@ -178,7 +179,6 @@ def literal(value: object) -> str:
     return "NULL" if value is None else "'" + str(value).replace("'", "''") + "'"
 
 
-DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")
 _TEXT = pa.dictionary(pa.int32(), pa.string())
 FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
 

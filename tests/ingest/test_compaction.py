@@ -15,7 +15,7 @@ from restock.errors import StoreError
 from restock.ingest.store import writer as writer_module
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.transitions import ENDS, packed, replaced
-from restock.ingest.store.writer import OPERATION, StoreWriter, compact, fold
+from restock.ingest.store.writer import OPERATION, StoreWriter, compact, fold, fold_if_many
 from restock.replay.store.audit import Finding, run_audits, shipped_audits
 from restock.replay.store.store import Store
 
@@ -265,6 +265,30 @@ def test_a_write_that_fails_leaves_no_part_of_a_file(writer, tmp_path, monkeypat
     with pytest.raises(StoreError if isinstance(error, OSError) else KeyboardInterrupt):
         compact(writer)
     assert parquet(tmp_path / "s") == before
+
+
+def test_one_ingest_after_the_other_leaves_few_manifests(tmp_path, monkeypatch):
+    """Each is written again a few times only; a reader that was open sees all that follow."""
+    monkeypatch.setattr(writer_module, "FOLD_FILES", 2)
+    writer, reader, merge, written = StoreWriter(tmp_path / "s"), None, writer_module.merge, []
+
+    def counted(*args, **given):
+        made = merge(*args, **given)
+        written.append(made.rows)
+        return made
+
+    monkeypatch.setattr(writer_module, "merge", counted)
+    for recording in range(1, 13):
+        writer.write_all([one(recording)])
+        fold_if_many(writer)
+        reader = reader or StoreWriter(tmp_path / "s")
+        assert reader.manifest(f"{recording:016x}")["ingest_id"] == f"{recording:016x}-a"
+        (first,) = writer.live(f"{1:016x}").to_pylist(maps_as_pydicts="strict")
+        assert reader.manifest(f"{1:016x}") == first
+        assert reader.manifest(f"{recording + 1:016x}") is None
+    assert written == [2, 4, 2, 8, 2, 4]
+    assert sorted(len(file.ingests) for file in reader.files(RECORDINGS)) == [4, 8]
+    same_as_scanned(tmp_path / "s")
 
 
 @pytest.mark.long

@@ -94,7 +94,7 @@ def test_what_a_damaged_file_loses_is_named_and_ingested_again(place, name, how)
     writer.clean(retention_hours=0)  # the files that it was made of
     damage(place, next(one for one in active(place, name) if "compacted" in one), how)
     with pytest.raises(StoreError, match=r"restock store compact .* --drop-damaged"):
-        writer.write(*one(1, "c"))
+        StoreWriter(place).write(*one(1, "c"))
     done = drop_damaged(writer)
     assert len(done.dropped) == 1
     assert [one.recording_id[-1] for one in done.lost] == ["1", "3"]

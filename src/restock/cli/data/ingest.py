@@ -99,7 +99,7 @@ class IngestCommand:
 
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.decoding.definitions import choose_definitions
-        from restock.ingest.store.writer import StoreWriter, fold_if_many
+        from restock.ingest.store.writer import StoreWriter
 
         store = None if self.dry_run else self.store
         if store is not None:
@@ -132,7 +132,6 @@ class IngestCommand:
                     show(result)
         if store is not None and outcomes:
             StoreWriter(store).clean()
-            fold_if_many(StoreWriter(store))
         if night is not None:
             output.print_text(night.total())
         if self.json:

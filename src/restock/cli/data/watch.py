@@ -36,7 +36,7 @@ from restock.ingest.containers.open_recording import (
     recordings_in,
 )
 from restock.ingest.containers.storage import unwatched
-from restock.ingest.store.writer import StoreWriter, fold_if_many
+from restock.ingest.store.writer import StoreWriter
 from restock.process import was_interrupted
 from restock.replay.places import open_place
 from restock.replay.store.audit import load_audits, load_thresholds, run_audits
@@ -131,7 +131,6 @@ class Watch:
         store, about = str(self.job.store), {"store": str(self.job.store), "recordings": written}
         try:
             StoreWriter(store).clean()
-            fold_if_many(StoreWriter(store))
             with open_place(store, only_store=True) as opened:
                 coverage = query(opened, "FROM coverage_by_condition", where=store)
                 held = coverage.to_arrow_table().to_pylist()
