@@ -334,7 +334,8 @@ def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path
 
 def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
     Run.create(tmp_path / "run", {"config": {}})
-    for place in (tmp_path / "nothing", tmp_path, tmp_path / "run"):
+    (tmp_path / "empty").mkdir()
+    for place in (tmp_path / "nothing", tmp_path / "empty", tmp_path / "run"):
         with pytest.raises(RunError) as refused:
             build_report(place)
         assert refused.value.where == str(place)

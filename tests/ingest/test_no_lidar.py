@@ -24,7 +24,7 @@ from restock.replay.plan.plan import plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
 from restock.replay.store.store import Store
 from restock.replay.trace.trace import trace_row
-from restock.train.view.write_view import write_view
+from restock.train.view.mcap_view import write_view
 
 NEEDS_ONE = ["blocked_aisle", "closing_traffic", "near_collision", "plan_blocked", "recovery"]
 SCAN = re.search(r"\[inputs\.scan\].*?\n\n", WAREHOUSE, re.DOTALL)

@@ -19,8 +19,6 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.logged_sampler import LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import rules_of
-from restock.replay.sampling.ring import FreshRing
-from restock.train.feed.batches import Batches
 from restock.train.feed.logs import Logs
 from restock.train.session import Session
 
@@ -142,28 +140,6 @@ def test_no_row_is_drawn_more_often_than_it_may_be(table, tmp_path, within):
     if within != "without_replacement":
         assert sum(row["replaced_rows"] for row in rows) > 0
     assert draws.draw(64).rows.size == 0
-
-
-def test_a_panel_read_in_chunks_gives_the_rows_it_names(table: pa.Table, tmp_path: Path) -> None:
-    text = "max_replays_per_row = 9\nsampling = 'chunked'\n[each_condition]\nshare = 'equal'\n"
-    built = panel(table, tmp_path / "p", text)
-    ring = FreshRing(64, 4, TOY_TASK.observation_size, discount=0.9)
-    logs = Logs.of_panel(built, PlannedDraws(offline=4_000))
-    parts = {"batch_size": 64, "logs_share": None, "seed": 0}
-    batches = Batches(logs, ring, **parts)  # type: ignore[arg-type]
-    again = Batches(logs, ring, **parts)  # type: ignore[arg-type]
-    counted = np.zeros(len(built), np.int64)
-    for number in range(9 * len(built) // 64):
-        batch = batches.draw_offline()
-        np.testing.assert_array_equal(batch.rows.numpy(), built.rows[batch.log_rows])
-        np.add.at(counted, batch.log_rows, 1)
-        if number == 20:
-            again.load_state_dict(batches.state_dict())
-        elif number == 21:
-            np.testing.assert_array_equal(again.draw_offline().log_rows, batch.log_rows)
-    assert counted.max() <= 9
-    with pytest.raises(MixtureError, match="every row of the panel was drawn 9 times"):
-        batches.draw_offline()
 
 
 def test_surplus_of_a_used_up_stratum_goes_to_the_others(table: pa.Table, tmp_path: Path) -> None:

@@ -26,8 +26,7 @@ from restock.train.dqn.learner import Learner
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.session import Progress
-from restock.train.view.mcap_view import critic_along
-from restock.train.view.write_view import ViewOptions, layout_of, write_view
+from restock.train.view.mcap_view import ViewOptions, critic_along, layout_of, write_view
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 

@@ -16,7 +16,11 @@ _STEPS = [
     ("env_steps", _I, "environment steps so far, all environments together"),
     ("gradient_steps", _I, "updates so far"),
 ]
-_MEASURES = [
+_OUTCOME = [  # of an evaluation's episode
+    ("success", _B, "reached the goal without a bump; null: no goal"),
+    ("bumps", _I, "number of times that a contact began"),
+    ("time_s", _F, "simulated time of the episode"),
+    ("return", _F, "undiscounted"),
     (
         "discounted_return",
         _F,
@@ -387,11 +391,7 @@ TABLES: dict[str, pa.Schema] = {
         ("perturbation", _S, "its name"),
         ("layout", _S, "name of the floor"),
         ("perturbation_values", VALUES, "parameters that are not nominal"),
-        ("success", _B, "reached the goal without a bump; null: no goal"),
-        ("bumps", _I, "number of times that a contact began"),
-        ("time_s", _F, "simulated time of the episode"),
-        ("return", _F, "undiscounted"),
-        *_MEASURES,
+        *_OUTCOME,
         ("best", _B, "whether this evaluation was the best so far"),
     ),
 }
@@ -406,11 +406,7 @@ EVAL_EPISODES = _schema(
     ("condition", _S, "kind of the fixed episode"),
     ("block", _S, "none | partial | full"),
     ("episode_seed", _I, "seed of the fixed episode"),
-    ("success", _B, "reached the goal without a bump; null: no goal"),
-    ("bumps", _I, "number of times that a contact began"),
-    ("time_s", _F, "simulated time of the episode"),
-    ("return", _F, "undiscounted"),
-    *_MEASURES,
+    *_OUTCOME,
     (
         "time_lost_s",
         _F,

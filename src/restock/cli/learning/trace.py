@@ -94,7 +94,7 @@ class TraceCommand:
         if self.view is None:
             refuse(self, ("critic",), "has no effect without --view", remedy="give --view FILE")
             return
-        from restock.train.view.write_view import check_view
+        from restock.train.view.mcap_view import check_view
 
         check_view(self.view)
         if self.row is None:
@@ -107,7 +107,7 @@ class TraceCommand:
     def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:
         if self.view is None:
             return None
-        from restock.train.view.write_view import ViewOptions, write_view
+        from restock.train.view.mcap_view import ViewOptions, write_view
 
         own = self.place if trace.audit is not None else None  # of a run
         critic = None if self.critic == "none" else self.critic or own

@@ -527,15 +527,12 @@ def _strip(plan: FloorMap, film: dict[str, Any]) -> Drawing:
 
 
 def _frame(plan: FloorMap, frame: dict[str, Any], track: list[list[float]]) -> str:
-    width, height = plan.width_m * SCALE, plan.depth_m * SCALE
-    parts = [f'<rect width="{width:.0f}" height="{height:.0f}" fill="#f8fafc"/>']
-    parts += [
+    slippery = [
         plan.box(_within(plan, x - hx, y - hy, x + hx, y + hy), 'fill="#56b4e9" fill-opacity="0.5"')
         for x, y, hx, hy in frame["patches"]
     ]
-    parts += [plan.box(rack, 'fill="#cbd5e1" stroke="#94a3b8"') for rack in plan.racks]
     goal = plan.at(*frame["goal"])
-    parts.append(f'<circle cx="{goal[0]:.1f}" cy="{goal[1]:.1f}" r="12" fill="#009e73"/>')
+    parts = [f'<circle cx="{goal[0]:.1f}" cy="{goal[1]:.1f}" r="12" fill="#009e73"/>']
     dashed = 'stroke="#009e73" stroke-width="4" stroke-dasharray="10 8"'
     parts.append(_line(plan, frame["plan"], dashed))
     parts.append(_line(plan, track, 'stroke="#d55e00" stroke-width="6"'))
@@ -545,11 +542,7 @@ def _frame(plan: FloorMap, frame: dict[str, Any], track: list[list[float]]) -> s
         x, y = plan.at(x_m, y_m)
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{PERSON_M * SCALE}" fill="#0072b2"/>')
     parts.append(_box(plan, frame["robot"], BODY_M, "#d55e00"))
-    parts.append(
-        f'<rect width="{width:.0f}" height="{height:.0f}" fill="none" stroke="#94a3b8"'
-        ' stroke-width="3"/>'
-    )
-    return "".join(parts)
+    return plan.plan(slippery, parts)
 
 
 def _within(plan: FloorMap, x0: float, y0: float, x1: float, y1: float) -> Box:
