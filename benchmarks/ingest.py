@@ -4,9 +4,10 @@
 
 All contestants read the same generated log (20 minutes of it, 2 with `--quick`) in one process,
 one after the other in every round; their values are compared along the way. Then the whole of
-`restock ingest`, one worker against two, and peak memory on recordings of 2 GB (256 MB with
-`--quick`). `--check` exits 1 where a target of the design is missed. A peer that is not installed
-is left out, and what is asked of Restock beside it is not measured.
+`restock ingest`, one worker against two, SHORT recordings of two minutes in one process against
+one alone, and peak memory on recordings of 2 GB (256 MB with `--quick`). `--check` exits 1 where a
+target of the design is missed. A peer that is not installed is left out, and what is asked of
+Restock beside it is not measured.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ import robot_log
 import zstandard
 from harness import finish, in_turns, markdown, medians, option_parser
 
-from restock.ingest.pipeline import ingest
+from restock.ingest.batch import IngestJob, ingest_all
+from restock.ingest.pipeline import IngestResult, ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 
@@ -59,6 +61,7 @@ ROBOT = "turtlebot3"  # the shipped profile that fits the generated log
 MEMORY_MB = 400  # what "a few hundred MB" is taken for
 IMAGES_MB = 50  # by how much images may raise it
 PLAIN, LONG, LONGER = "MCAP, no images", "MCAP, no images, 4x as long", 4
+SHORT = 32
 LIMIT_MB = 768  # of private memory set aside, used or not: beyond it is a MemoryError
 
 # One process' peak: code and pages of mapped files included.
@@ -177,6 +180,26 @@ def two_workers(folder: Path, seconds: float, stores: Stores, rounds: int) -> di
     return {"one_s": one, "two_s": two, "faster": one / two, "load": os.getloadavg()[0]}
 
 
+def short_recordings(folder: Path, stores: Stores, rounds: int) -> dict[str, float]:
+    """CPU time of one recording of two minutes alone, and of each of SHORT different ones."""
+    paths = [
+        robot_log.write_mcap(folder / f"short_{number}.mcap", 120.0, seed=number + 1)
+        for number in range(SHORT)
+    ]
+    profile = load_profile(ROBOT)
+
+    def ingested(some: list[Path]) -> None:
+        outcomes = dict(ingest_all(some, IngestJob(profile, stores.new())))
+        assert all(isinstance(one, IngestResult) for one in outcomes.values())
+
+    ingested(paths[:1])
+    work = {"alone_s": paths[:1], "each_s": paths}
+    used = medians(
+        in_turns({n: partial(cpu_s, partial(ingested, some)) for n, some in work.items()}, rounds)
+    )
+    return used | {"each_s": used["each_s"] / SHORT}
+
+
 def limit() -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_MB << 20, LIMIT_MB << 20))
 
@@ -288,6 +311,8 @@ def lines(answer: dict[str, Any]) -> Iterator[str]:
         f"\nsix recordings: {workers['one_s']:.2f} s by one worker, {workers['two_s']:.2f} s by"
         f" two: {workers['faster']:.2f}x (load average {workers['load']:.1f})\n"
     )
+    alone, each = answer["short"]["alone_s"], answer["short"]["each_s"]
+    yield f"a recording of two minutes: {alone:.3f} CPU s alone, {each:.3f} as one of {SHORT}\n"
     verdicts = {True: "met", False: "MISSED", None: "not measured"}
     yield from (f"{verdicts[observed]:12} {name}" for name, observed in answer["targets"].items())
 
@@ -305,6 +330,7 @@ def main() -> int:
         quick, slow, equal = contestants(folder, seconds, stores)
         cpu = medians(measure(quick, slow, rounds, slow_rounds))
         workers = two_workers(folder, seconds * 2, stores, 3)
+        short = short_recordings(folder, stores, rounds)
         used = memory(folder, seconds, 256 if options.quick else 2200)
         columns = readers.restock_columns(folder / "log.mcap")
         size_mb = (folder / "log.mcap").stat().st_size / 1e6
@@ -319,6 +345,7 @@ def main() -> int:
         "over_floor": ratio,
         "left_out": sorted(readers.NOT_INSTALLED),
         "workers": workers,
+        "short": short,
         "memory": used,
         "mb_an_hour": (used[LONG]["peak_mb"] - used[PLAIN]["peak_mb"])
         / ((LONGER - 1) * seconds / 3600),

@@ -21,18 +21,19 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union
 
 from restock.errors import TRACEBACK, ConfigError, RecordingError, RestockError, print_traceback
-from restock.process import import_extra
+from restock.process import import_extra, in_step
 
 if TYPE_CHECKING:
     from restock.errors import RestockError
@@ -43,8 +44,11 @@ if TYPE_CHECKING:
 
 Result = tuple[Path, Union["IngestResult", RestockError]]
 Engine = Literal["processes", "ray"]
+A = TypeVar("A")
 T = TypeVar("T")
 D = TypeVar("D")
+# Of short recordings that are labelled together: how many, and how large they are together.
+BUNDLE, BUNDLE_BYTES = 16, 64 << 20
 PATIENCE_S = 10  # for a worker that was told to stop, before it is killed
 AGAIN = "run it again: recordings that are already in the store are skipped"
 
@@ -78,18 +82,7 @@ class IngestJob:
         from restock.ingest.pipeline import prepare
 
         try:
-            return prepare(
-                path,
-                self.profile,
-                store=self.writer,
-                force=self.force,
-                salvage=self.salvage,
-                definitions=self.definitions,
-                repeated=self.repeated,
-                tags=self.tags,
-                watch=watch,
-                settle=settle,
-            )
+            return prepare(path, self.profile, watch=watch, settle=settle, **self.options)
         except RestockError as error:
             return error
         except MemoryError:
@@ -111,6 +104,44 @@ class IngestJob:
                 remedy=f"please report it ({TRACEBACK}=1 shows the traceback); this recording was "
                 "not added to the store, the others were",
             )
+
+    def prepare_several(
+        self, paths: Sequence[Path], **more: Any
+    ) -> Iterator[tuple[int, Prepared | RestockError]]:
+        """Yield what `prepare` returns of each path, with its place, as it comes.
+
+        Short recordings are labelled together. What cannot be done so is done alone.
+        """
+        from restock.ingest.pipeline import Prepared, preparing
+
+        left, ids = dict(enumerate(paths)), set[str]()
+        settle = more.get("settle", ids.add)
+
+        def settle_first(recording_id: str) -> None:
+            if recording_id in ids:
+                raise LookupError  # after the other one: it may be the same
+            settle(recording_id)
+            ids.add(recording_id)
+
+        with suppress(Exception):  # `prepare` says what is wrong with which
+            how = {**self.options, **more, "settle": settle_first}
+            works = [preparing(path, self.profile, **how) for path in paths if len(paths) > 1]
+            for place, one in in_step(works):
+                if isinstance(one, Prepared | RestockError):
+                    del left[place]
+                    yield place, one
+        for place, path in left.items():
+            yield place, self.prepare(path, **more)
+
+    def prepare_list(self, paths: Sequence[Path]) -> list[Prepared | RestockError]:
+        """Return what `prepare` returns of each path."""
+        return [one for _, one in sorted(self.prepare_several(paths), key=itemgetter(0))]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return what `preparing` is told of every recording."""
+        names = ("force", "salvage", "definitions", "repeated", "tags")
+        return {"store": self.writer, **{name: getattr(self, name) for name in names}}
 
 
 def ingest_all(
@@ -142,7 +173,7 @@ def ingest_all(
     elif some <= 1:
         read = _one_by_one(here, taken, group, watch)
     else:
-        read = side_by_side(job.prepare, taken, some, died=_died, patience_s=group.due_in_s)
+        read = _by_workers(job, taken, some, group)
     next_up = 0
     try:
         with closing(read):
@@ -171,8 +202,47 @@ def _one_by_one(
         if watch is not None:
             watch(what, done, of)
 
+    for bundle in _bundles(paths, BUNDLE):
+        several = [paths[place] for place in bundle]
+        for at, one in job.prepare_several(several, watch=watched, settle=group.settle):
+            yield bundle[at], one
+
+
+def _by_workers(
+    job: IngestJob, paths: Sequence[Path], workers: int, group: CommitGroup
+) -> Generator[tuple[int, Prepared | RestockError] | None]:
+    """Prepare recordings in several processes; those of one that died are read again alone."""
+
+    def died(bundle: Sequence[Path], code: int) -> list[Prepared | RestockError]:
+        return [_died(path, code) for path in bundle if len(bundle) == 1]
+
+    left = _bundles(paths, min(BUNDLE, max(len(paths) // (4 * workers), 1)))
+    while left:
+        bundles, left = left, []
+        several = [[paths[place] for place in bundle] for bundle in bundles]
+        for arrived in side_by_side(
+            job.prepare_list, several, workers, died=died, patience_s=group.due_in_s
+        ):
+            if arrived is None:
+                yield None
+                continue
+            bundle, found = bundles[arrived[0]], arrived[1]
+            left += [[place] for place in bundle if not found]
+            yield from zip(bundle, found, strict=False)
+
+
+def _bundles(paths: Sequence[Path], most: int) -> list[list[int]]:
+    """Put together the places of up to `most` short recordings that follow each other."""
+    bundles: list[list[int]] = []
+    whole = 0
     for place, path in enumerate(paths):
-        yield place, job.prepare(path, watched, group.settle)
+        size = _size(path)
+        if not bundles or len(bundles[-1]) >= most or whole + size > BUNDLE_BYTES:
+            bundles.append([])
+            whole = 0
+        bundles[-1].append(place)
+        whole += size
+    return bundles
 
 
 def out_of_memory(path: Path) -> RecordingError:
@@ -199,14 +269,14 @@ class _Worker(Generic[T]):
 
 
 def side_by_side(
-    work: Callable[[Path], T],
-    paths: Sequence[Path],
+    work: Callable[[A], T],
+    paths: Sequence[A],
     workers: int,
     *,
-    died: Callable[[Path, int], D],
+    died: Callable[[A, int], D],
     patience_s: Callable[[], float | None] = lambda: None,
 ) -> Generator[tuple[int, T | D] | None]:
-    """Yield what `work` returns for each path, with its place, as it comes.
+    """Yield what `work` returns for each path, or several, with their place, as it comes.
 
     A path whose process died gives `died(path, exit code)`. Yields None if nothing came for
     `patience_s()` seconds, which is evaluated at each wait. The largest recordings begin first, so
@@ -267,7 +337,7 @@ def warm_up() -> None:
         forkserver.ensure_running()
 
 
-def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
+def _serve(pipe: Connection, work: Callable[[A], T]) -> None:
     """Run a worker: one recording after the other, until none is left or the parent is gone."""
     from restock.ingest.containers.mcap_file import ChunkReader
 
@@ -303,8 +373,10 @@ def _context() -> ForkServerContext | SpawnContext:
     return context
 
 
-def _size(path: Path) -> int:
-    """Return the bytes of a recording, summed over a folder's files; 0 if it is gone."""
+def _size(path: object) -> int:
+    """Return the bytes of recordings, summed over a folder's files; 0 if it is gone."""
+    if not isinstance(path, Path):
+        return sum(map(_size, path if isinstance(path, Sequence) else ()))
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
 

@@ -54,12 +54,12 @@ from restock.ingest.store.manifest import (
     uncertain_conditions,
 )
 from restock.ingest.store.removal import remove_recordings
-from restock.ingest.store.summary import RepeatedDrive
+from restock.ingest.store.summary import RepeatedDrive, summarise
 from restock.ingest.store.transitions import Provenance, recording_table, replaced
 from restock.ingest.store.writer import Staged, StoreWriter, fold_if_many
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.schema import recording_schema
-from restock.process import interrupts_raised
+from restock.process import Work, alone, interrupts_raised
 
 GROUP_S = 5.0
 MAX_WAITING = 64
@@ -150,7 +150,15 @@ def ingest(
     return outcome
 
 
-def prepare(
+def prepare(path: Path | str, profile: Profile, **how: Any) -> Prepared:
+    """Read one recording and write its files, for a commit to come (`commit_all`).
+
+    Takes what `preparing` does. Raises as `ingest`, which does both.
+    """
+    return alone(preparing(path, profile, **how))
+
+
+def preparing(
     path: Path | str,
     profile: Profile,
     *,
@@ -162,13 +170,11 @@ def prepare(
     tags: Mapping[str, str] = MappingProxyType({}),
     watch: Watch | None = None,
     settle: Callable[[str], None] = lambda recording_id: None,
-) -> Prepared:
-    """Read one recording and write its files, for a commit to come (`commit_all`).
+) -> Work[Prepared]:
+    """Prepare a recording in step with others, whose labels and summaries are made with its own.
 
     `settle(recording_id)` is called before the recording is looked up in the store, which does not
     show recordings that wait for their commit.
-
-    Raises as `ingest`, which does both.
     """
     with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
         renamed = renamed_inputs(profile, recording.topics)
@@ -189,7 +195,8 @@ def prepare(
             return Prepared(result, staged)
         try:
             reported = replace(reported, notes=[*reported.notes, *renamed])
-            return _Ingest(str(path), recording, profile, reported, repeated, before).run(store)
+            one = _Ingest(str(path), recording, profile, reported, repeated, before)
+            return (yield from one.run(store))
         except RecordingError as error:
             if error.where:
                 raise
@@ -239,7 +246,7 @@ class _Ingest:
         self.corrections = corrections_in(before) if before else []
         self.ingest_id = uuid.uuid4().hex[:16]
 
-    def run(self, store: StoreWriter | None) -> Prepared:
+    def run(self, store: StoreWriter | None) -> Work[Prepared]:
         profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
         # The next stages need to know which topics had messages, not their values: free those.
@@ -257,7 +264,7 @@ class _Ingest:
             self.recording.recording_id, self.ingest_id, visible(self.path), software_version()
         )
         watch("rows and labels, ticks", 0, ticks)
-        table, rows = recording_table(
+        table, rows = yield from recording_table(
             *(profile, steps, episodes, provenance),
             done=lambda tick: watch("rows and labels, ticks", tick, ticks),
         )
@@ -279,7 +286,11 @@ class _Ingest:
         file = path if sum(len(one.row) for one in kept) else ""
         facts["cameras"] = [one.manifest_row(self.recording, file) for one in kept]
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
-        staged = self._stage(store, manifest, table, kept) if store else None
+        staged = None
+        if store:
+            row = pa.Table.from_pylist([manifest], recording_schema())
+            row = yield summarise, (row, table)
+            staged = self._stage(store, manifest, row, table, kept)
         holding = held(table["conditions"], list(rows.labels))
         counts = {name: int(holds.sum()) for name, holds in holding.items()}
         counts[NOMINAL] = first[NOMINAL]
@@ -303,13 +314,13 @@ class _Ingest:
         self,
         store: StoreWriter,
         manifest: dict[str, Any],
+        row: pa.Table,
         table: pa.Table,
         kept: Sequence[KeptFrames],
     ) -> Staged:
         # What another process corrects meanwhile is not written over.
         read = self.before["ingest_id"] if self.corrections else None
         with self._frames_written(store, manifest, kept):
-            row = pa.Table.from_pylist([manifest], recording_schema())
             return store.stage(row, table, instead_of=read)
 
     @contextmanager

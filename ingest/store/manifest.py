@@ -19,6 +19,7 @@ import datetime as dt
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -48,6 +49,7 @@ from restock.ingest.task.task import OUTLINE_SIGNALS
 UNUSED = "not used by the profile"
 
 
+@cache
 def software_version() -> str:
     """Return Restock's version."""
     try:

@@ -128,31 +128,59 @@ SUMMARY_SCHEMA = pa.schema(
 
 def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     """Return a manifest row with the summary of its recording's rows, and their number."""
-    place = manifest.schema.get_field_index("transitions")
-    count = pa.array([len(rows)], manifest.schema.field(place).type)
-    manifest = manifest.set_column(place, manifest.schema.field(place), count)
+    (found,) = summarise([(manifest, rows)])
+    return found
+
+
+def summarise(recordings: Sequence[tuple[pa.Table, pa.Table]]) -> list[pa.Table]:
+    """Return what `summarised` does of each recording, those with the same columns in one go.
+
+    They are several recordings: planning the queries takes longer than some hundred rows do.
+    """
+    counted: list[pa.Table] = []
+    alike: dict[str, list[int]] = {}
+    for place, (manifest, rows) in enumerate(recordings):
+        at = manifest.schema.get_field_index("transitions")
+        count = pa.array([len(rows)], manifest.schema.field(at).type)
+        counted.append(manifest.set_column(at, manifest.schema.field(at), count))
+        alike.setdefault(rows.schema.to_string(show_schema_metadata=False), []).append(place)
+    for places in alike.values():
+        tables = _tables([(counted[place], recordings[place][1]) for place in places])
+        of = {n: np.asarray(rows["recording_id"], object) for n, rows in tables.items()}
+        for place in places:
+            mine = str(counted[place]["recording_id"][0])
+            some = {n: rows.filter(pa.array(of[n] == mine)) for n, rows in tables.items()}
+            counted[place] = _with_summary(counted[place], recordings[place][1], some)
+    return counted
+
+
+def _tables(recordings: Sequence[tuple[pa.Table, pa.Table]]) -> dict[str, pa.Table]:
+    """Return the tables of summary.sql and BY_EPISODE, of recordings with the same columns."""
+    manifests, rows = (pa.concat_tables(several) for several in zip(*recordings, strict=True))
+    with _database().cursor() as connection:  # with temporary tables of its own
+        connection.register("recordings", manifests)
+        rows = rows.rename_columns({"condition": "primary_condition"})  # as rows.sql
+        custom = any(manifests["signals"].to_pylist())  # whether the profile has its own
+        tables = _of_episodes(connection, rows, custom=custom)
+        connection.register("transitions", rows.drop_columns(list(WIDE)))
+        connection.execute(_definitions())
+        left = TABLES.keys() - tables.keys() - {"distinctive_rows"}
+        return tables | {n: connection.table(n).to_arrow_table() for n in left}
+
+
+def _with_summary(manifest: pa.Table, rows: pa.Table, tables: dict[str, pa.Table]) -> pa.Table:
     hashes, at = distinctive(rows)
     values: dict[str, Any] = {
         "sketch": sketch(hashes),
         "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
     }
     in_order = np.argsort(at)
-    tables = {
-        "distinctive_rows": pa.table(
-            {
-                "transition_id": rows["transition_id"].take(pa.array(at[in_order])),
-                "content": hashes[in_order].view(np.int64),
-            }
-        )
-    }
-    with _database().cursor() as connection:  # with temporary tables of its own
-        connection.register("recordings", manifest)
-        rows = rows.rename_columns({"condition": "primary_condition"})  # as rows.sql
-        custom = any(manifest["signals"].to_pylist())  # whether the profile has its own
-        tables |= _of_episodes(connection, rows, custom=custom)
-        connection.register("transitions", rows.drop_columns(list(WIDE)))
-        connection.execute(_definitions())
-        tables |= {n: connection.table(n).to_arrow_table() for n in TABLES.keys() - tables.keys()}
+    tables["distinctive_rows"] = pa.table(
+        {
+            "transition_id": rows["transition_id"].take(pa.array(at[in_order])),
+            "content": hashes[in_order].view(np.int64),
+        }
+    )
     for field in SUMMARY_SCHEMA:
         column = (
             _listed(tables[field.name], field.type)

@@ -11,19 +11,21 @@ SELECT
     ) AS handover
 FROM (
     SELECT
-        episode_id, episode_index, step_index, stamp_ns, action, reward, terminated, truncated,
+        recording_id, episode_id, episode_index, step_index, stamp_ns, action, reward, terminated, truncated,
         primary_condition, conditions, behaviour_policy, zone, bumped, goal_source, clearance_m, progress_m
     FROM transitions
 )
-CROSS JOIN (
+JOIN (
     SELECT
+        recording_id,
         CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
         json_extract_string(task_json, '$.goal') = 'route' AS has_goal
     FROM recordings
-);
+) USING (recording_id);
 
 CREATE TEMP TABLE episode_rows AS
 SELECT
+    any_value(recording_id) AS recording_id,
     episode_id,
     any_value(episode_index) AS episode_index,
     min(stamp_ns) AS start_ns,
@@ -47,6 +49,7 @@ WHERE coalesce(len(conditions), 0) < 1;
 -- Episodes do not reach over recordings: numbers of distinct ones add up.
 CREATE TEMP TABLE cells AS
 SELECT
+    recording_id,
     condition,
     action,
     zone,
@@ -62,11 +65,12 @@ SELECT
     count(DISTINCT episode_id) FILTER (success IS NOT NULL) AS goal_episodes
 FROM held
 JOIN (SELECT episode_id, success FROM episode_rows) USING (episode_id)
-GROUP BY condition, action, zone, behaviour_policy
+GROUP BY recording_id, condition, action, zone, behaviour_policy
 ORDER BY ALL;
 
 CREATE TEMP TABLE condition_episodes AS
 SELECT
+    recording_id,
     condition,
     count(*) AS episodes_held,
     CAST(sum(n) AS BIGINT) AS rows_held,
@@ -78,10 +82,15 @@ SELECT
     CAST(sum(primary_n) AS BIGINT) AS primary_rows,
     count(*) FILTER (primary_n > 0) AS primary_episodes
 FROM (
-    SELECT condition, episode_id, count(*) AS n, count(*) FILTER (condition = primary_condition) AS primary_n
+    SELECT
+        recording_id,
+        condition,
+        episode_id,
+        count(*) AS n,
+        count(*) FILTER (condition = primary_condition) AS primary_n
     FROM held
-    GROUP BY condition, episode_id
+    GROUP BY recording_id, condition, episode_id
 )
 JOIN (SELECT episode_id, success, return FROM episode_rows) USING (episode_id)
-GROUP BY condition
+GROUP BY recording_id, condition
 ORDER BY ALL;

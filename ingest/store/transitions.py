@@ -20,7 +20,7 @@ from restock.ingest.store.summary import ENDS, WIDE
 from restock.ingest.task.conditions import (
     NOMINAL,
     Condition,
-    label_with_probabilities,
+    label_several,
     primary,
     reported,
     too_near_to_call,
@@ -36,6 +36,7 @@ from restock.ingest.task.schema import (
 )
 from restock.ingest.task.task import Signals, observe, reward
 from restock.ingest.task.task_sql import own_reward
+from restock.process import Work
 
 GROUP_ROWS = 8192  # of whole episodes that are worked out together: bounds memory
 
@@ -108,7 +109,7 @@ def groups(episodes: Split) -> Iterator[range]:
 
 def episode_rows(
     profile: Profile, steps: Steps, episodes: Split, group: range | None = None
-) -> EpisodeRows:
+) -> Work[EpisodeRows]:
     """Lay the steps of these episodes (None: of all) out, with their own route, and label them."""
     group = range(len(episodes.episodes)) if group is None else group
     chosen = [episodes.episodes[number] for number in group]
@@ -135,7 +136,7 @@ def episode_rows(
         reported(several, lidar=lidar, driven_plan=driven_plan)
         for several in (profile.conditions, profile.exposures)
     )
-    held, probable = label_with_probabilities(table, [*conditions, *situations])
+    held, probable = yield label_several, (table, [*conditions, *situations])
     labels, exposures = (
         {condition.name: held[condition.name] for condition in several}
         for several in (conditions, situations)
@@ -212,7 +213,7 @@ def recording_table(
     provenance: Provenance,
     *,
     done: Callable[[int], None] = lambda ticks: None,
-) -> tuple[pa.Table, EpisodeRows]:
+) -> Work[tuple[pa.Table, EpisodeRows]]:
     """Return all transitions of a recording, and their steps (without signals).
 
     Some whole episodes at a time, which changes no value: an episode's rows and labels depend on
@@ -225,7 +226,7 @@ def recording_table(
     tables, ends, parts = [], [], []
     same: dict[str, pa.ChunkedArray] = {}  # the longest so far of each column of one value
     for group in groups(episodes):
-        rows = episode_rows(profile, steps, episodes, group)
+        rows = yield from episode_rows(profile, steps, episodes, group)
         made = transitions(profile, steps, episodes, rows, provenance)
         tables.append(_sharing(made, same))
         del made

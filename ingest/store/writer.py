@@ -176,6 +176,8 @@ class StoreWriter(TableCommits):
     def stage(self, manifest: pa.Table, rows: pa.Table, *, instead_of: str | None = None) -> Staged:
         """Write the files of a recording, of which nothing shows before `commit_staged`.
 
+        The manifest row may have its summary already.
+
         Raises:
             StoreError: they cannot be written.
         """
@@ -184,7 +186,8 @@ class StoreWriter(TableCommits):
             self.reach()  # Delta's library says of S3 what is wrong; Arrow's writer says less
             self._reached = True
         ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()
-        manifest = summarised(manifest, rows)
+        if "distinctive_rows" not in manifest.column_names:
+            manifest = summarised(manifest, rows)
         contents = manifest["distinctive_rows"].combine_chunks().flatten().field("content")
         staged = Staged(
             *ids,

@@ -267,6 +267,40 @@ def label_with_probabilities(
     return _labels(columns, conditions), _probabilities(columns, conditions)
 
 
+def label_several(
+    several: Sequence[tuple[pa.Table, Sequence[Condition]]],
+) -> list[tuple[dict[str, Bools], dict[str, F32]]]:
+    """Compute `label_with_probabilities` of several tables, those alike in one query.
+
+    Planning a query takes longer than labelling some hundred steps.
+    """
+    found: dict[int, tuple[dict[str, Bools], dict[str, F32]]] = {}
+    for place, (steps, conditions) in enumerate(several):
+        alike = [
+            other
+            for other, (table, rules) in enumerate(several)
+            if other not in found and rules == conditions and table.schema == steps.schema
+        ]
+        if any("episode_index" in condition.words for condition in conditions):
+            alike = [place]  # else it would see other numbers
+        if place in found:
+            continue
+        parts, first = [], 0
+        for table in (several[other][0] for other in alike):
+            episodes = np.asarray(table["episode_index"]) + first
+            parts.append(table.set_column(0, "episode_index", pa.array(episodes)))
+            first = episodes.max(initial=first - 1) + 1
+        ends = np.cumsum([len(part) for part in parts])
+        held, probable = label_with_probabilities(pa.concat_tables(parts), conditions)
+        for other, stop, part in zip(alike, ends, parts, strict=True):
+            rows = slice(stop - len(part), stop)
+            found[other] = (
+                {name: values[rows] for name, values in held.items()},
+                {name: values[rows] for name, values in probable.items()},
+            )
+    return [found[place] for place in range(len(several))]
+
+
 def _labels(columns: Columns, conditions: Sequence[Condition]) -> dict[str, Bools]:
     labels = {}
     for condition in conditions:

@@ -1,4 +1,4 @@
-"""This process: its interrupts and child processes, its cores, and late imports.
+"""This process: interrupts, child processes, works in step, its cores, and late imports.
 
 A kill does what Ctrl-C does, and child processes end with it. Libraries that are optional or slow
 are imported when they are used.
@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from importlib import import_module
@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # slow to import, and every command imports this
 
 P = ParamSpec("P")
 T = TypeVar("T")
+# A work that asks for answers on its way: yields a function of several arguments and its own one.
+Work = Generator[tuple[Callable[[list[Any]], Sequence[Any]], Any], Any, T]
 
 _running: set[subprocess.Popen[bytes]] = set()
 _interrupted = False
@@ -103,6 +105,40 @@ def went_on_after_interrupt() -> None:
     """Note that an interrupt was dealt with, and did not cause later errors."""
     global _interrupted
     _interrupted = False
+
+
+def in_step(works: Sequence[Work[T]]) -> Iterator[tuple[int, T | Exception]]:
+    """Run works side by side, and answer together what several ask for.
+
+    Yields the place of each work that ends, and what it returned or raised. An error of the answers
+    to several is raised: it says not whose it is.
+    """
+    answers: dict[int, Any] = dict.fromkeys(range(len(works)))
+    try:
+        while answers:
+            asked: dict[Callable[[list[Any]], Sequence[Any]], dict[int, Any]] = {}
+            for place, answer in answers.items():
+                try:
+                    function, argument = works[place].send(answer)
+                    asked.setdefault(function, {})[place] = argument
+                except StopIteration as done:
+                    yield place, done.value
+                except Exception as error:  # noqa: BLE001  (of that work alone)
+                    yield place, error
+            answers = {}
+            for function, of_each in asked.items():
+                answers |= zip(of_each, function([*of_each.values()]), strict=True)
+    finally:
+        for work in works:
+            work.close()
+
+
+def alone(work: Work[T]) -> T:
+    """Return what a work returns; raise what it raises."""
+    ((_, outcome),) = in_step([work])
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.steps.episodes import split, steps_of
 from restock.ingest.store.transitions import Provenance, episode_rows, transitions
 from restock.ingest.task.schema import STEP_BITS, transition_schema
+from restock.process import alone
 
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task
@@ -20,7 +21,7 @@ PROVENANCE = Provenance("fedcba9876543210", "0011223344556677", "logs/a.mcap", "
 def rows_of(topics: dict[str, TopicColumns], profile: Profile = PROFILE) -> pa.Table:
     steps = steps_of(profile, topics)
     episodes = split(profile.task, steps)
-    rows = episode_rows(profile, steps, episodes)
+    rows = alone(episode_rows(profile, steps, episodes))
     return transitions(profile, steps, episodes, rows, PROVENANCE)
 
 

@@ -5,19 +5,25 @@ import errno
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 from support.driven_robot import write_bags
 from support.long import one_in
 
 from restock.cli import main
+from restock.errors import RecordingError
 from restock.ingest.batch import IngestJob, ingest_all, side_by_side
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task import conditions
 from restock.replay.store.store import Store, is_store
 
 
@@ -70,6 +76,56 @@ def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
     assert "drive1: the process that read it was killed (SIGKILL)" in err
 
 
+class _Dying(IngestJob):
+    """A job whose process dies of one recording, whichever it reads it with."""
+
+    def prepare_several(self, paths, **more):
+        if any(path.name == "drive1" for path in paths):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().prepare_several(paths, **more)
+
+
+def test_a_process_that_dies_costs_one_recording(bags, tmp_path, monkeypatch):
+    monkeypatch.setattr("restock.ingest.batch._bundles", lambda paths, most: [[0, 1, 2], [3, 4]])
+    job = _Dying(load_profile("warehouse_amr"), tmp_path / "s")
+    results = dict(ingest_all(sorted(bags.iterdir()), job, workers=2))
+    assert "the process that read it was killed" in str(results.pop(bags / "drive1"))
+    assert [result.status for result in results.values()] == ["written"] * 4
+
+
+def test_recordings_read_together_give_what_each_gives(bags, tmp_path, monkeypatch):
+    evaluated, evaluate = [], conditions.label_with_probabilities
+    monkeypatch.setattr(
+        conditions,
+        "label_with_probabilities",
+        lambda steps, rules: evaluated.append(len(steps)) or evaluate(steps, rules),
+    )
+    drives, profile = sorted(bags.iterdir())[:3], load_profile("warehouse_amr")
+    copy = shutil.copytree(drives[1], tmp_path / "copy")
+    (empty := tmp_path / "empty.mcap").touch()
+    found = dict(ingest_all([*drives, copy, empty], IngestJob(profile, tmp_path / "s")))
+    assert [found[path].status for path in (*drives, copy)] == ["written"] * 3 + ["unchanged"]
+    assert isinstance(found[empty], RecordingError)
+    assert len(evaluated) == 1
+    for path in drives:
+        ingest(path, profile, store=StoreWriter(tmp_path / "t"))
+    assert len(evaluated) == 4
+    assert contents(tmp_path / "s") == contents(tmp_path / "t")
+
+
+def contents(store: Path) -> dict[str, str]:
+    """Return the rows of each recording's files, without ingest and time."""
+    return {
+        str(file.parent.relative_to(store)): str(
+            [
+                {name: value for name, value in row.items() if not name.startswith("ingest")}
+                for row in pq.ParquetFile(file).read().to_pylist()
+            ]
+        )
+        for file in store.rglob("*.parquet")
+    }
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "said"),
@@ -81,14 +137,14 @@ def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
 def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch, error, said):
     from restock.ingest import pipeline
 
-    prepare = pipeline.prepare
+    preparing = pipeline.preparing
 
     def failing(path, *args, **kwargs):
         if path.name == "drive1":
             raise error
-        return prepare(path, *args, **kwargs)
+        return preparing(path, *args, **kwargs)
 
-    monkeypatch.setattr(pipeline, "prepare", failing)
+    monkeypatch.setattr(pipeline, "preparing", failing)
     job = IngestJob(load_profile("warehouse_amr"), tmp_path / "s")
     results = dict(ingest_all(sorted(bags.iterdir()), job))
     assert said in str(results.pop(bags / "drive1"))
