@@ -31,11 +31,12 @@ from restock.replay.export.trajectory import (
 )
 from restock.replay.panel.panel import HEADER
 
+WITH_IMAGES = ("lerobot", "lerobot-video")
 READ = {
-    "lerobot": 'LeRobotDataset("restock/logs", root=FOLDER)',
+    **dict.fromkeys(WITH_IMAGES, 'LeRobotDataset("restock/logs", root=FOLDER)'),
     "minari": "minari.MinariDataset(FOLDER)",
 }
-_HUB_TAG = {"lerobot": "LeRobot", "minari": "minari"}
+_HUB_TAG = {**dict.fromkeys(WITH_IMAGES, "LeRobot"), "minari": "minari"}
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 
 
@@ -66,7 +67,7 @@ def card(selection: Selection, counts: Counts, contents: Contents, to: str) -> s
         f"tags: [{_HUB_TAG[to]}, robotics, offline-rl, mobile-robots, restock]",
         f"size_categories: [{size}]",
     ]
-    if to == "lerobot":
+    if to in WITH_IMAGES:
         front += ["configs:", "  - config_name: default", "    data_files: data/*/*.parquet"]
     action = (
         "the logged command, m/s ahead and rad/s to the left"
@@ -124,7 +125,6 @@ def _table(name: str, counts: Counter[str]) -> list[str]:
     return ["", f"| {name} | transitions | share |", "| --- | ---: | ---: |", *rows, ""]
 
 
-WITH_IMAGES = ("lerobot",)
 # The HDF5 library crashes where it cannot write what it holds back when a file is closed. That is
 # less than this: its caches of metadata, and of chunks.
 ROOM_BYTES = 64 << 20
@@ -178,7 +178,9 @@ def export_dataset(
         raise StoreError("already there", where=str(out), remedy="choose another name")
     expect_place(out, StoreError)
     counts = Counts()
-    write = getattr(importlib.import_module(f"restock.replay.export.{module}"), f"write_{to}")
+    write = getattr(
+        importlib.import_module(f"restock.replay.export.{module}"), f"write_{to.replace('-', '_')}"
+    )
     with open_selection(
         source,
         query=query,
@@ -208,7 +210,7 @@ def export_dataset(
                 remedy="export the observations as they are stored",
             )
         several: Iterator[Trajectory] = chain([first], episodes)
-        if needs:
+        if needs and to not in WITH_IMAGES:
             several = _while_there_is_room(several, out)
         with building(out) as folder:
             partial = folder / out.name

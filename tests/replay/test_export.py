@@ -217,6 +217,7 @@ def provenance_in(to: str, out: Path) -> Any:
         "parquet": lambda: pq.read_metadata(out).metadata[b"restock"],
         "npz": lambda: np.load(out)["restock"].item(),
         "lerobot": lambda: (out / "meta/restock.json").read_text(),
+        "lerobot-video": lambda: (out / "meta/restock.json").read_text(),
         "minari": lambda: json.loads((out / "metadata.json").read_text())["restock"],
         "d3rlpy": lambda: __import__("h5py").File(out)["restock"].attrs["provenance"],
     }[to]
@@ -518,8 +519,9 @@ def test_a_missing_library_is_named_with_its_command(store_path, tmp_path, monke
     find = importlib.util.find_spec
 
     def absent(name: str, package: str | None = None) -> Any:
-        return None if name == "h5py" else find(name, package)
+        return None if name in ("h5py", "av") else find(name, package)
 
     monkeypatch.setattr(importlib.util, "find_spec", absent)
-    with pytest.raises(ConfigError, match=re.escape(install_command("libraries"))):
-        export_dataset(store_path, "d3rlpy", tmp_path / "logs.h5")
+    for to, out in (("d3rlpy", "logs.h5"), ("lerobot-video", "logs")):
+        with pytest.raises(ConfigError, match=re.escape(install_command("libraries"))):
+            export_dataset(store_path, to, tmp_path / out)

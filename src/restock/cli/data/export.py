@@ -31,7 +31,8 @@ class ExportCommand:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """A store or a panel; for onnx, a run; for run, a folder of runs."""
     to: Annotated[str, tyro.conf.arg(constructor=Literal[TO], metavar=f"{{{','.join(TO)}}}")]
-    """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
+    """The format. minari, lerobot and lerobot-video (frames as MP4) write directories, the others
+    files (d3rlpy: .h5)."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
     panel: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
