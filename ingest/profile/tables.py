@@ -262,6 +262,13 @@ def _reserved() -> set[str]:
 COMMAND_SOURCES = "command_sources"
 COMMAND_THROUGH = "command_through"
 MAX_NAME = 64  # characters of a behaviour policy
+CLOUD = "sensor_msgs/msg/PointCloud2"
+SCAN_OF_CLOUD = {
+    "ranges_m": "ranges",
+    "angle_min_rad": "angle_min",
+    "angle_increment_rad": "angle_increment",
+}
+_Bearing = Annotated[float, Meta(ge=-3.1416, le=3.1416)]
 _OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of its outline
 SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # of a robot's lidars
 _SCAN_FIELDS = {
@@ -326,7 +333,7 @@ HINDSIGHT = {
 
 
 FIX_SETTINGS = ("origin_deg", "max_std_m", "track_m")
-SCAN_SETTINGS = ("upside_down", "lidar_at_m", "lidar_yaw_rad")
+SCAN_SETTINGS = ("upside_down", "lidar_at_m", "lidar_yaw_rad", "height_m", "angle_rad")
 _COMMAND, _SCAN, _FIX = "a command", "a scan", "a pose by latitude and longitude"
 _APPLIES_TO = {
     "stop_holds": _COMMAND,
@@ -356,6 +363,9 @@ class Input(Checked, frozen=True):
     upside_down: bool = False
     lidar_at_m: tuple[_OnRobot, _OnRobot] | None = None
     lidar_yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
+    # Of a point cloud, in its own frame: what is read as a scan (`restock.ingest.steps.clouds`).
+    height_m: tuple[float, float] | None = None  # the lowest and highest point
+    angle_rad: tuple[_Bearing, _Bearing] | None = None  # the first and last bearing; None: all
     # Of a pose by latitude and longitude (`restock.ingest.steps.input_columns`).
     origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
     max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5
@@ -478,6 +488,7 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
                 where=where,
                 remedy="give both, or lidar_x_m and lidar_yaw_rad of [task.body]",
             )
+        _check_cloud(f"inputs.{name}", source, where)
     if scans and "scan" not in scans:
         raise ConfigError(
             f"`inputs.{next(iter(scans))}` is given without `inputs.scan`",
@@ -506,6 +517,30 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
         raise ConfigError(
             f"`inputs.{list(scans)[-1]}.topic`: two lidars have the same topic", where=where
         )
+
+
+def _check_cloud(key: str, source: Input, where: str) -> None:
+    """Check what makes a scan of a point cloud."""
+    if source.type != CLOUD:
+        for setting in ("height_m", "angle_rad"):
+            if getattr(source, setting) is not None:
+                what = f"`{key}.{setting}` applies only to {CLOUD}, not to {source.type}"
+                raise ConfigError(what, where=where, remedy="leave it out")
+        return
+    if source.height_m is None or source.fields != SCAN_OF_CLOUD:
+        fields = ", ".join(f'{key} = "{path}"' for key, path in SCAN_OF_CLOUD.items())
+        raise ConfigError(
+            f"`{key}`: a point cloud is read as the scan of a slice of it",
+            where=where,
+            remedy="say which: height_m = [LOW, HIGH] above the lidar, of what the robot can run"
+            f" into, and the fields of that scan: fields = {{ {fields} }}",
+        )
+    for setting in ("height_m", "angle_rad"):
+        low, high = getattr(source, setting) or (0, 1)
+        if not low < high:
+            raise ConfigError(
+                f"`{key}.{setting}` must be [LOW, HIGH], got {[low, high]}", where=where
+            )
 
 
 def _check_pressed(key: str, source: Input, where: str) -> None:

@@ -15,7 +15,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import TAKEOVER
 from restock.ingest.profile.signal_paths import pressed_in
-from restock.ingest.profile.tables import FALLBACKS, Input
+from restock.ingest.profile.tables import CLOUD, FALLBACKS, SCAN_OF_CLOUD, Input
 from restock.ingest.propose.candidates import camera_lines
 from restock.ingest.propose.clock_choice import ClockChoice
 from restock.ingest.propose.commands import Commands
@@ -37,6 +37,7 @@ from restock.ingest.propose.roles import (
     Roles,
     clouds_alone,
     robots_in,
+    usable_topics,
 )
 from restock.ingest.propose.trial import Trial
 from restock.ingest.steps.needs import field_paths
@@ -323,7 +324,18 @@ def _input_lines(
             ]
         fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
         none = "none of use" if why else "no topic seen"
-        return [*reported, f"# [inputs.{role}]  # {none}; instead: {fallback}", ""]
+        lines = [*reported, f"# [inputs.{role}]  # {none}; instead: {fallback}"]
+        clouds = [one for one in usable_topics(seen.recording).values() if one.type == CLOUD]
+        if role == "scan" and clouds:
+            fields = ", ".join(f'{key} = "{path}"' for key, path in SCAN_OF_CLOUD.items())
+            lines += [
+                f'# topic = "{clouds[0].name}"',
+                f'# type = "{CLOUD}"',
+                f"# fields = {{ {fields} }}",
+                "# height_m = [LOW, HIGH]  # above the lidar: what the robot can run into",
+                "# max_age_s = 0.5",
+            ]
+        return [*lines, ""]
     topic, kind = fitting[0]
     rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
     beside = dict.fromkeys(other.name for other, _ in fitting if other.name != topic.name)

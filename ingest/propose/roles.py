@@ -12,7 +12,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
 from restock.ingest.profile.signal_paths import last_part
-from restock.ingest.profile.tables import Input
+from restock.ingest.profile.tables import CLOUD, Input
 from restock.ingest.steps.needs import field_paths
 
 T = TypeVar("T")
@@ -84,7 +84,7 @@ _MEASURED = (
     ),
 )
 
-CLOUDS = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointCloud", "foxglove.PointCloud")
+CLOUDS = (CLOUD, "sensor_msgs/msg/PointCloud", "foxglove.PointCloud")
 MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
 
 # Best first.
@@ -438,13 +438,17 @@ def clouds_alone(recording: Recording, roles: Roles) -> str:
     clouds = [one for one in usable_topics(recording).values() if one.type in CLOUDS]
     if roles["scan"] or not clouds:
         return ""
-    first, *others = (one.name for one in clouds)
-    also = f" (or {', '.join(others[:2])})" if others else ""
+    first, *others = sorted(clouds, key=lambda one: one.type != CLOUD)
+    also = f" (or {', '.join(one.name for one in others[:2])})" if others else ""
+    if first.type == CLOUD:
+        return (
+            f"{first.name}{also} is a point cloud, of which a slice can be read as a scan:"
+            " uncomment [inputs.scan], set its height_m to what the robot can run into, and remove"
+            " `sectors = 0` from [task]"
+        )
     return (
-        f"{first}{also} is a point cloud, and clearance is taken from laser scans alone: make a"
-        f" scan of it with pointcloud_to_laserscan (cloud_in:={first}, min_height and max_height of"
-        " what the robot can run into), as the robot drives or while you replay the recording, and"
-        " record that with the other topics"
+        f"{first.name}{also} is a {first.type}, and clearance is taken from laser scans and"
+        f" {CLOUD} alone: record one of these with the other topics"
     )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.containers.storage import Fields
-from restock.ingest.profile.tables import Input
+from restock.ingest.profile.tables import CLOUD, Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.frames import motion_at
@@ -464,7 +464,9 @@ class Filling:
         beams = np.zeros(count, np.int64)
         beams[fresh] = np.asarray(fields[BEAMS])[rows]
         self._mark_invalid(fresh & (beams == 0), f"{name}: no beams")
-        for flag, reason in ((BLIND, "no beam has a valid range"), (UNAIMED, "unusable angles")):
+        broken = "cut short, or has no x, y, z as floats"
+        unaimed = broken if source.type == CLOUD else "unusable angles"
+        for flag, reason in ((BLIND, "no beam has a valid range"), (UNAIMED, unaimed)):
             bad = np.zeros(count, np.bool_)
             bad[fresh] = np.asarray(fields[flag])[rows]
             self._mark_invalid(bad, f"{name}: {reason}")

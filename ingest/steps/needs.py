@@ -31,11 +31,12 @@ from restock.ingest.profile.signal_paths import (
     pressed_paths,
     transform_fields,
 )
-from restock.ingest.profile.tables import SCANS, CustomSignal, Input
+from restock.ingest.profile.tables import CLOUD, SCANS, CustomSignal, Input
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.cameras import TYPES, frame_reduction, other_field
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.clouds import CLOUD_PATHS, cloud_reduction
 from restock.ingest.steps.custom_columns import custom_reduction
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.task.surroundings import MovedMap, SectorMap
@@ -62,7 +63,8 @@ def read_topics(
 
     Where header stamps run at another pace than log time, `/clock` is read too: it says which.
     `reduced`: scans as clearance, messages as custom signals and images as their layout alone,
-    which is all that steps are made of; else with all fields as they were recorded, but images.
+    which is all that steps are made of; else with all fields as they were recorded, but images, and
+    clouds as scans.
 
     Raises:
         RecordingError: as `wanted_fields`.
@@ -73,11 +75,15 @@ def read_topics(
     leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in topics}
     wanted, made = wanted_fields(profile, topics, leaves), reductions(profile, topics, leaves)
     if not reduced:
-        wanted = {
-            topic: [*paths, *(made[topic].fields if topic in made else ())]
-            for topic, paths in wanted.items()
+        clouds = {
+            scan.topic: cloud_reduction(scan, profile.task.range_min_m)
+            for scan in profile.inputs.scans.values()
+            if scan.type == CLOUD and scan.topic in wanted
         }
-    columns = recording.read(wanted, made if reduced else {})
+        for topic in made.keys() & wanted.keys() - clouds.keys():
+            wanted[topic] = [*wanted[topic], *made[topic].fields]
+        made = clouds
+    columns = recording.read(wanted, made)
     by_stamp = profile.clock.alignment == STAMP and CLOCK_TOPIC not in columns
     half_period_s = profile.task.control_period_s / 2
     clocks = without_cameras(profile, columns)
@@ -203,6 +209,8 @@ def _both(parts: Sequence[Reduction]) -> Reduction:
 
 def field_paths(source: Input) -> list[str]:
     """Return the field paths that an input reads."""
+    if source.type == CLOUD:
+        return list(CLOUD_PATHS)
     paths: list[str] = []
     for key, field in source.fields.items():
         if key == "pressed":
@@ -417,6 +425,9 @@ def scan_reduction(task: Task, source: Input) -> Reduction:
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
     reducer = _ScanReducer(task, source)
+    if source.type == CLOUD:
+        cloud = cloud_reduction(source, task.range_min_m)
+        return Reduction(cloud.fields, lambda fields: reducer(cloud.apply(fields)))
     return Reduction(tuple(dict.fromkeys(reducer.paths)), reducer)
 
 

@@ -224,5 +224,5 @@ def test_a_point_cloud_alone_is_told_what_to_do(has_scan, tmp_path, capsys):
     topics = typed_topics(Drive() if has_scan else BlindDrive()) | {"/points": cloud}
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     assert main(["profile", "new", str(bag), "--out", str(tmp_path / "p.toml")]) == 0
-    hint = "pointcloud_to_laserscan (cloud_in:=/points"
+    hint = "/points is a point cloud, of which a slice can be read as a scan"
     assert (hint in capsys.readouterr().err) is not has_scan

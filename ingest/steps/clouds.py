@@ -1,0 +1,107 @@
+"""Scans from the point clouds of a 3-D lidar, as ROS's pointcloud_to_laserscan makes them.
+
+Points between two heights and two bearings become a scan: in each of its beams the nearest point,
+measured along the floor, or inf. A cloud is decoded by columns, in the layout that its own fields
+give, and its points are gone before the next one is read.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import F32, F64
+from restock.ingest.containers.storage import Fields, Reduction
+from restock.ingest.decoding.columns import FieldColumn
+from restock.ingest.profile.tables import Input
+
+BEAM_RAD = np.pi / 360  # from one beam to the next
+_FIELDS = ("fields[].name", "fields[].offset", "fields[].datatype")
+_SHAPE = ("height", "width", "point_step", "row_step", "is_bigendian")
+CLOUD_PATHS = (*_FIELDS, *_SHAPE, "data")  # of a sensor_msgs/msg/PointCloud2
+_FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
+
+
+def cloud_reduction(source: Input, range_min_m: float) -> Reduction:
+    """Build the reduction of clouds to scans, in the fields that `source` names.
+
+    A cloud without any point at `range_min_m` or farther has NaN ranges, as a lidar that sees
+    nothing. One that cannot be decoded has a NaN angle.
+    """
+    low, high = source.angle_rad or (-np.pi, np.pi)
+    beams = max(round((high - low) / BEAM_RAD), 1)
+
+    def apply(fields: Fields) -> dict[str, FieldColumn]:
+        count = len(fields["width"])
+        ranges = np.full((count, beams), np.nan, np.float32)
+        first = np.full(count, low + BEAM_RAD / 2)
+        for row in range(count):
+            points = points_of(fields, row)
+            if points is None:
+                first[row] = np.nan
+            else:
+                ranges[row] = _scan(source, points, range_min_m, low, beams)
+        made = (ranges, first, np.full(count, BEAM_RAD))
+        keys = ("ranges_m", "angle_min_rad", "angle_increment_rad")
+        return {source.fields[key]: column for key, column in zip(keys, made, strict=True)}
+
+    return Reduction(CLOUD_PATHS, apply)
+
+
+def points_of(fields: Fields, row: int) -> F64 | None:
+    """Return the points (3, P) of one cloud in its own frame, in metres, NaN included.
+
+    None if it is cut short, or has no x, y, z as floats.
+    """
+    names, offsets, kinds = (tuple(np.asarray(fields[path][row]).tolist()) for path in _FIELDS)
+    height, width, step, row_step = (int(np.asarray(fields[path])[row]) for path in _SHAPE[:4])
+    layout = _layout(names, offsets, kinds, step, bool(np.asarray(fields["is_bigendian"])[row]))
+    data = np.ascontiguousarray(fields["data"][row], np.uint8)
+    if not height * width:
+        return np.zeros((3, 0))
+    short = (height - 1) * row_step + width * step > len(data)
+    if layout is None or short or (height > 1 and row_step < width * step):
+        return None
+    rows = (row_step, step)  # a row of an organised cloud may be padded, a point too
+    table: NDArray[Any] = np.ndarray((height, width), layout, data.data, strides=rows)
+    return np.stack([table[axis].ravel().astype(np.float64) for axis in "xyz"])
+
+
+@lru_cache(maxsize=64)
+def _layout(
+    names: tuple[str, ...], offsets: tuple[int, ...], kinds: tuple[int, ...], step: int, big: bool
+) -> np.dtype[Any] | None:
+    """Return how x, y and z lie in a point; None if it has not all of them as floats."""
+    at = {name: place for place, name in enumerate(names)}
+    if not {"x", "y", "z"} <= at.keys():
+        return None
+    places = [at[axis] for axis in "xyz"]
+    types = [_FLOATS.get(kinds[place]) for place in places]
+    if None in types:
+        return None
+    formats = [(">" if big else "<") + str(one) for one in types]
+    try:
+        starts = [offsets[place] for place in places]
+        return np.dtype(
+            {"names": ["x", "y", "z"], "formats": formats, "offsets": starts, "itemsize": step}
+        )
+    except ValueError:  # beyond the end of a point
+        return None
+
+
+def _scan(source: Input, points: F64, range_min_m: float, low: float, beams: int) -> F32:
+    """Return the nearest point in each beam, in metres along the floor."""
+    x, y, z = points[:, np.isfinite(points).all(axis=0)]
+    far = np.hypot(x, y)
+    there = far >= range_min_m
+    scan = np.full(beams, np.inf if there.any() else np.nan, np.float32)
+    bottom, top = source.height_m or (-np.inf, np.inf)
+    up = -z if source.upside_down else z
+    beam = np.floor((np.arctan2(y, x) - low) / BEAM_RAD).astype(np.int64)
+    beam[beam == beams] -= 1  # the last bearing itself
+    kept = there & (bottom <= up) & (up <= top) & (beam >= 0) & (beam < beams)
+    np.minimum.at(scan, beam[kept], far[kept].astype(np.float32))
+    return scan

@@ -1,0 +1,272 @@
+"""A robot with a 3-D lidar alone: a slice of its point clouds is read as a scan."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from support.driven_robot import Drive, write_bag
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import Ragged, offsets_of
+from restock.ingest.live.observer import LiveObserver
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.steps.clouds import BEAM_RAD, cloud_reduction
+from restock.ingest.steps.episodes import Steps, steps_of
+from restock.ingest.steps.needs import read_topics
+from restock.replay.store.store import Store
+from restock.replay.trace.moment import seen_between
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+FIELDS = 'ranges_m = "ranges", angle_min_rad = "angle_min", angle_increment_rad = "angle_increment"'
+CLOUD = f"""[inputs.scan]
+topic = "/points"
+type = "sensor_msgs/msg/PointCloud2"
+max_age_s = 0.5
+height_m = [-0.2, 0.6]
+fields = {{ {FIELDS} }}
+
+"""
+PROFILE = re.sub(r"(?ms)^\[inputs\.scan\].*?(?=^\[)", CLOUD, WAREHOUSE)
+SOURCE = parse_profile(PROFILE, where="cloud.toml").inputs.scan
+PLAIN = [("x", "f4"), ("y", "f4"), ("z", "f4")]
+KINDS = {"f4": 7, "f8": 8, "i2": 3}
+
+
+def packed(
+    xyz: np.ndarray,
+    layout: Any = PLAIN,
+    order: str = "<",
+    step: int = 0,
+    rows: int = 1,
+    pad: int = 0,
+) -> dict[str, Any]:
+    """Return the fields of a cloud of points (P, 3), laid out like this."""
+    kind = np.dtype([(name, order + one) for name, one in layout])
+    if step:
+        formats, offsets = zip(*(kind.fields[name] for name in kind.names), strict=True)
+        padded = {"names": kind.names, "formats": formats, "offsets": offsets, "itemsize": step}
+        kind = np.dtype(padded)
+    points = np.zeros(len(xyz), kind)
+    for place, axis in enumerate("xyz"):
+        if axis in kind.names:
+            points[axis] = xyz[:, place]
+    lines = points.reshape(rows, -1)
+    data = b"".join(line.tobytes() + b"\xff" * pad for line in lines)
+    return {
+        "height": rows,
+        "width": lines.shape[1],
+        "fields": [(name, kind.fields[name][1], KINDS[one]) for name, one in layout],
+        "is_bigendian": order == ">",
+        "point_step": kind.itemsize,
+        "row_step": lines.shape[1] * kind.itemsize + pad,
+        "data": np.frombuffer(data, np.uint8),
+    }
+
+
+def scans(clouds: list[dict[str, Any]], source: Any = SOURCE) -> dict[str, np.ndarray]:
+    """Return what is read of clouds, from their columns."""
+    columns: dict[str, Any] = {}
+    for path, place in (("name", 0), ("offset", 1), ("datatype", 2)):
+        values = [np.array([field[place] for field in one["fields"]]) for one in clouds]
+        offsets = offsets_of(np.array([len(value) for value in values]))
+        columns[f"fields[].{path}"] = Ragged(np.concatenate(values), offsets)
+    for path in ("height", "width", "point_step", "row_step", "is_bigendian"):
+        columns[path] = np.array([one[path] for one in clouds])
+    data = [one["data"] for one in clouds]
+    columns["data"] = Ragged(np.concatenate(data), offsets_of(np.array([len(d) for d in data])))
+    return cloud_reduction(source, 0.05).apply(columns)
+
+
+def around(count: int = 1200, seed: int = 0) -> np.ndarray:
+    """Return points all around, on the floor to above the robot, some of them NaN."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform((-6, -6, -1), (6, 6, 2), (count, 3)).astype(np.float32)
+    xyz[::7, 1] = np.nan
+    return xyz
+
+
+def test_a_scan_is_the_nearest_point_of_the_slice_in_each_beam():
+    xyz = around().astype(np.float64)
+    expected = np.full(720, np.inf)
+    for x, y, z in xyz[np.isfinite(xyz).all(axis=1)]:  # one by one, as the ROS node does
+        if -0.2 <= z <= 0.6 and np.hypot(x, y) >= 0.05:
+            beam = min(int((np.arctan2(y, x) + np.pi) / BEAM_RAD), 719)
+            expected[beam] = min(expected[beam], np.hypot(x, y))
+    found = scans([packed(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")])])
+    np.testing.assert_allclose(found["ranges"][0], expected, rtol=1e-6)
+    assert np.isfinite(expected).sum() > 100
+    assert found["angle_min"][0] == pytest.approx(BEAM_RAD / 2 - np.pi)
+
+
+def test_every_layout_of_the_same_points_is_the_same_scan():
+    xyz = around()
+    found = scans(
+        [
+            packed(xyz),
+            packed(
+                xyz, [("intensity", "f4"), ("z", "f4"), ("y", "f4"), ("ring", "i2"), ("x", "f4")]
+            ),
+            packed(xyz, step=32),
+            packed(xyz, order=">"),
+            packed(xyz, rows=16, pad=12),
+            packed(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")], order=">"),
+        ]
+    )
+    assert (found["ranges"] == found["ranges"][0]).all()
+
+
+def test_bearings_and_a_lidar_upside_down():
+    wall = np.array([[2.0, 1.0, 0.5], [2.0, -1.0, 0.5], [-3.0, 0.0, 0.5]])
+    ahead = {"angle_rad": (-np.pi / 2, np.pi / 2)}
+    (seen,) = scans([packed(wall)], type(SOURCE)(**fields_of(SOURCE) | ahead))["ranges"]
+    assert seen.shape == (360,)
+    assert np.isfinite(seen).sum() == 2
+    turned = {"upside_down": True, "height_m": (-0.6, -0.4)}
+    (seen,) = scans([packed(wall)], type(SOURCE)(**fields_of(SOURCE) | turned))["ranges"]
+    assert np.isfinite(seen).sum() == 3
+
+
+def fields_of(source: Any) -> dict[str, Any]:
+    return {name: getattr(source, name) for name in source.__struct_fields__}
+
+
+def cut(cloud: dict[str, Any]) -> dict[str, Any]:
+    return cloud | {"data": cloud["data"][:-5]}
+
+
+NOTHING = np.full((4, 3), np.nan)
+UNREAD = "cut short, or has no x, y, z as floats"
+UNSEEN = "no beam has a valid range"
+UNUSABLE = {
+    "cut short": (cut(packed(around())), UNREAD),
+    "without z": (packed(around(), PLAIN[:2]), UNREAD),
+    "of whole numbers": (packed(np.ones((64, 3)), [(axis, "i2") for axis in "xyz"]), UNREAD),
+    "beyond a point": (packed(around()) | {"point_step": 8}, UNREAD),
+    "with rows that overlap": (packed(around(), rows=16) | {"row_step": 0}, UNREAD),
+    "empty": (packed(np.zeros((0, 3))), UNSEEN),
+    "of NaN": (packed(NOTHING), UNSEEN),
+}
+
+
+def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None) -> Path:
+    """Write a drive whose scans are clouds; those from 3 s on are `spoilt`."""
+    folder.mkdir()
+    drive, bag = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "drive"), folder / "bag"
+    point = TYPES.types["sensor_msgs/msg/PointField"]
+    writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
+    with AnyReader([drive]) as reader, writer:
+        made = {
+            c.id: writer.add_connection(c.topic, c.msgtype, typestore=TYPES)
+            for c in reader.connections
+            if c.topic != "/scan"
+        }
+        to = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=TYPES)
+        for connection, now_ns, raw in reader.messages():
+            if connection.topic != "/scan":
+                writer.write(made[connection.id], now_ns, raw)
+                continue
+            scan = reader.deserialize(raw, connection.msgtype)
+            bearing = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+            level = np.stack([scan.ranges * np.cos(bearing), scan.ranges * np.sin(bearing)], axis=1)
+            low, high = ((level, z) for z in (0.1, 1.5))
+            xyz = np.concatenate(
+                [
+                    np.column_stack([at * (1 if z < 1 else 0.1), np.full(len(at), z)])
+                    for at, z in (low, high)
+                ]
+            ).astype(np.float32)
+            late = now_ns - reader.start_time > 3 * 10**9
+            cloud = spoilt if spoilt is not None and late else packed(xyz)
+            names = [point(name=n, offset=o, datatype=k, count=1) for n, o, k in cloud["fields"]]
+            message = TYPES.types["sensor_msgs/msg/PointCloud2"](
+                header=scan.header, is_dense=False, **cloud | {"fields": names}
+            )
+            writer.write(to, now_ns, TYPES.serialize_cdr(message, to.msgtype))
+    return bag
+
+
+def read(bag: Path, text: str = PROFILE) -> Steps:
+    profile = parse_profile(text, where="cloud.toml")
+    with open_recording(bag) as recording:
+        return steps_of(profile, read_topics(recording, profile))
+
+
+def test_a_drive_with_clouds_has_the_clearance_of_its_scans(tmp_path):
+    bag = with_clouds(tmp_path / "clouds")
+    by_cloud, by_scan = read(bag), read(tmp_path / "clouds" / "drive", WAREHOUSE)
+    assert by_cloud.problem == by_scan.problem
+    for name in ("sector_clearance_m", "clearance_ahead_m", "plan_return_m"):
+        np.testing.assert_allclose(by_cloud.signals[name], by_scan.signals[name], atol=0.02)
+    # What a row saw is a scan, too.
+    profile = parse_profile(PROFILE, where="cloud.toml")
+    with open_recording(bag) as recording:
+        start_ns = recording.span_ns[0]
+        seen = seen_between(recording, profile, start_ns, start_ns + 2 * 10**9).scans
+    assert all(scan is None or len(scan.ranges_m) == 720 for scan in seen)
+    assert any(scan is not None for scan in seen)
+
+
+@pytest.mark.parametrize("kind", UNUSABLE)
+def test_a_cloud_that_cannot_be_used_drops_its_steps_with_the_reason(kind, tmp_path):
+    spoilt, reason = UNUSABLE[kind]
+    problems = read(with_clouds(tmp_path / "clouds", spoilt)).problem
+    assert set(problems) == {"", f"scan: {reason}"}
+
+
+def test_a_running_robot_sees_by_clouds_what_ingest_stores(tmp_path):
+    bag = with_clouds(tmp_path / "clouds", UNUSABLE["cut short"][0])
+    observer, seen = LiveObserver(parse_profile(PROFILE, where="cloud.toml")), {}
+    with AnyReader([bag]) as reader:
+        chosen = [c for c in reader.connections if c.topic in observer.topics]
+        for connection, now_ns, raw in reader.messages(chosen):
+            if connection.topic == "/cmd_vel":
+                observed = observer.observe(now_ns)
+                seen[observed.stamp_ns] = observed
+            observer.receive(connection.topic, reader.deserialize(raw, connection.msgtype), now_ns)
+    steps, compared = read(bag), {"": 0, f"scan: {UNREAD}": 0}
+    stamps, sectors = (steps.signals[name] for name in ("stamp_ns", "sector_clearance_m"))
+    for stamp_ns, problem, clearance in zip(stamps.tolist(), steps.problem, sectors, strict=True):
+        if stamp_ns in seen and seen[stamp_ns].problem == problem:
+            live = seen[stamp_ns].signals["sector_clearance_m"][0]
+            np.testing.assert_array_equal(live, clearance)
+            compared[problem] += 1
+    assert min(compared.values()) > 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("height_m = [-0.2, 0.6]\n", "", r"height_m = \[LOW, HIGH\] above the lidar"),
+        ("[-0.2, 0.6]", "[0.6, -0.2]", r"height_m` must be \[LOW, HIGH\]"),
+        ('"ranges"', '"data"', 'fields = { ranges_m = "ranges"'),
+        ("PointCloud2", "LaserScan", "height_m` applies only to sensor_msgs/msg/PointCloud2"),
+    ],
+)
+def test_what_makes_no_scan_of_a_cloud_is_refused(old, new, what):
+    with pytest.raises(ConfigError, match=what):
+        parse_profile(PROFILE.replace(old, new, 1), where="cloud.toml")
+
+
+def test_a_proposal_says_how_to_read_a_cloud(tmp_path, capsys):
+    bag, profile = with_clouds(tmp_path / "clouds"), tmp_path / "robot.toml"
+    assert main(["profile", "new", str(bag), "--out", str(profile)]) == 0
+    assert "a slice can be read as a scan" in capsys.readouterr().err
+    text = profile.read_text().replace("sectors = 0", "sectors = 36")
+    table = re.search(r"(?m)^# \[inputs\.scan\].*(\n# .*)+", text)[0]
+    own = table[2:].replace("\n# ", "\n").replace("[LOW, HIGH]", "[-0.2, 0.6]")
+    profile.write_text(text.replace(table, own))
+    assert (
+        main(["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "s")]) == 0
+    )
+    with Store(tmp_path / "s") as store:
+        assert store.sql(
+            "SELECT count(*) > 10, count(clearance_m) = count(*) FROM transitions"
+        ).fetchall() == [(True, True)]
