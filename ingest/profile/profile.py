@@ -571,7 +571,8 @@ def _check_conditions(profile: Profile, where: str) -> None:
                 remedy=error.remedy,
             ) from error
     task = profile.task
-    own = [*own_sql(task, "reward_terms"), *own_sql(task, "observed")]
+    own = own_sql(task, "reward_terms") if task.reward_terms else []
+    own += own_sql(task, "observed") if task.observed else []
     if profile.goal_source == "hindsight":
         for name, plan in unseen(own, PLAN_SIGNALS).items():
             raise ConfigError(
@@ -580,7 +581,8 @@ def _check_conditions(profile: Profile, where: str) -> None:
                 remedy="leave it out: with goals in hindsight, nothing stood on the plan",
             )
     try:
-        own_values(task, "reward_terms", steps)
+        if task.reward_terms:
+            own_values(task, "reward_terms", steps)
         if task.observed:
             Past(task, "observed", 1, "a running robot")
     except ConfigError as error:
