@@ -47,6 +47,9 @@ def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "cut: " in out
     assert "total: 4 recordings (written 1, unchanged 3); " in out
+    words = ["ingest", str(bags), "--store", str(tmp_path / "other"), "--profile", "turtlebot3"]
+    assert main(words) == 2
+    assert "; 3 gives no transition with the profile 'turtlebot3'; " in capsys.readouterr().out
     assert "lost data 1" in out.splitlines()[-1]
 
 

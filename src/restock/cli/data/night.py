@@ -70,7 +70,7 @@ class Night:
         """Count a recording that was refused; return its line."""
         what = first_line(error.what)
         self.statuses["refused"] += 1
-        self.reasons[re.sub(r"\d[\d,.]*", "N", what.partition(":")[0])] += 1
+        self.reasons[re.sub(r"\b\d[\d,.]*", "N", what.partition(":")[0])] += 1
         return f"{'refused':<9} {self.name(path)}: {what}"
 
     def total(self) -> str:
