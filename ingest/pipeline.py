@@ -14,8 +14,9 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -211,12 +212,15 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
 
 def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
     """Return whether a recording was ingested with another [robot] in its profile."""
-    try:
-        return (
-            read_profile_toml(before["profile_toml"], where="profile_toml").robot != profile.robot
-        )
-    except ConfigError:  # as another version wrote it
-        return False
+    stored = _stored_profile(before["profile_toml"])
+    return stored is not None and stored.robot != profile.robot
+
+
+@lru_cache(maxsize=64)  # which many recordings share
+def _stored_profile(text: str) -> Profile | None:
+    with suppress(ConfigError):  # as another version wrote it
+        return read_profile_toml(text, where="profile_toml")
+    return None
 
 
 def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> Staged:

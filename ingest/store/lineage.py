@@ -312,9 +312,9 @@ class StoreReader:
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
         """
-        if TRANSITIONS not in self._listings and not self.path.has_table(TRANSITIONS):
-            return None
-        if (one := self._listing(TRANSITIONS).by_recording.get(recording_id)) is None:
+        made = TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
+        one = self._listing(TRANSITIONS).by_recording.get(recording_id) if made else None
+        if one is None:
             return None
         path = self._listing(RECORDINGS).paths.get(one.ingest_id, [own_path(*one[:2])])[-1]
         if OWN_PATH.fullmatch(path):
@@ -402,9 +402,8 @@ class StoreReader:
 
     def _files_of(self, ingest_id: str) -> list[str]:
         """Return the active files of transitions that hold rows of an ingest."""
-        if TRANSITIONS not in self._listings and not self.path.has_table(TRANSITIONS):
-            return []
-        return self._listing(TRANSITIONS).paths.get(ingest_id, [])
+        made = TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
+        return self._listing(TRANSITIONS).paths.get(ingest_id, []) if made else []
 
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
         """Yield the recording of each of these ingests and the ends of its episodes.
