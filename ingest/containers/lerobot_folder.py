@@ -46,7 +46,7 @@ from restock.ingest.decoding.columns import Channel, MessageBatch
 
 VERSION = "v3.0"
 GAP_S = 10  # between two episodes: longer than what a profile allows within one
-MAX_S = 1e6  # of a timestamp
+MAX_S, MAX_WIDTH = 1e6, 4096  # of a timestamp; numbers of a feature
 ROWS, IMAGES = 65_536, 256  # frames read at a time
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 FRAME, IMAGE = "/frame", "sensor_msgs/msg/CompressedImage"
@@ -121,7 +121,7 @@ class LeRobotFolder:
             raise RecordingError("it has no features", where=str(self._path / LEROBOT_INFO))
         for name, about in features.items():
             about = about if isinstance(about, dict) else {}
-            kind, shape = str(about.get("dtype")), about.get("shape")
+            kind = str(about.get("dtype"))
             if name in (*COUNTERS, "timestamp"):
                 continue
             if kind == "video":
@@ -132,12 +132,13 @@ class LeRobotFolder:
                 yield _Feature(name, ())
             elif not _NUMERIC.fullmatch(kind):
                 self.notes.append(f"feature {name} is a {kind}: it is not read")
-            elif not isinstance(shape, list) or len(shape) > 1 or shape == [0]:
+            elif (width := _width(about.get("shape"))) is None:
                 self.notes.append(
-                    f"feature {name} has the shape {shape}: only those of one dimension are read"
+                    f"feature {name} has the shape {about.get('shape')}: only one dimension is"
+                    f" read, of up to {MAX_WIDTH:,} numbers"
                 )
             else:
-                yield _Feature(name, field_names(about.get("names"), shape[0] if shape else 1))
+                yield _Feature(name, field_names(about.get("names"), width))
         if self.extras:
             self.notes.append(
                 f"{counted(len(self.extras), 'feature')} of video: listed, and not read"
@@ -285,6 +286,14 @@ class LeRobotFolder:
 
 
 _FRAME = "".join([*(f"int64 {name}\n" for name in COUNTERS), "float64 timestamp\n"]).encode()
+
+
+def _width(shape: object) -> int | None:
+    """Return how many numbers a feature of this shape has; None if that is not read."""
+    if not isinstance(shape, list) or len(shape) > 1:
+        return None
+    width = shape[0] if shape else 1
+    return width if isinstance(width, int) and 0 < width <= MAX_WIDTH else None
 
 
 def _type(feature: _Feature) -> str:

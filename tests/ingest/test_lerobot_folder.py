@@ -278,11 +278,15 @@ def test_another_layout_is_refused(tmp_path: Path, info: dict[str, Any], words: 
 
 def test_features_that_are_not_read_are_noted(tmp_path):
     text, wide = {"dtype": "string", "shape": [1]}, {"dtype": "float32", "shape": [4, 4]}
-    folder = write_set(tmp_path / "set", {"language": text, "map": wide})
+    odd = {
+        f"odd{at}": {"dtype": "float32", "shape": s} for at, s in enumerate(([0], ["4"], [10**12]))
+    }
+    folder = write_set(tmp_path / "set", {"language": text, "map": wide, "none": None, **odd})
     with open_recording(folder) as recording:
         assert list(recording.topics) == ["/action", "/frame", "/observation.state"]
         assert "feature language is a string: it is not read" in recording.notes
         assert any("map has the shape [4, 4]" in note for note in recording.notes)
+        assert sum("only one dimension is read" in note for note in recording.notes) == 4
 
 
 def test_rows_of_another_length_are_lost(tmp_path):
