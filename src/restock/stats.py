@@ -90,10 +90,7 @@ def median(values: NDArray[Any]) -> float:
 
 def paired_improvement(better: NDArray[Any], worse: NDArray[Any]) -> float:
     """Return P(a value of `better` (n,) beats its partner in `worse`), ties counting half."""
-    return _wins(np.asarray(better, np.float64) - np.asarray(worse, np.float64))
-
-
-def _wins(difference: F64) -> float:
+    difference = np.asarray(better, np.float64) - np.asarray(worse, np.float64)
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
 

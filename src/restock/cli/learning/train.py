@@ -150,7 +150,11 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                 if event == "evaluation":
                     say(_evaluation_line(values, session.wall_s))
                 elif event == "teacher":
-                    say(_silence_line(values))
+                    say(
+                        "warning: the teacher had no opinion (-1) in any of the"
+                        f" {values['asked']:,} states in which it was asked, so nothing was learnt"
+                        " from it in the twin"
+                    )
                 elif event == "off_policy":
                     for note in values["notes"]:
                         say(f"off-policy evaluation: {note}")
@@ -212,13 +216,6 @@ def _progress_note(values: dict[str, Any]) -> str:
     return (
         f"{values['phase']}: {values['env_steps_per_s']:,.0f} steps/s,"
         f" {values['updates_per_s']:,.0f} updates/s{success}"
-    )
-
-
-def _silence_line(values: dict[str, Any]) -> str:
-    return (
-        f"warning: the teacher had no opinion (-1) in any of the {values['asked']:,} states in "
-        "which it was asked, so nothing was learnt from it in the twin"
     )
 
 

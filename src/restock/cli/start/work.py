@@ -119,8 +119,8 @@ class Work:
                 return self._note(Ended(stage.name, "", "kept", outcome=["nothing to do"]))
             stage = replace(stage, command=command)
         began = self._known.get(stage.name, {})
-        goes_on = bool(stage.resume) and began.get("stamp") == stamp and _resumable(stage)
-        if goes_on:
+        saved = any(any((path / "checkpoints").glob("*.safetensors")) for path in stage.writes)
+        if stage.resume and began.get("stamp") == stamp and saved:
             stage = replace(stage, command=list(stage.resume))
         else:
             self._clear(stage)
@@ -283,10 +283,6 @@ def _parsed(text: str) -> Any:
     except json.JSONDecodeError:
         return {}
     return {"rows": document} if isinstance(document, list) else document
-
-
-def _resumable(stage: Stage) -> bool:
-    return any(any((path / "checkpoints").glob("*.safetensors")) for path in stage.writes)
 
 
 def _fingerprint(path: Path) -> str:

@@ -144,18 +144,13 @@ def _against_baseline(facts: Facts) -> str:
             parts[-1] += f"; the lowest is {points_text(lowest)} in {words(lowest['condition'])}"
     if few:
         against = "" if parts else f" from {who}"
-        parts.append(f"too few episodes to tell a difference{against} in {_few(few)}")
+        some = [f"{words(row['condition'])} ({points(row['difference'])} points)" for row in few]
+        parts.append(f"too few episodes to tell a difference{against} in {listed(some)}")
     if apart:
         as_who = "" if parts else f" as {who}"
         parts.append(f"not on the same episodes{as_who} in {listed(apart)}")
     text = "; ".join(parts)
     return text[0].upper() + text[1:]
-
-
-def _few(rows: Rows) -> str:
-    return listed(
-        [f"{words(row['condition'])} ({points(row['difference'])} points)" for row in rows]
-    )
 
 
 def _alone(row: dict[str, Any]) -> str:
