@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 import numpy as np
@@ -98,7 +98,7 @@ SIGNALS: tuple[Signal, ...] = (
 # places in the body frame, ground velocity along the body's axes, seconds since first seen.
 TRACK_SIGNALS = ("track_x_m", "track_y_m", "track_vx_mps", "track_vy_mps", "track_age_s")
 
-OBSERVED = "observed"  # beside them: the task's own entries, see `restock.ingest.task.task_sql`
+OBSERVED: Final = "observed"  # beside them: entries of the task's own, of `task_sql.py`
 OWN_LIMIT = 20.0  # of such an entry, either way
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
