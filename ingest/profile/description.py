@@ -28,6 +28,7 @@ from restock.errors import ConfigError
 from restock.files import first_line
 
 BASE_FRAMES = ("base_link", "base_footprint", "base")  # best first
+FIXED_FRAMES = ("map", "odom", "world")  # best first
 F64 = NDArray[np.float64]
 MAX_LETTERS = 4_000_000  # letters of a description
 MAX_LINKS = 5_000

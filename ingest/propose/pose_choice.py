@@ -16,7 +16,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
-from restock.ingest.profile.description import BASE_FRAMES
+from restock.ingest.profile.description import BASE_FRAMES, FIXED_FRAMES
 from restock.ingest.profile.signal_paths import transform_fields
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.roles import Roles, robots_in
@@ -26,7 +26,6 @@ from restock.ingest.steps.input_columns import MAX_STD_M, TRACK_M, Fixes, fixes_
 from restock.ingest.task.task import wrap_angle, yaw_of
 
 FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")
-FIXED_FRAMES = ("map", "odom", "world")  # best first
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from restock.errors import RecordingError, counted
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, cut, take
-from restock.ingest.profile.description import BASE_FRAMES
+from restock.ingest.profile.description import BASE_FRAMES, FIXED_FRAMES
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import (
     FIELDS,
@@ -67,13 +67,20 @@ def read_topics(
     clouds as scans.
 
     Raises:
-        RecordingError: as `wanted_fields`.
+        RecordingError: as `wanted_fields`; a point cloud is in a frame that does not move along.
     """
     if not reduced:
         profile = msgspec.structs.replace(profile, cameras={})  # images do not fit into memory
     topics = recording.topics
     leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in topics}
     wanted, made = wanted_fields(profile, topics, leaves), reductions(profile, topics, leaves)
+    for name, scan in profile.inputs.scans.items():
+        frame = _first_frame(recording, scan.topic) if scan.type == CLOUD else ""
+        if frame.split("/")[-1] in FIXED_FRAMES:
+            raise RecordingError(
+                f"{scan.topic} ({name}) has its points in the frame {frame}, not in the robot's",
+                remedy="name a topic of clouds in the lidar's own frame",
+            )
     if not reduced:
         clouds = {
             scan.topic: cloud_reduction(scan, profile.task.range_min_m)

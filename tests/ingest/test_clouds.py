@@ -1,6 +1,7 @@
 """A robot with a 3-D lidar alone: a slice of its point clouds is read as a scan."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from support.driven_robot import Drive, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import Ragged, offsets_of
 from restock.ingest.live.observer import LiveObserver
@@ -156,7 +157,7 @@ UNUSABLE = {
 }
 
 
-def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None) -> Path:
+def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str = "") -> Path:
     """Write a drive whose scans are clouds; those from 3 s on are `spoilt`."""
     folder.mkdir()
     drive, bag = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "drive"), folder / "bag"
@@ -187,7 +188,9 @@ def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None) -> Path:
             cloud = spoilt if spoilt is not None and late else packed(xyz)
             names = [point(name=n, offset=o, datatype=k, count=1) for n, o, k in cloud["fields"]]
             message = TYPES.types["sensor_msgs/msg/PointCloud2"](
-                header=scan.header, is_dense=False, **cloud | {"fields": names}
+                header=replace(scan.header, frame_id=frame),
+                is_dense=False,
+                **cloud | {"fields": names},
             )
             writer.write(to, now_ns, TYPES.serialize_cdr(message, to.msgtype))
     return bag
@@ -219,6 +222,12 @@ def test_a_cloud_that_cannot_be_used_drops_its_steps_with_the_reason(kind, tmp_p
     spoilt, reason = UNUSABLE[kind]
     problems = read(with_clouds(tmp_path / "clouds", spoilt)).problem
     assert set(problems) == {"", f"scan: {reason}"}
+
+
+def test_a_cloud_in_a_fixed_frame_is_refused(tmp_path):
+    bag = with_clouds(tmp_path / "clouds", frame="robot1/odom")
+    with pytest.raises(RecordingError, match="its points in the frame robot1/odom"):
+        read(bag)
 
 
 def test_a_running_robot_sees_by_clouds_what_ingest_stores(tmp_path):
