@@ -41,7 +41,6 @@ from replay_contenders import (
     strata,
 )
 
-from restock.native import is_used
 from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.packed_rows import row_width
 from restock.replay.sampling.ring import FreshRing
@@ -50,11 +49,9 @@ from restock.replay.sampling.sampler import QuotaSampler, uniform_sampler
 MANY_WIDTH = 16  # floats in a row, of ten million
 RECORD_TARGET = 0.06
 QUOTA_TARGET = 1.2
-TARGETS = {  # name -> (slower, faster, at least so many times)
-    "stable_baselines3 / uniform": ("stable_baselines3", "uniform", 9.0 if is_used() else 6.0),
-    "tianshou / uniform": ("tianshou", "uniform", 6.0 if is_used() else 4.3),
-    "tianshou_per / per": ("tianshou_per", "per", 6.0),
-}
+# Times gathering the rows alone, at most: memory decides what that takes, and so how far ahead of
+# other libraries a draw can be.
+TARGETS = {"uniform": 1.3, "per": 2.2}
 
 
 def measure(contenders: dict[str, Callable[[], None]], rounds: int, draws: int) -> dict[str, float]:
@@ -112,11 +109,7 @@ def sampling(quick: bool) -> dict[str, Any]:
         "row_floats": row_width(OBSERVATION),
         "cpu_us_per_batch": us,
         "left_out": left_out | more_left_out,
-        "ratios": {
-            name: us[slower] / us[faster]
-            for name, (slower, faster, _) in TARGETS.items()
-            if slower in us
-        },
+        "over_rows_alone": {name: us[name] / us["rows_alone"] for name in TARGETS},
         "quotas / uniform": us["quotas"] / us["uniform"],
     }
 
@@ -337,11 +330,11 @@ SECTIONS: dict[str, Callable[[bool], dict[str, Any]]] = {
 
 def missed(figures: dict[str, Any]) -> list[str]:
     """Return the targets of the design that these figures miss."""
-    ratios = figures["sampling"]["ratios"] if "sampling" in figures else {}
+    ratios = figures["sampling"]["over_rows_alone"] if "sampling" in figures else {}
     misses = [
-        f"{name}: {ratio:.2f}, at least {TARGETS[name][2]:g}"
+        f"{name} / the rows alone: {ratio:.2f}, at most {TARGETS[name]:g}"
         for name, ratio in ratios.items()
-        if ratio < TARGETS[name][2]
+        if ratio > TARGETS[name]
     ]
     for part in (figures[name] for name in ("sampling", "many_rows") if name in figures):
         if (ratio := part["quotas / uniform"]) > QUOTA_TARGET:
@@ -365,8 +358,8 @@ def lines(result: dict[str, Any]) -> Iterator[str]:
             times = value / us["uniform"]
             yield f"  {name:22} {value:10.1f} us of CPU a batch {times:8.2f} x uniform"
         yield from (f"  {n:22} left out: {why}" for n, why in figures["left_out"].items())
-        for name, ratio in figures["ratios"].items():
-            yield f"  {name:38} {ratio:6.2f}  (target {TARGETS[name][2]:g})"
+        for name, ratio in figures["over_rows_alone"].items():
+            yield f"  {name} / the rows alone: {ratio:.2f} (target at most {TARGETS[name]:g})"
 
 
 if __name__ == "__main__":
