@@ -12,6 +12,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -302,7 +303,13 @@ class MessageType(ABC):
         Raises:
             CannotDecode: it nests too deeply, or has too many fields.
         """
-        return list(self._leaves(self.name, "", (), (self.name,), [0]))
+        return [*self._by_path.values()]
+
+    @cached_property
+    def _by_path(self) -> dict[str, Leaf]:
+        """Hold the leaves by their paths: a process keeps its types, and many recordings ask."""
+        every = self._leaves(self.name, "", (), (self.name,), [0])
+        return {leaf.path: leaf for leaf in every}
 
     def _leaves(
         self,
@@ -335,6 +342,8 @@ class MessageType(ABC):
         Raises:
             RecordingError: the type has no such field; names those it has.
         """
+        if path in self._by_path:
+            return self._by_path[path]
         name, steps = self.name, list[FieldType]()
         parts = path.split(".")
         for place, part in enumerate(parts):
