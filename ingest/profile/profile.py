@@ -286,6 +286,12 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
     cameras = document.get("cameras")
     for name, table in cameras.items() if isinstance(cameras, dict) else ():
         typed(table, Camera, where=where, prefix=f"cameras.{name}")
+    task = document.get("task")
+    terms = task.get("reward_terms") if isinstance(task, dict) else None
+    for name, term in terms.items() if isinstance(terms, dict) else ():
+        if not isinstance(term, list):
+            what = f'`task.reward_terms.{name}` must be [WEIGHT, "SQL"], got {term!r}'
+            raise ConfigError(what, where=where)
     profile = typed(document, Profile, where=where, renamed=PROFILE_KEYS)
     if not profile.inputs.scans:
         profile = without_lidar(profile)  # whatever number of sectors it gives
@@ -575,11 +581,8 @@ def _check_conditions(profile: Profile, where: str) -> None:
     own += own_sql(task, "observed") if task.observed else []
     if profile.goal_source == "hindsight":
         for name, plan in unseen(own, PLAN_SIGNALS).items():
-            raise ConfigError(
-                f"the SQL of {name!r} in [task] names {plan[0]}, and {DRIVEN_PLAN}",
-                where=where,
-                remedy="leave it out: with goals in hindsight, nothing stood on the plan",
-            )
+            what = f"the SQL of {name!r} in [task] names {plan[0]}, and {DRIVEN_PLAN}"
+            raise ConfigError(what, where=where, remedy="leave it out: nothing stood on it")
     try:
         if task.reward_terms:
             own_values(task, "reward_terms", steps)

@@ -83,11 +83,9 @@ def _layout(
     if None in types:
         return None
     formats = [(">" if big else "<") + str(one) for one in types]
+    spec = {"names": ["x", "y", "z"], "formats": formats, "itemsize": step}
     try:
-        starts = [offsets[place] for place in places]
-        return np.dtype(
-            {"names": ["x", "y", "z"], "formats": formats, "offsets": starts, "itemsize": step}
-        )
+        return np.dtype(spec | {"offsets": [offsets[place] for place in places]})
     except ValueError:  # beyond the end of a point
         return None
 
