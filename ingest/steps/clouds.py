@@ -83,9 +83,9 @@ def _layout(
     if None in types:
         return None
     formats = [(">" if big else "<") + str(one) for one in types]
-    spec = {"names": ["x", "y", "z"], "formats": formats, "itemsize": step}
+    xyz, at_byte = list("xyz"), [offsets[place] for place in places]
     try:
-        return np.dtype(spec | {"offsets": [offsets[place] for place in places]})
+        return np.dtype({"names": xyz, "formats": formats, "offsets": at_byte, "itemsize": step})
     except ValueError:  # beyond the end of a point
         return None
 
