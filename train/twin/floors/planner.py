@@ -132,7 +132,7 @@ class Planner:
 
     def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
         """Follow the tree from a cell to the goal; return the way smoothed and resampled."""
-        cells, following = [start], memoryview(before)  # whose items are Python's own numbers
+        cells, following = [start], before.data  # whose items are Python's own numbers
         while (cell := following[cells[-1]]) >= 0:
             cells.append(cell)
         way = np.stack(np.unravel_index(np.array(cells), self.shape), axis=-1) * CELL_M + CELL_M / 2

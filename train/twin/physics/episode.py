@@ -115,7 +115,8 @@ def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode
         for heading in (yaw, ahead, *square.tolist()):
             cos, sin = np.cos(heading), np.sin(heading)
             points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + place
-            if near_floor_gap(warehouse, *points.T[:, None], AISLE_ROOM_M).min() > 0:
+            corners = points[None, :, 0], points[None, :, 1]
+            if near_floor_gap(warehouse, *corners, AISLE_ROOM_M).min() > 0:
                 return replace(episode, start=(*place, heading))
     return episode
 
