@@ -26,10 +26,10 @@ from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measure
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batch_record import LEAVE_OUT, TRAIN_SLOWER, refuse
-from restock.train.feed.batches import ReplayBatch
+from restock.train.feed.batches import ReplayBatch, drawn_ahead
 from restock.train.feed.logs import PROBE_ROWS, Probe
 from restock.train.feed.teacher import TeacherFailed
-from restock.train.feed.update_blocks import LONGEST, Made, drawn_ahead
+from restock.train.feed.update_blocks import LONGEST, Made
 from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy

@@ -261,6 +261,19 @@ class LogTerms:
         return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
 
 
+def drawn_ahead(
+    draw: Callable[[], ReplayBatch], count: int
+) -> tuple[list[ReplayBatch], MixtureError | None]:
+    """Draw batches; return them, and the error that ended them early, if any."""
+    batches: list[ReplayBatch] = []
+    for _ in range(count):
+        try:
+            batches.append(draw())
+        except MixtureError as error:
+            return batches, error
+    return batches, None
+
+
 def check_terms(config: TrainConfig, panel: Panel | None) -> None:
     """Refuse what `LogTerms.of` would, from the panel's columns alone."""
     if panel is None:

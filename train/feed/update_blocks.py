@@ -23,14 +23,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from restock.errors import MixtureError
 from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.behaviour import Labelled
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner, Terms
 from restock.train.dqn.network import averaging_rate
-from restock.train.feed.batches import Batches, LogTerms, ReplayBatch
+from restock.train.feed.batches import Batches, LogTerms, ReplayBatch, drawn_ahead
 from restock.train.feed.teacher import Imitation
 
 LONGEST = 16  # updates of a block
@@ -164,19 +163,6 @@ class UpdateBlocks:
         for k, batch in enumerate(drawn):
             self.learner.count(1, labelled=labelled)
             yield batch, Loss(outcome.loss[k], outcome.td[k], outcome.q[k]), outcome.tail[k]
-
-
-def drawn_ahead(
-    draw: Callable[[], ReplayBatch], count: int
-) -> tuple[list[ReplayBatch], MixtureError | None]:
-    """Draw batches; return them, and the error that ended them early, if any."""
-    batches: list[ReplayBatch] = []
-    for _ in range(count):
-        try:
-            batches.append(draw())
-        except MixtureError as error:
-            return batches, error
-    return batches, None
 
 
 _WARM_UP = 3  # updates before the capture: libraries take their memory at the first calls
