@@ -32,7 +32,7 @@ from restock.train.dqn.behaviour import (
 from restock.train.dqn.config import PLANNER, TrainConfig, parse_config
 from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_probabilities
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.network import Ensemble, QNetwork, UpdatePath, members_of
+from restock.train.dqn.network import Ensemble, QNetwork, UpdatePath, clone, members_of
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.ope_dataset import MODEL_ROWS, held_out_rows
 from restock.train.run import checkpoint
@@ -43,7 +43,6 @@ from restock.train.run.run import (
     Run,
     chosen_policy,
     env_steps_of,
-    latest_drives,
     resuming,
 )
 from restock.train.run.run_profile import profile_of_run, run_panel
@@ -105,7 +104,8 @@ def load_agent(run: Run) -> GreedyPolicy:
         RunError: it has made no update yet, its policy is missing or damaged, or it is of a task
             that the profile no longer is.
     """
-    latest = latest_drives(run)
+    chosen = chosen_policy(run)
+    latest = chosen == "latest"
     if not (latest or run.best.exists()) and not (
         run.latest.is_file() and kept_one(checkpoint.load(run.latest))
     ):
@@ -135,7 +135,7 @@ def load_agent(run: Run) -> GreedyPolicy:
             remedy="put the settings back that were changed in config.json: network, teacher",
         ) from error
     env_steps, updates = state["env_steps"], state["gradient_steps"]
-    origin = PolicyOrigin(chosen_policy(run), env_steps, updates, env_steps_of(run))
+    origin = PolicyOrigin(chosen, env_steps, updates, env_steps_of(run))
     return GreedyPolicy(network.eval(), f"{run.path.name}@{updates}", origin)
 
 
@@ -219,48 +219,44 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
     """
     runs = [Run.open(path) for path in places]
     agents = [load_agent(run) for run in runs]
-    config = parse_config(runs[0].document["config"], where=str(runs[0].path))
-    first = agents[0].network
-    for run, agent in zip(runs, agents, strict=True):
-        if isinstance(agent.network, FilteredNetwork):
+    configs = [parse_config(run.document["config"], where=str(run.path)) for run in runs]
+    kinds = [
+        (run.document["task_hash"], config.network, config.loss.algorithm, config.teacher.source)
+        for run, config in zip(runs, configs, strict=True)
+    ]
+    values, root = [], len(runs) ** 0.5
+    for run, agent, kind in zip(runs, agents, kinds, strict=True):
+        network = agent.network
+        if isinstance(network, FilteredNetwork):
             raise ConfigError(
                 "its policy has a teacher's filter, of which there is no mean",
                 where=str(run.path),
                 remedy='train with teacher.source = "planner" or "none"',
             )
-        known = parse_config(run.document["config"], where=str(run.path))
-        alike = (known.network, known.loss.algorithm, known.teacher.source) == (
-            *(config.network, config.loss.algorithm, config.teacher.source),
-        )
-        if not alike or run.document["task_hash"] != runs[0].document["task_hash"]:
+        if kind != kinds[0]:
             raise RunError(
                 f"is not of the same task, network, algorithm and teacher as {runs[0].path}",
                 where=str(run.path),
                 remedy="give runs that differ in their seeds alone",
             )
-    networks = [
-        agent.network.values if isinstance(agent.network, ProposalNetwork) else agent.network
-        for agent in agents
-    ]
-    values = Ensemble([member for network in networks for member in members_of(network)])
-    network: PolicyNetwork = values
-    if isinstance(first, ProposalNetwork):
-        network = ProposalNetwork(values, None, 0.0)
-        buffers = {name: of for name, of in first.state_dict().items() if "." not in name}
-        network.load_state_dict({**network.state_dict(), **buffers})
-        network.lead /= len(runs) ** 0.5
+        values += members_of(network.values if isinstance(network, ProposalNetwork) else network)
+    mean: PolicyNetwork = Ensemble(values)
+    if isinstance(first := agents[0].network, ProposalNetwork):
+        mean = clone(first)
+        mean.values, mean.lead = Ensemble(values), mean.lead / root
     document = {key: value for key, value in runs[0].document.items() if key != "format"}
-    whole = msgspec.to_builtins(config)
-    whole["network"]["members"] = len(values.members)
-    whole["teacher"]["margin"] /= len(runs) ** 0.5
-    document |= {"config": whole, MEAN_OF: [agent.version for agent in agents]}
-    steps, updates = (
-        sum(getattr(agent.origin, name) for agent in agents)
-        for name in ("env_steps", "gradient_steps")
+    whole = msgspec.to_builtins(configs[0])
+    whole["network"]["members"] = len(values)
+    whole["teacher"]["margin"] /= root
+    made = Run.create(
+        out, document | {"config": whole, MEAN_OF: [agent.version for agent in agents]}
     )
-    made = Run.create(out, document)
-    clocks = {"env_steps": steps, "gradient_steps": updates}
-    save_agent(made, network, profile_of_run(made).task, Score({}, 0.0, 0.0), clocks)
+    origins = [agent.origin for agent in agents if agent.origin is not None]
+    clocks = {
+        "env_steps": sum(origin.env_steps for origin in origins),
+        "gradient_steps": sum(origin.gradient_steps for origin in origins),
+    }
+    save_agent(made, mean, profile_of_run(made).task, Score({}, 0.0, 0.0), clocks)
     return load_agent(made)
 
 
