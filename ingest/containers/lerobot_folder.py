@@ -147,6 +147,7 @@ class LeRobotFolder:
     def _opened(self) -> list[_Frames]:
         """Find the data files and the stamps of their frames; a file that is missing is damage."""
         listed = self._listed()
+        columns = ("timestamp", *COUNTERS, *(one.name for one in self._features.values()))
         found: list[tuple[Path, str]] = []
         parts: list[tuple[Ints, NDArray[Any]]] = []
         for path in sorted(self._path.glob(LEROBOT_DATA)):
@@ -155,13 +156,7 @@ class LeRobotFolder:
             self._watch("looking through the data files", len(found), len(found) + len(listed) + 1)
             try:
                 file = pq.ParquetFile(path)
-                lacking = [one.name for one in self._features.values()]
-                lacking = [
-                    one
-                    for one in ("timestamp", *COUNTERS, *lacking)
-                    if one not in file.schema_arrow.names
-                ]
-                if lacking:
+                if lacking := [one for one in columns if one not in file.schema_arrow.names]:
                     raise ValueError(f"it has no column {', '.join(lacking)}")
                 table = file.read(columns=["timestamp", "episode_index"])
                 episode = table["episode_index"].to_numpy().astype(np.int64)
@@ -237,7 +232,7 @@ class LeRobotFolder:
         names += [*COUNTERS, "timestamp"] if 1 in channels else []
         images = any(number != 1 and not self._features[number].fields for number in wanted)
         for file in self._files if wanted else ():
-            done = 0
+            done, short = 0, Counter[tuple[int, str]]()
             try:
                 parts = pq.ParquetFile(file.path).iter_batches(
                     IMAGES if images else ROWS, columns=names
@@ -245,14 +240,18 @@ class LeRobotFolder:
                 for part in parts:
                     stamp_ns = file.stamp_ns[done : done + len(part)]
                     for number in wanted:
-                        yield number, self._batch(number, part, stamp_ns, file.name)
+                        yield number, self._batch(number, part, stamp_ns, short)
                     done += len(part)
             except UNREADABLE as error:
                 lost = dict.fromkeys(wanted, len(file.stamp_ns) - done)
                 self._damaged(f"{file.name} from row {done:,} on: {first_line(error)}", lost)
+            for (number, why), count in short.items():
+                self._damaged(f"{file.name}: frames with {why}", {number: count})
 
-    def _batch(self, number: int, part: pa.RecordBatch, stamp_ns: Ints, file: str) -> MessageBatch:
-        """Build the messages of one channel for these frames."""
+    def _batch(
+        self, number: int, part: pa.RecordBatch, stamp_ns: Ints, short: Counter[tuple[int, str]]
+    ) -> MessageBatch:
+        """Build the messages of one channel for these frames; count in `short` those without."""
         if number == 1:
             counters = [
                 part[name].cast(pa.int64()).to_numpy(zero_copy_only=False) for name in COUNTERS
@@ -263,21 +262,15 @@ class LeRobotFolder:
         column = part[feature.name]
         if feature.fields:
             good, values = rows_of(column, len(feature.fields))
+            why = f"another number of values than {len(feature.fields)}"
         else:
             pictures = column.field("bytes") if pa.types.is_struct(column.type) else column
-            good = np.asarray(pictures.is_valid())
+            good, why = np.asarray(pictures.is_valid()), "no picture within the table"
         if not good.all():
-            why = (
-                f"another number of values than {len(feature.fields)}"
-                if feature.fields
-                else ("no picture within the table")
-            )
-            self._damaged(
-                f"{file}: frames with {why} in {feature.name}", {number: int((~good).sum())}
-            )
-        if feature.fields:
-            return cdr_batch(values, stamp_ns[good])
+            short[number, f"{why} in {feature.name}"] += int((~good).sum())
         kept = stamp_ns[good]
+        if feature.fields:
+            return cdr_batch(values, kept)
         payloads = map(image_cdr, pictures.drop_null().to_pylist(), kept.tolist())
         return MessageBatch.of(list(payloads), kept, kept)
 
@@ -334,18 +327,14 @@ def stamps_of(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[
     within_ns = np.rint((seconds - seconds[first][run]) * 1e9).astype(np.int64)
     last_ns = within_ns[np.append(first[1:], len(episode)) - 1]
     begin_ns = np.cumsum(np.append(0, last_ns[:-1]) + GAP_S * 10**9)
-    problem = None
-    if len(wrong):
-        at = int(wrong[0]) + 1
-        problem = (
-            at,
-            (
-                f"is of episode {episode[at]:,}, after episode {episode[at - 1]:,}"
-                if episode[at] != episode[at - 1]
-                else f"of episode {episode[at]:,} is not later than the one before it"
-            ),
-        )
-    return begin_ns[run] + within_ns, problem
+    stamps = begin_ns[run] + within_ns
+    if not len(wrong):
+        return stamps, None
+    at = int(wrong[0]) + 1
+    before, now = episode[at - 1 : at + 1]
+    if now != before:
+        return stamps, (at, f"is of episode {now:,}, after episode {before:,}")
+    return stamps, (at, f"of episode {now:,} is not later than the one before it")
 
 
 def rows_of(column: pa.Array, width: int) -> tuple[Bools, NDArray[np.float64]]:
