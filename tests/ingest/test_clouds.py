@@ -10,14 +10,13 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import Drive, seen_alike, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import Ragged, offsets_of
-from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.steps.clouds import BEAM_RAD, cloud_reduction
 from restock.ingest.steps.episodes import Steps, steps_of
@@ -232,22 +231,8 @@ def test_a_cloud_in_a_fixed_frame_is_refused(tmp_path):
 
 def test_a_running_robot_sees_by_clouds_what_ingest_stores(tmp_path):
     bag = with_clouds(tmp_path / "clouds", UNUSABLE["cut short"][0])
-    observer, seen = LiveObserver(parse_profile(PROFILE, where="cloud.toml")), {}
-    with AnyReader([bag]) as reader:
-        chosen = [c for c in reader.connections if c.topic in observer.topics]
-        for connection, now_ns, raw in reader.messages(chosen):
-            if connection.topic == "/cmd_vel":
-                observed = observer.observe(now_ns)
-                seen[observed.stamp_ns] = observed
-            observer.receive(connection.topic, reader.deserialize(raw, connection.msgtype), now_ns)
-    steps, compared = read(bag), {"": 0, f"scan: {UNREAD}": 0}
-    stamps, sectors = (steps.signals[name] for name in ("stamp_ns", "sector_clearance_m"))
-    for stamp_ns, problem, clearance in zip(stamps.tolist(), steps.problem, sectors, strict=True):
-        if stamp_ns in seen and seen[stamp_ns].problem == problem:
-            live = seen[stamp_ns].signals["sector_clearance_m"][0]
-            np.testing.assert_array_equal(live, clearance)
-            compared[problem] += 1
-    assert min(compared.values()) > 5
+    alike = seen_alike(bag, parse_profile(PROFILE, where="cloud.toml"), read(bag))
+    assert min(alike[""], alike[f"scan: {UNREAD}"]) > 5
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosbags.highlevel import AnyReader
-from support.driven_robot import Drive, columns, scans, transforms, without, write_bag
+from support.driven_robot import Drive, columns, scans, seen_alike, transforms, without, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
@@ -207,28 +205,7 @@ def test_a_tick_without_one_of_the_lidars_is_dropped_by_its_name(tmp_path):
 
 def test_a_running_robot_sees_by_all_lidars_what_ingest_stores(tmp_path):
     bag, text = Corridor().bag(tmp_path / "bag"), two_lidars()
-    observer, seen = LiveObserver(parse_profile(text, where="p")), {}
-    with AnyReader([bag]) as reader:
-        chosen = [c for c in reader.connections if c.topic in observer.topics]
-        for connection, now_ns, raw in reader.messages(chosen):
-            if connection.topic == "/cmd_vel":
-                observed = observer.observe(now_ns)
-                seen[observed.stamp_ns] = observed
-            observer.receive(connection.topic, reader.deserialize(raw, connection.msgtype), now_ns)
-    steps = read(bag, text)
-    compared = 0
-    for stamp_ns, problem, clearance in zip(
-        steps.signals["stamp_ns"].tolist(),
-        steps.problem,
-        steps.signals["sector_clearance_m"],
-        strict=True,
-    ):
-        if problem == "" and seen[stamp_ns].problem == "":
-            np.testing.assert_array_equal(
-                seen[stamp_ns].signals["sector_clearance_m"][0], clearance
-            )
-            compared += 1
-    assert compared > 10
+    assert seen_alike(bag, parse_profile(text, where="p"), read(bag, text))[""] > 10
 
 
 def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -10,8 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
 
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
+from restock.ingest.live.observer import LiveObserver, Observed
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.episodes import Steps
 
 SPEED_MPS = 0.5
 PERIOD_S = 0.2
@@ -325,3 +330,22 @@ def cut_bag(folder: Path) -> Path:
     (file,) = write_bag(Drive(), folder, storage="mcap").glob("*.mcap")
     os.truncate(file, int(0.8 * file.stat().st_size))
     return folder
+
+
+def seen_alike(bag: Path, profile: Profile, steps: Steps) -> Counter[str]:
+    """Count the commands at which a running robot sees what ingest stores, by what is amiss."""
+    observer, seen, alike = LiveObserver(profile), dict[int, Observed](), Counter[str]()
+    with AnyReader([bag]) as reader:
+        chosen = [c for c in reader.connections if c.topic in observer.topics]
+        for connection, now_ns, raw in reader.messages(chosen):
+            if connection.topic == "/cmd_vel":
+                observed = observer.observe(now_ns)
+                seen[observed.stamp_ns] = observed
+            observer.receive(connection.topic, reader.deserialize(raw, connection.msgtype), now_ns)
+    stamps, sectors = (steps.signals[name] for name in ("stamp_ns", "sector_clearance_m"))
+    for stamp_ns, problem, clearance in zip(stamps.tolist(), steps.problem, sectors, strict=True):
+        if seen[stamp_ns].problem == problem:
+            live = seen[stamp_ns].signals["sector_clearance_m"][0]
+            np.testing.assert_array_equal(live, clearance)
+            alike[problem] += 1
+    return alike
