@@ -14,6 +14,7 @@ from support.stores import recording_transitions, write_store
 from restock.cli import main
 from restock.replay.store.store import Store
 from restock.report import coverage_page, study_page, write_page
+from restock.report.fleet.coverage import coverage_weeks
 from restock.report.look import charts
 from restock.report.look.write import Charts
 
@@ -133,6 +134,7 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     with Store(write_store(tmp_path / "store", tables, tags=tags)) as store:
         _, sections = coverage_of(store, missing())
         (table,) = sections["robots"].tables
+        weeks, _ = coverage_weeks(store)
         of_robot = (
             "SELECT robot, count(*), count(DISTINCT primary_condition) FROM transitions"
             " GROUP BY ALL"
@@ -141,6 +143,8 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     assert all(conditions > 1 for _, _, conditions in counted)
     expected = {robot: f"{rows * CONTROL_PERIOD_S / 3600:.2f}" for robot, rows, _ in counted}
     assert {row["robot"]: row["hours"] for row in table.rows} == expected
+    every = sum(rows for _, rows, _ in counted) * CONTROL_PERIOD_S / 3600
+    assert {round(row["hours"], 9) for row in weeks} == {round(every, 9)}
 
 
 def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:
@@ -163,6 +167,8 @@ def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, capsys):
     make_run(folder / "runs" / "<b>monday", document(0, created_ns=1), success=0.2)
     make_run(folder / "runs" / "tuesday", document(1, created_ns=2, **wider), success=0.7)
     make_run(folder / "old", document(1, format="restock-run/1"))
+    damaged = make_run(folder / "damaged", document(1)) / "fed.parquet"
+    damaged.write_bytes(damaged.read_bytes()[:-9])
     (folder / "fleet").symlink_to(store_path)
     assert main(["report", str(folder)]) == 0
     assert capsys.readouterr().out == f"{folder / 'report.html'}\n"
@@ -170,5 +176,6 @@ def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, capsys):
     assert "tuesday, the latest run, against <b>monday: better in wheel slip" in text
     assert re.search(r"replay\.batch_size \d+ → 7\b", text)
     assert "was written by an earlier Restock" in text
+    assert str(damaged) in text
     assert "fleet: week by week" in text
     assert main(["report", str(folder / "runs" / "nothing")]) == 2

@@ -90,7 +90,9 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
-    "report": "look run fleet ingest/store replay replay/store train/judge train/run",
+    "report": (
+        "look run fleet ingest/store replay replay/store train/evaluation train/judge train/run"
+    ),
     "report/look": "train/twin/missions",
     "report/run": (
         "look replay/panel replay/plan replay/review replay/sampling replay/store train/evaluation"

@@ -4,74 +4,82 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import altair as alt
-import pyarrow.compute as pc
 
 from restock.errors import RestockError, RunError, counted
 from restock.ingest.store.location import Location
 from restock.replay.places import kind_beside
-from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store, is_store
 from restock.report.fleet.coverage import coverage_weeks
 from restock.report.look import blocks, charts
-from restock.report.look.blocks import Figure, Rows, Section, Table, ask, count, named, words
+from restock.report.look.blocks import Figure, Rows, Section, Table, count, words
+from restock.report.run.comparison import better_and_worse
 from restock.stats import interval_text
+from restock.train.evaluation.regression import agent_episodes
 from restock.train.judge.compare import diff_runs, last_evaluation
-from restock.train.run.kept_evaluations import shown_evaluation, summary_rows
+from restock.train.run.kept_evaluations import summary_rows
 from restock.train.run.replay_audit import fed_shares
 from restock.train.run.run import Run
 
 DEPTH = 3  # folders below the one that was named in which runs and stores are looked for
 MAX_SETTINGS = 6  # settings that are named in a line
+CLEAN = ("none", "nominal")  # names of driving without a perturbation
 _SOFTWARE = ("free", "software")  # kinds of settings that change no result by intent
-_WEEKS = """
-    SELECT week, condition, sum(hours)::DOUBLE AS hours, sum(rows_held)::BIGINT AS rows_held,
-           sum(events)::BIGINT AS events, sum(successes)::BIGINT AS successes,
-           sum(goal_episodes)::BIGINT AS goal_episodes
-    FROM coverage_by_week GROUP BY week, condition ORDER BY week, condition
-"""
+T = TypeVar("T")
+
+
+class _Seen(NamedTuple):
+    """What the page shows of a run."""
+
+    run: Run
+    env_steps: int
+    by: str  # who drove it: `restock eval`, training, or nobody yet
+    success: Rows  # a row a condition
+    fed: Rows  # a row a stratum
 
 
 def history_page(folder: Path) -> dict[str, Any]:
     """Return everything that the page's template needs.
 
-    Runs that cannot be read are named on the page. Without a store in the folder, the stores that
-    the runs' panels were mixed from are shown.
+    Runs and stores that cannot be read are named on the page. Without a store in the folder, those
+    that the runs' panels were mixed from are shown.
 
     Raises:
         RunError: there is neither a run nor a store in the folder.
     """
-    runs, stores, missing = _found(folder)
-    if not runs and not stores:
+    found, stores = _places(folder)
+    if not found and not stores:
         raise RunError(
             "holds no run and no store" if folder.is_dir() else "no such folder",
             where=str(folder),
             remedy="give a run (`restock train --out`), or a folder of runs and stores",
         )
-    fed_from = dict.fromkeys((run.document.get("panel") or {}).get("store") for run in runs)
-    if not stores:
-        stores = [Path(place) for place in fed_from if place and is_store(place)]
-    driven = [_success(run) for run in runs]
-    changes = [_change(a, b) for a, b in itertools.pairwise(runs)]
+    missing: Rows = []
+    runs = sorted(_read(_seen, found, missing), key=lambda one: _began(one.run))
+    fed_from = ((one.run.document.get("panel") or {}).get("store") for one in runs)
+    weeks = list(_read(_weeks, stores or map(Path, filter(None, dict.fromkeys(fed_from))), missing))
+    changes = [_change(a.run, b.run) for a, b in itertools.pairwise(runs)]
     return {
         "kicker": "runs and weeks",
         "title": folder.resolve().name,
-        "headline": _headline(runs, changes, stores),
+        "headline": _headline(runs, changes, len(weeks)),
         "lead": "Runs are in the order in which they began, each beside the run before it.",
         "cards": [
             {"value": count(len(runs)), "label": "runs"},
-            {"value": count(len(stores)), "label": "stores"},
+            {"value": count(len(weeks)), "label": "stores"},
         ],
         "sections": [
-            _runs(runs, driven),
+            _runs(runs),
             _changes(runs, changes),
             _fed(runs),
-            *(section for place in stores for section in _weeks(place)),
+            *weeks,
             Section("missing", "What could not be read", tables=[Table(missing)])
             if missing
             else None,
@@ -80,54 +88,60 @@ def history_page(folder: Path) -> dict[str, Any]:
     }
 
 
-def _found(folder: Path) -> tuple[list[Run], list[Path], Rows]:
-    """Return the runs of a folder by when they began, its stores, and what cannot be read."""
-    runs, stores, missing = [], [], []
+def _places(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Find the runs and the stores of a folder."""
+    runs, stores = [], []
     for name, below, files in os.walk(folder, followlinks=True):
         place = Path(name)
         kind = kind_beside(place)
         if kind == "run" and "progress.parquet" in files:
-            try:
-                runs.append(Run.open(place))
-            except RestockError as error:
-                missing.append({"run": str(place), "why": str(error)})
+            runs.append(place)
         elif is_store(Location.of(place)):
             stores.append(place)
         elif kind != "panel" and len(place.relative_to(folder).parts) < DEPTH:
             below[:] = sorted(one for one in below if not one.startswith("."))
             continue
         below.clear()
-    return sorted(runs, key=_began), stores, missing
+    return runs, stores
+
+
+def _read(read: Callable[[Path], T | None], places: Iterable[Path], missing: Rows) -> Iterator[T]:
+    """Yield what is read at each place; add those that cannot be read to `missing`."""
+    for place in places:
+        try:
+            if (found := read(place)) is not None:
+                yield found
+        except RestockError as error:
+            missing.append({"place": str(place), "why": str(error)})
 
 
 def _began(run: Run) -> int:
     return int(run.document.get("created_ns") or 0)
 
 
-def _names(runs: list[Run]) -> list[str]:
+def _names(runs: Sequence[_Seen]) -> list[str]:
     """Name runs by their folders, and by more of their paths where those are alike."""
-    names = [run.path.name for run in runs]
-    return [
-        name if names.count(name) == 1 else "/".join(run.path.parts[-2:])
-        for name, run in zip(names, runs, strict=True)
-    ]
+    paths = [one.run.path for one in runs]
+    names = Counter(path.name for path in paths)
+    return [path.name if names[path.name] == 1 else "/".join(path.parts[-2:]) for path in paths]
 
 
-def _success(run: Run) -> tuple[str, Rows]:
-    """Return who drove, and success by condition: `restock eval`, else training's last one."""
-    evaluated, _ = shown_evaluation(run.path)
-    rows = evaluated.filter(
-        pc.and_(pc.equal(evaluated["policy"], "agent"), pc.equal(evaluated["perturbation"], "none"))
-    ).to_pylist()
-    if rows:
-        return "restock eval", summary_rows(rows)
-    try:
-        rows = last_evaluation(run).to_pylist()
-    except RunError:
-        return "not yet", []
-    own = {"policy": "agent", "perturbation": "none"}
+def _seen(path: Path) -> _Seen:
+    """Read a run. Success is of the last `restock eval`, else of training's last evaluation."""
+    run = Run.open(path)
+    progress, by = run.table("progress"), "restock eval"
+    steps = progress["env_steps"][-1].as_py() if progress.num_rows else 0
+    if (driven := agent_episodes(run)) is None:
+        evaluated = run.table("evaluations").num_rows
+        by, driven = ("training", last_evaluation(run)) if evaluated else ("not yet", None)
     unknown = dict.fromkeys(("time_lost_s", "limited_s", "stopped_s"))
-    return "training", summary_rows(row | own | unknown for row in rows)
+    clean = {"policy": "agent", "perturbation": "none"}
+    rows = [
+        unknown | row | clean
+        for row in ([] if driven is None else driven.to_pylist())
+        if row["perturbation"] in CLEAN
+    ]
+    return _Seen(run, steps, by, summary_rows(rows), fed_shares(run))
 
 
 def _change(before: Run, run: Run) -> dict[str, Any]:
@@ -138,15 +152,12 @@ def _change(before: Run, run: Run) -> dict[str, Any]:
         return {"why": str(error), "settings": [], "evaluation": []}
 
 
-def _headline(runs: list[Run], changes: Rows, stores: list[Path]) -> str:
+def _headline(runs: Sequence[_Seen], changes: Rows, stores: int) -> str:
     """Say what the last run does better or worse than the one before it."""
     if not changes:
-        return f"{counted(len(runs), 'run')}, {counted(len(stores), 'store')}"
+        return f"{counted(len(runs), 'run')}, {counted(stores, 'store')}"
     before, last = _names(runs)[-2:]
-    outcome = _outcome(changes[-1])
-    return (
-        f"{last}, the latest run, against {before}: {outcome or 'no difference of success shown'}"
-    )
+    return f"{last}, the latest run, against {before}: {_outcome(changes[-1])}"
 
 
 def _outcome(change: dict[str, Any]) -> str:
@@ -154,52 +165,40 @@ def _outcome(change: dict[str, Any]) -> str:
     if "why" in change:
         return f"not compared: {change['why']}"
     shown = [
-        row | {"condition": f"{row['condition']}{_under(row['perturbation'])}"}
+        row | {"condition": row["condition"] + (under not in CLEAN) * f" under {under}"}
         for row in change["evaluation"]
+        for under in [row["perturbation"]]
         if row.get("difference_low") is not None
-        and (row["difference_low"] > 0 or row["difference_high"] < 0)
     ]
-    parts = (
-        ("better", [row for row in shown if row["difference"] > 0]),
-        ("worse", [row for row in shown if row["difference"] < 0]),
-    )
-    return "; ".join(f"{word} in {named(rows)}" for word, rows in parts if rows)
+    return "; ".join(better_and_worse(shown)[0]) or "no difference shown"
 
 
-def _under(perturbation: str) -> str:
-    return "" if perturbation in ("none", "nominal") else f" under {perturbation}"
-
-
-def _runs(runs: list[Run], driven: list[tuple[str, Rows]]) -> Section | None:
+def _runs(runs: Sequence[_Seen]) -> Section | None:
     if not runs:
         return None
-    names = _names(runs)
     table, dots = [], []
-    for name, run, (by, cells) in zip(names, runs, driven, strict=True):
-        panel, progress = run.document.get("panel") or {}, run.table("progress")
-        steps = progress["env_steps"][-1].as_py() if progress.num_rows else 0
+    for name, one in zip(_names(runs), runs, strict=True):
+        panel, began = one.run.document.get("panel") or {}, _began(one.run) / 1e9
+        logs = f"{Path(panel['store']).name}@{panel['store_version']}" if panel else "none"
+        known = [row for row in one.success if row["success"] is not None]
         table.append(
             {
                 "run": name,
-                "began": f"{datetime.fromtimestamp(_began(run) / 1e9, UTC):%Y-%m-%d %H:%M}",
-                "logs": f"{Path(panel['store']).name}@{panel['store_version']}"
-                if panel
-                else "none",
+                "began": f"{datetime.fromtimestamp(began, UTC):%Y-%m-%d %H:%M}",
+                "logs": logs,
                 "logged rows": count(panel.get("rows")),
-                "environment steps": count(steps),
-                "driven by": by,
-                "episodes": count(sum(row["episodes"] for row in cells)),
+                "environment steps": count(one.env_steps),
+                "driven by": one.by,
+                "episodes": count(sum(row["episodes"] for row in one.success)),
                 **{
                     words(row["condition"]): interval_text(
                         row["success"], row["success_low"], row["success_high"]
                     )
-                    for row in cells
-                    if row["success"] is not None
+                    for row in known
                 },
             }
         )
-        dots += [row | {"run": name} for row in cells if row["success"] is not None]
-    columns = dict.fromkeys(column for row in table for column in row)
+        dots += [row | {"run": name} for row in known]
     return Section(
         "runs",
         "Which runs, and how well do they drive?",
@@ -207,8 +206,14 @@ def _runs(runs: list[Run], driven: list[tuple[str, Rows]]) -> Section | None:
         " there is one, else of the last evaluation in training. Runs may have driven other"
         " missions: the table below counts only those that both of a pair drove.",
         figures=[Figure(_dots(dots), "Success by run and condition")] if dots else [],
-        tables=[Table([dict.fromkeys(columns, "") | row for row in table])],
+        tables=[_even(table)],
     )
+
+
+def _even(rows: Rows) -> Table:
+    """Return a table of rows of which not all have the same columns."""
+    columns = dict.fromkeys(column for row in rows for column in row)
+    return Table([dict.fromkeys(columns, "") | row for row in rows])
 
 
 def _dots(rows: Rows) -> blocks.Drawing:
@@ -226,7 +231,7 @@ def _dots(rows: Rows) -> blocks.Drawing:
     )
 
 
-def _changes(runs: list[Run], changes: Rows) -> Section | None:
+def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
     if not changes:
         return None
     names = _names(runs)
@@ -236,7 +241,7 @@ def _changes(runs: list[Run], changes: Rows) -> Section | None:
             "against": before,
             "settings": _settings(change["settings"]),
             "logs": "" if "why" in change else _logs(change["panels"]),
-            "success": _outcome(change) or "no difference shown",
+            "success": _outcome(change),
             "restock compare": "" if "why" in change else change["comparable"]["algorithm"],
         }
         for (before, name), change in zip(itertools.pairwise(names), changes, strict=True)
@@ -271,35 +276,34 @@ def _logs(panels: dict[str, Any] | None) -> str:
     return f"{rows['in']:,} rows in, {rows['out']:,} out, {rows['both']:,} in both"
 
 
-def _fed(runs: list[Run]) -> Section | None:
+def _fed(runs: Sequence[_Seen]) -> Section | None:
+    if not any(one.fed for one in runs):
+        return None
     table = [
         {"run": name}
         | {
             words(row["stratum"]): f"{row['drawn_share']:.1%} (of {row['wanted_share']:.1%})"
-            for row in fed_shares(run)
+            for row in one.fed
         }
-        for name, run in zip(_names(runs), runs, strict=True)
+        for name, one in zip(_names(runs), runs, strict=True)
     ]
-    strata = dict.fromkeys(name for row in table for name in row)
-    if len(strata) == 1:
-        return None
     return Section(
         "fed",
         "What was each critic fed?",
         intro="Share of all rows fed, and the share that its mixture wanted.",
-        tables=[Table([dict.fromkeys(strata, "") | row for row in table])],
+        tables=[_even(table)],
     )
 
 
-def _weeks(place: Path) -> list[Section]:
-    """Return the sections of one store: its weeks, drawn and as a table."""
+def _weeks(place: Path) -> Section | None:
+    """Return the section of a store's weeks, drawn and as a table."""
+    if not is_store(place):
+        return None
     with Store(place) as store:
-        install_named(store.connection, _WEEKS)
-        rows = ask(store.connection, _WEEKS)
-        drawn = coverage_weeks(store)
-    if not rows or drawn is None:
-        return []
-    weeks: dict[Any, dict[str, Any]] = {}
+        rows, section = coverage_weeks(store)
+    if section is None:
+        return None
+    weeks: dict[str, dict[str, Any]] = {}
     for row in rows:
         week = "not known" if row["week"] is None else str(row["week"])
         line = weeks.setdefault(week, {"week": week, "hours": f"{row['hours'] or 0:.2f}"})
@@ -307,7 +311,5 @@ def _weeks(place: Path) -> list[Section]:
         line[name] = f"{row['events']:,} events" if row["events"] else f"{row['rows_held']:,} rows"
         if row["goal_episodes"]:
             line[name] += f", {row['successes']} of {row['goal_episodes']} arrived"
-    columns = dict.fromkeys(column for line in weeks.values() for column in line)
-    table = Table([dict.fromkeys(columns, "") | line for line in weeks.values()])
-    title = f"{place.name}: week by week"
-    return [replace(drawn, id=f"weeks-{place.name}", title=title, tables=[table])]
+    title, table = f"{place.name}: week by week", _even([*weeks.values()])
+    return replace(section, id=f"weeks-{place.name}", title=title, tables=[table])

@@ -51,14 +51,14 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     return found
 
 
-def coverage_weeks(store: Store) -> Section | None:
-    """Return the section of a store's weeks, as on its page."""
+def coverage_weeks(store: Store) -> tuple[Rows, Section | None]:
+    """Return the rows of a store's weeks, and their section as on its page."""
     sql = statements("restock.report.fleet", "coverage.sql")["weeks"]
     install_named(store.connection, sql)
     rows = ask(store.connection, sql)
     colours = blocks.palette({row["condition"] for row in rows})
     once = by_priority(words(name) for name in store.priority())
-    return _weeks(rows, {words(name): colour for name, colour in colours.items()}, once)
+    return rows, _weeks(rows, {words(name): colour for name, colour in colours.items()}, once)
 
 
 def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dict[str, Any]:
@@ -234,6 +234,7 @@ def _strangest(found: dict[str, Rows], place: str) -> Section | None:
 
 
 def _weeks(rows: Rows, colours: dict[str, str], once: str) -> Section | None:
+    rows = [row for row in rows if row["primary_rows"]]
     if not rows:
         return None
     shown = [

@@ -7,12 +7,21 @@ SELECT condition, rows_held, held_share, episodes_held, effective_episodes, succ
 FROM coverage_by_condition;
 
 -- name: weeks
--- A condition's part of a week's rows, over all robots: each row once, by priority.
-SELECT week, condition, CAST(sum(primary_rows) AS BIGINT) AS primary_rows
-FROM coverage_by_week
-WHERE primary_rows > 0
-GROUP BY week, condition
-ORDER BY week, condition;
+-- A condition's part of a week's rows, over all robots: primary_rows has each row once, by priority.
+-- Hours are the week's, of all robots, whether or not they saw the condition.
+WITH driven AS (
+    SELECT week, sum(hours) AS hours
+    FROM (SELECT DISTINCT robot, week, hours FROM coverage_by_week)
+    GROUP BY week
+)
+SELECT seen.week, condition, any_value(driven.hours) AS hours,
+       CAST(sum(primary_rows) AS BIGINT) AS primary_rows,
+       CAST(sum(rows_held) AS BIGINT) AS rows_held, CAST(sum(events) AS BIGINT) AS events,
+       CAST(sum(successes) AS BIGINT) AS successes,
+       CAST(sum(goal_episodes) AS BIGINT) AS goal_episodes
+FROM coverage_by_week AS seen JOIN driven ON seen.week IS NOT DISTINCT FROM driven.week
+GROUP BY seen.week, condition
+ORDER BY seen.week, condition;
 
 -- name: robots
 -- Hours are the robot's, over all conditions: the same in each of its rows.

@@ -80,11 +80,9 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
         return f"{second} and {first} cannot be compared: {found['why']}"
     rows = [row for row in found["outcomes"] if row["perturbation"] == "none"] or found["outcomes"]
     known = [row for row in rows if row["difference_low"] is not None]
-    better = [row for row in known if row["difference_low"] > 0]
-    worse = [row for row in known if row["difference_high"] < 0]
-    parts = [f"{word} in {named(of)}" for word, of in (("better", better), ("worse", worse)) if of]
+    parts, shown = better_and_worse(known)
     if parts:
-        rest = len(rows) - len(better) - len(worse)
+        rest = len(rows) - shown
         more = f"; no difference shown in {rest} more" if rest else ""
         return f"{second} is {', '.join(parts)} than {first}{more}"
     if not known:
@@ -95,6 +93,14 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
         f"No difference between {second} and {first} is shown in any condition; the widest"
         f" interval is {points_text(widest)} in {words(widest['condition'])}"
     )
+
+
+def better_and_worse(rows: Rows) -> tuple[list[str], int]:
+    """Name the conditions that differ by their intervals, and say how many they are."""
+    better = [row for row in rows if row["difference_low"] > 0]
+    worse = [row for row in rows if row["difference_high"] < 0]
+    parts = [f"{word} in {named(of)}" for word, of in (("better", better), ("worse", worse)) if of]
+    return parts, len(better) + len(worse)
 
 
 def outcome_sections(
