@@ -276,6 +276,8 @@ def label_several(
     """
     found: dict[int, tuple[dict[str, Bools], dict[str, F32]]] = {}
     for place, (steps, conditions) in enumerate(several):
+        if place in found:
+            continue
         alike = [
             other
             for other, (table, rules) in enumerate(several)
@@ -283,8 +285,6 @@ def label_several(
         ]
         if any("episode_index" in condition.words for condition in conditions):
             alike = [place]  # else it would see other numbers
-        if place in found:
-            continue
         parts, first = [], 0
         for table in (several[other][0] for other in alike):
             episodes = np.asarray(table["episode_index"]) + first

@@ -116,17 +116,17 @@ def in_step(works: Sequence[Work[T]]) -> Iterator[tuple[int, T | Exception]]:
     answers: dict[int, Any] = dict.fromkeys(range(len(works)))
     try:
         while answers:
-            asked: dict[Callable[[list[Any]], Sequence[Any]], dict[int, Any]] = {}
+            wanted: dict[Callable[[list[Any]], Sequence[Any]], dict[int, Any]] = {}
             for place, answer in answers.items():
                 try:
                     function, argument = works[place].send(answer)
-                    asked.setdefault(function, {})[place] = argument
+                    wanted.setdefault(function, {})[place] = argument
                 except StopIteration as done:
                     yield place, done.value
                 except Exception as error:  # noqa: BLE001  (of that work alone)
                     yield place, error
             answers = {}
-            for function, of_each in asked.items():
+            for function, of_each in wanted.items():
                 answers |= zip(of_each, function([*of_each.values()]), strict=True)
     finally:
         for work in works:

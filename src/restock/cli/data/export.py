@@ -11,6 +11,7 @@ import tyro
 
 from restock.cli import output
 from restock.cli.command_line import refuse
+from restock.errors import RunError, counted
 from restock.replay.export import FORMATS
 
 TO = (*FORMATS, "onnx", "run")
@@ -103,8 +104,6 @@ class ExportCommand:
             output.print_text(line)
 
     def _write_mean(self) -> None:
-        from restock.cli import output
-        from restock.errors import RunError, counted
         from restock.replay.places import kind_beside
         from restock.train.evaluation.policies import write_mean
 

@@ -1,11 +1,10 @@
 """`restock ingest FOLDER --watch`: take recordings as they arrive, one line of log an event.
 
 A recording is complete if its files have kept their names, sizes and times for `STILL_S`, and if it
-says so itself: an MCAP file ends with its footer, and a bag's folder has the metadata.yaml that
-rosbag2 writes last, and every file that it lists; a LeRobot folder has the frames that
-its info counts. Nothing is remembered on disk: the store knows
-recordings by their content, so a process that was killed takes them all again, and those that are
-in the store are unchanged.
+says so itself: an MCAP file ends with its footer, a bag's folder has the metadata.yaml that rosbag2
+writes last, and every file that it lists, and a LeRobot folder has the frames that its info counts.
+Nothing is remembered on disk: the store knows recordings by their content, so a process that was
+killed takes them all again, and those that are in the store are unchanged.
 """
 
 from __future__ import annotations
