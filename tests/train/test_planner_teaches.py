@@ -157,7 +157,7 @@ def kept(path: Path, seed: int, **teacher: object) -> GreedyPolicy:
     config = parse_config(document, where="test")
     torch.manual_seed(seed)
     network = make_learner(config, TASK).policy
-    about = {"config": msgspec.to_builtins(config), "task_hash": TASK.hash}
+    about = {"config": msgspec.to_builtins(config), "task_hash": TASK.hash, "created_ns": 1}
     run = Run.create(path, about)
     clocks = {"env_steps": 100, "gradient_steps": 7}
     save_agent(run, network, TASK, Score({}, 0.0, 0.0), clocks)
@@ -172,7 +172,9 @@ def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, capsys)
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
     assert main(words) == 0
     assert "mean of runs of 200 steps together" in capsys.readouterr().out
-    made = load_agent(Run.open(tmp_path / "mean"))
+    run = Run.open(tmp_path / "mean")
+    assert run.document["created_ns"] > 1  # it is newer than what it is the mean of
+    made = load_agent(run)
     observation = torch.from_numpy(observed(np.asarray(TASK.actions), np.arange(10) > 4))
     with torch.no_grad():
         mean = (one.network.values(observation) + other.network.values(observation)) / 2

@@ -43,6 +43,7 @@ from restock.train.run.run import (
     Run,
     chosen_policy,
     env_steps_of,
+    now_ns,
     resuming,
 )
 from restock.train.run.run_profile import profile_of_run, run_panel
@@ -248,9 +249,8 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
     whole = msgspec.to_builtins(configs[0])
     whole["network"]["members"] = len(values)
     whole["teacher"]["margin"] /= root
-    made = Run.create(
-        out, document | {"config": whole, MEAN_OF: [agent.version for agent in agents]}
-    )
+    document |= {"created_ns": now_ns(), "config": whole}
+    made = Run.create(out, document | {MEAN_OF: [agent.version for agent in agents]})
     origins = [agent.origin for agent in agents if agent.origin is not None]
     clocks = {
         "env_steps": sum(origin.env_steps for origin in origins),
