@@ -1,6 +1,7 @@
 """Is the default recipe's policy worth driving? Its targets, on episodes that chose nothing.
 
     python benchmarks/targets.py --out DIR [--budget NAME] [--teacher NAME] [--seeds 5] [--check]
+                                 [--profile PATH]
 
 `restock train` on the sample logs with mixture `coverage`, practice by success and the twin's
 teacher, once a seed; a budget is a number of environment steps. Beside each, a run of the same seed
@@ -11,6 +12,8 @@ With `--teacher planner` nobody but the planner teaches: runs are fed by quotas 
 missions as they are, from a seed on that chose nothing (the margin was chosen on the first 100 of
 the others). With Q constant such a policy is the planner, so what it is ahead by is Q's. Its hour
 is spent on the runs of ten minutes: the mean of their policies drives (`restock export --to run`).
+With `--profile` the logs are ingested by another profile, as one with `tracks`, and runs are fed by
+quotas alone, and drive the missions as they are.
 
 Intervals of the agent draw seeds and episodes again (five seeds: a little too narrow), those of
 planner and operator are Wilson's. "Ahead" is paired by episode, and by seed of the run fed
@@ -66,6 +69,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--budget", choices=BUDGETS, default="ten-minutes")
     parser.add_argument("--teacher", choices=("operator", "planner"), default="operator")
+    parser.add_argument("--profile", default="warehouse_amr", help="of the sample logs")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=300, help="of each kind, as they are")
     options = parser.parse_args()
@@ -83,12 +87,15 @@ def main() -> int:
         settings += ["schedule.env_steps=2000", "schedule.offline_updates=200"]
         settings += ["evaluation.every_env_steps=1000", "evaluation.episodes=2"]
     name = ("planner-" if alone else "") + ("quick" if options.quick else budget)
-    runs: dict[str, list[Path]] = {"coverage": []} if alone else {"coverage": [], "uniform": []}
-    further = not alone and BUDGETS[options.budget] >= BUDGETS["ten-minutes"]
+    runs: dict[str, list[Path]] = {"coverage": []}
+    paired = not alone and options.profile == "warehouse_amr"
+    if paired:
+        runs["uniform"] = []
+    further = paired and BUDGETS[options.budget] >= BUDGETS["ten-minutes"]
     for seed, mixture in itertools.product(range(options.seeds), runs):
         path = options.out / f"{name}-{'' if mixture == 'coverage' else 'uniform-'}{seed}"
         there, began = (path / "done").exists(), (time.process_time(), time.monotonic())
-        trained(path, [*settings, f"seed={seed}"], _panel(options.out, mixture))
+        trained(path, [*settings, f"seed={seed}"], _panel(options.out, mixture, options.profile))
         if not there:
             spent = time.process_time() - began[0], time.monotonic() - began[1]
             print(f"{path.name}: {spent[0]:.0f} s of CPU in {spent[1]:.0f} s", file=sys.stderr)
@@ -117,9 +124,10 @@ def main() -> int:
     return finish(options, rows, missed, [_as_markdown(rows)])
 
 
-def _panel(out: Path, mixture: str) -> Path:
+def _panel(out: Path, mixture: str, profile: str) -> Path:
     store, panel = out / "store", out / ("panel" if mixture == "coverage" else mixture)
-    run_restock(["ingest", str(LOGS), "--store", str(store)])  # skips what it has
+    words = ["ingest", str(LOGS), "--store", str(store), "--profile", profile]
+    run_restock(words)  # skips what it has
     if not panel.exists():
         run_restock(["mix", str(store), "--mixture", mixture, "--out", str(panel)])
     return panel
