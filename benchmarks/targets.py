@@ -12,8 +12,8 @@ With `--teacher planner` nobody but the planner teaches: runs are fed by quotas 
 missions as they are, from a seed on that chose nothing (the margin was chosen on the first 100 of
 the others). With Q constant such a policy is the planner, so what it is ahead by is Q's. Its hour
 is spent on the runs of ten minutes: the mean of their policies drives (`restock export --to run`).
-With `--profile` the logs are ingested by another profile, as one with `tracks`, and runs are fed by
-quotas alone, and drive the missions as they are.
+With `--profile` the logs are ingested by that profile, as one with `tracks`; runs are fed by quotas
+alone, drive the missions as they are, and spend their hour in the same way.
 
 Intervals of the agent draw seeds and episodes again (five seeds: a little too narrow), those of
 planner and operator are Wilson's. "Ahead" is paired by episode, and by seed of the run fed
@@ -22,6 +22,7 @@ uniformly. What is done is not done again; `--check` exits 1 where a target of t
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import sys
 import time
@@ -69,13 +70,14 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--budget", choices=BUDGETS, default="ten-minutes")
     parser.add_argument("--teacher", choices=("operator", "planner"), default="operator")
-    parser.add_argument("--profile", default="warehouse_amr", help="of the sample logs")
+    parser.add_argument("--profile", help="of the sample logs; default: warehouse_amr")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=300, help="of each kind, as they are")
     options = parser.parse_args()
     few = (4, 4, 4) if options.quick else (options.episodes, 60, 100)
     alone = options.teacher == "planner"
-    mean = alone and options.budget == "hour"
+    paired = not alone and options.profile is None
+    mean = not paired and options.budget == "hour"
     budget = "ten-minutes" if mean else options.budget
     steps = BUDGETS[budget]
     if alone:  # nobody is queried, so as long a time has a third more steps
@@ -86,16 +88,16 @@ def main() -> int:
     if options.quick:
         settings += ["schedule.env_steps=2000", "schedule.offline_updates=200"]
         settings += ["evaluation.every_env_steps=1000", "evaluation.episodes=2"]
+    first = ("--seed", UNCHOSEN) if alone else ()
     name = ("planner-" if alone else "") + ("quick" if options.quick else budget)
     runs: dict[str, list[Path]] = {"coverage": []}
-    paired = not alone and options.profile == "warehouse_amr"
     if paired:
         runs["uniform"] = []
     further = paired and BUDGETS[options.budget] >= BUDGETS["ten-minutes"]
     for seed, mixture in itertools.product(range(options.seeds), runs):
         path = options.out / f"{name}-{'' if mixture == 'coverage' else 'uniform-'}{seed}"
         there, began = (path / "done").exists(), (time.process_time(), time.monotonic())
-        trained(path, [*settings, f"seed={seed}"], _panel(options.out, mixture, options.profile))
+        trained(path, [*settings, f"seed={seed}"], _panel(options, mixture))
         if not there:
             spent = time.process_time() - began[0], time.monotonic() - began[1]
             print(f"{path.name}: {spent[0]:.0f} s of CPU in {spent[1]:.0f} s", file=sys.stderr)
@@ -107,14 +109,14 @@ def main() -> int:
             path,
             few,
             ["agent", *references],
-            *(("--seed", UNCHOSEN) if alone else ()),
+            *first,
             further=further and mixture == "coverage",
         )
     if mean:
         path = options.out / f"{name}-mean"
         made = [load_agent(Run.open(run)).version for run in runs["coverage"]]
         once(path / "made", made, partial(write_mean, runs["coverage"], path))
-        _judge(path, few, ["agent", *REFERENCES], "--seed", UNCHOSEN, further=False)
+        _judge(path, few, ["agent", *REFERENCES], *first, further=False)
         runs["coverage"] = [path]
     twins = ["none"]
     if further:
@@ -124,9 +126,17 @@ def main() -> int:
     return finish(options, rows, missed, [_as_markdown(rows)])
 
 
-def _panel(out: Path, mixture: str, profile: str) -> Path:
+def _panel(options: argparse.Namespace, mixture: str) -> Path:
+    out: Path = options.out
     store, panel = out / "store", out / ("panel" if mixture == "coverage" else mixture)
-    words = ["ingest", str(LOGS), "--store", str(store), "--profile", profile]
+    words = [
+        "ingest",
+        str(LOGS),
+        "--store",
+        str(store),
+        "--profile",
+        options.profile or "warehouse_amr",
+    ]
     run_restock(words)  # skips what it has
     if not panel.exists():
         run_restock(["mix", str(store), "--mixture", mixture, "--out", str(panel)])

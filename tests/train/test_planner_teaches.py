@@ -18,12 +18,12 @@ from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import nearest_action, proposal_reader
-from restock.train.dqn.behaviour import ProposalNetwork, make_policy
+from restock.train.dqn.behaviour import ProposalNetwork, make_policy, plausible_actions
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.network import members_of
 from restock.train.evaluation.evaluate import Score
-from restock.train.evaluation.policies import GreedyPolicy, load_agent, make_learner, save_agent
+from restock.train.evaluation.policies import load_agent, make_learner, save_agent, write_mean
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
@@ -151,7 +151,7 @@ def test_onnx_deviates_where_torch_does() -> None:
     np.testing.assert_array_equal(action, greedy_actions(policy, observation))
 
 
-def kept(path: Path, seed: int, **teacher: object) -> GreedyPolicy:
+def kept(path, seed, **teacher):
     """Write a run with a policy of random weights; return the policy."""
     document = {"teacher": teacher, "network": {"hidden": [16], "members": 2}, "seed": seed}
     config = parse_config(document, where="test")
@@ -184,18 +184,31 @@ def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, capsys)
     assert main(words) == 2  # it exists
 
 
+def test_a_mean_of_means_filters_by_the_mean_of_the_logits(tmp_path: Path) -> None:
+    places = [tmp_path / name for name in "abcd"]
+    filters = {"source": "operator", "ratio": 0.9}
+    alone = [kept(place, seed, **filters).network for seed, place in enumerate(places)]
+    pairs = [tmp_path / "ab", tmp_path / "cd"]
+    for first, pair in zip((0, 2), pairs, strict=True):
+        write_mean(places[first : first + 2], pair)
+    made = write_mean(pairs, tmp_path / "all").network
+    observation = torch.from_numpy(observed(np.asarray(TASK.actions), np.arange(10) > 4))
+    with torch.no_grad():
+        logits = sum(one.behaviour(observation) for one in alone) / 4
+        mean = sum(one.values(observation) for one in alone) / 4
+        plausible = plausible_actions(logits, made.ratio)
+        torch.testing.assert_close(made(observation), mean.masked_fill(~plausible, -torch.inf))
+    assert not plausible.all()
+
+
 @pytest.mark.parametrize(
     ("teacher", "why"),
-    [
-        ({"source": "operator"}, "has a teacher's filter"),
-        ({"source": "none"}, "is not of the same task, network, algorithm and teacher"),
-        (None, "holds 1 run"),
-    ],
+    [("none", "is not of the same task, network, algorithm and teacher"), (None, "holds 1 run")],
 )
 def test_runs_without_a_mean_are_refused(tmp_path: Path, capsys, teacher, why: str) -> None:
     kept(tmp_path / "runs" / "a", 0, source="planner")
     if teacher:
-        kept(tmp_path / "runs" / "b", 1, **teacher)
+        kept(tmp_path / "runs" / "b", 1, source=teacher)
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
     assert main(words) == 2
     assert why in capsys.readouterr().err

@@ -78,7 +78,10 @@ class FilteredNetwork(nn.Module):
     ratio: Tensor
 
     def __init__(
-        self, values: QNetwork | Ensemble, behaviour: QNetwork, ratio: Tensor | None = None
+        self,
+        values: QNetwork | Ensemble,
+        behaviour: QNetwork | Ensemble,
+        ratio: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.values, self.behaviour = values, behaviour
@@ -147,14 +150,17 @@ def make_behaviour(
     return QNetwork(observation_size, actions, hidden=HIDDEN, generator=generator)
 
 
-def make_policy(config: TrainConfig, observation_size: int, actions: int) -> PolicyNetwork:
-    """Return the policy network that a run's config describes, to load weights into."""
+def make_policy(
+    config: TrainConfig, observation_size: int, actions: int, *, runs: int = 1
+) -> PolicyNetwork:
+    """Return a run's policy network, or that of a mean of runs, to load weights into."""
     values = make_network(config, observation_size, actions)
     if config.teacher.source == PLANNER:
         return ProposalNetwork(values, None, config.teacher.margin)
     if not config.teacher.filters:
         return values
-    return FilteredNetwork(values, make_behaviour(observation_size, actions))
+    behaviours = [make_behaviour(observation_size, actions) for _ in range(runs)]
+    return FilteredNetwork(values, Ensemble(behaviours) if runs > 1 else behaviours[0])
 
 
 class Behaviour(Stateful):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,7 @@ from restock.errors import ConfigError, PanelError, RunError, StoreError
 from restock.ingest.task.task import Task, proposal_reader
 from restock.replay.panel.panel import Panel
 from restock.state import first_mismatch
-from restock.train.dqn.behaviour import (
-    FilteredNetwork,
-    PolicyNetwork,
-    ProposalNetwork,
-    make_policy,
-)
+from restock.train.dqn.behaviour import PolicyNetwork, ProposalNetwork, make_policy
 from restock.train.dqn.config import PLANNER, TrainConfig, parse_config
 from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_probabilities
 from restock.train.dqn.learner import Learner, greedy_actions
@@ -126,7 +122,8 @@ def load_agent(run: Run) -> GreedyPolicy:
             where=str(file),
             remedy="train again: the meaning of observations or actions has changed",
         )
-    network = make_policy(config, state["observation_size"], state["actions"])
+    runs = len(run.document.get(MEAN_OF, "1"))
+    network = make_policy(config, state["observation_size"], state["actions"], runs=runs)
     try:
         network.load_state_dict(state["network"])
     except RuntimeError as error:  # torch's of other shapes or names
@@ -210,13 +207,12 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
     """Write a run that acts by the mean of the values of several runs' policies, and load it.
 
     Runs that explored by themselves err differently, so their mean errs less (arXiv:1611.01929).
-    Where the planner taught them, the margin by which an action must be better than its proposal
-    falls with the errors, by the root of the number of runs. The run has no tables: it was fed
-    nothing itself.
+    So does the mean of their behaviour networks' logits, which filters if theirs do. If the planner
+    taught them, the margin by which an action must be better than its proposal falls with the
+    errors, by the root of the number of runs. The run has no tables: it was fed nothing itself.
 
     Raises:
-        RunError: there are not two runs, they are not alike, or one has no policy.
-        ConfigError: a policy is of another kind of network, or has a teacher's filter.
+        RunError: they are not alike, or one has no policy.
     """
     runs = [Run.open(path) for path in places]
     agents = [load_agent(run) for run in runs]
@@ -225,39 +221,39 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
         (run.document["task_hash"], config.network, config.loss.algorithm, config.teacher.source)
         for run, config in zip(runs, configs, strict=True)
     ]
-    values, root = [], len(runs) ** 0.5
-    for run, agent, kind in zip(runs, agents, kinds, strict=True):
-        network = agent.network
-        if isinstance(network, FilteredNetwork):
-            raise ConfigError(
-                "its policy has a teacher's filter, of which there is no mean",
-                where=str(run.path),
-                remedy='train with teacher.source = "planner" or "none"',
-            )
+    for run, kind in zip(runs, kinds, strict=True):
         if kind != kinds[0]:
             raise RunError(
                 f"is not of the same task, network, algorithm and teacher as {runs[0].path}",
                 where=str(run.path),
                 remedy="give runs that differ in their seeds alone",
             )
-        values += members_of(network.values if isinstance(network, ProposalNetwork) else network)
-    mean: PolicyNetwork = Ensemble(values)
-    if isinstance(first := agents[0].network, ProposalNetwork):
-        mean = clone(first)
-        mean.values, mean.lead = Ensemble(values), mean.lead / root
+    networks: list[Any] = [agent.network for agent in agents]
+    mean, root = clone(networks[0]), len(runs) ** 0.5
+    parts = [name for name in ("values", "behaviour") if hasattr(mean, name)]
+    for name in parts:
+        setattr(mean, name, _mean([getattr(network, name) for network in networks]))
+    if not parts:
+        mean = _mean(networks)
+    if isinstance(mean, ProposalNetwork):
+        mean.lead = mean.lead / root
     document = {key: value for key, value in runs[0].document.items() if key != "format"}
     whole = msgspec.to_builtins(configs[0])
-    whole["network"]["members"] = len(values)
+    whole["network"]["members"] = sum(config.network.members for config in configs)
     whole["teacher"]["margin"] /= root
-    document |= {"created_ns": now_ns(), "config": whole}
-    made = Run.create(out, document | {MEAN_OF: [agent.version for agent in agents]})
-    origins = [agent.origin for agent in agents if agent.origin is not None]
+    of = [run.document.get(MEAN_OF, [made.version]) for run, made in zip(runs, agents, strict=True)]
+    document |= {"created_ns": now_ns(), "config": whole, MEAN_OF: [*chain.from_iterable(of)]}
+    made = Run.create(out, document)
     clocks = {
-        "env_steps": sum(origin.env_steps for origin in origins),
-        "gradient_steps": sum(origin.gradient_steps for origin in origins),
+        name: sum(getattr(agent.origin, name) for agent in agents)
+        for name in ("env_steps", "gradient_steps")
     }
     save_agent(made, mean, profile_of_run(made).task, Score({}, 0.0, 0.0), clocks)
     return load_agent(made)
+
+
+def _mean(networks: Sequence[Any]) -> Ensemble:
+    return Ensemble([member for network in networks for member in members_of(network)])
 
 
 CLONED = "cloned"
@@ -338,7 +334,8 @@ def load_cloned(run: Run, name: str, *, seed: int = 0) -> ClonedPolicy:
         checkpoint.save(file, state)
         keep_clone(run.path, quality)
     quality = CloneQuality(**state["quality"])
-    network = _empty_network(panel.observation_size, len(panel.task.actions))
+    nothing = np.zeros((1, panel.observation_size), np.float32), np.zeros(1, np.int64)
+    network = _clone(*nothing, len(panel.task.actions), updates=0)
     network.load_state_dict(state["network"])
     version = f"{panel.id}@{quality.updates}"
     return ClonedPolicy(network.eval(), quality, version, seed)
@@ -451,8 +448,3 @@ def _log_likelihood(network: QNetwork, observation: F32, action: Ints) -> float:
 def _clone(observation: F32, action: Ints, actions: int, updates: int) -> QNetwork:
     config = replace(FittedQConfig(), cloning_updates=updates)
     return cloned_behaviour(observation, action, actions, config=config, seed=0)
-
-
-def _empty_network(observation_size: int, actions: int) -> QNetwork:
-    none = np.zeros((1, observation_size), np.float32), np.zeros(1, np.int64)
-    return _clone(*none, actions, 0)
