@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo site test test-long test-docs test-slow test-lowest test-ros neighbours lint notebook sample-logs clean
+.PHONY: demo site test test-long test-docs test-all test-slow test-lowest test-ros neighbours lint notebook sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -12,6 +12,7 @@ help:
 	@echo "make test-long    the tests that take longer, or show in full what a shorter one shows"
 	@echo "make site         the documentation as a site, build/site/index.html; a broken link fails"
 	@echo "make test-docs    run every block of the documentation as it is printed"
+	@echo "make test-all     those three in one run, as CI does"
 	@echo "make test-lowest  the tests with the oldest releases of libraries that Restock runs with"
 	@echo "make test-ros     the node under rclpy, over DDS on this machine, in a Python of its own"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
@@ -36,10 +37,10 @@ demo: $(VENV)/.runtime
 
 # A process a core, each with whole files: fixtures of a module are made once. Each computes on one
 # thread: threads of several processes on the same cores wait for each other at full load.
-test test-long test-docs test-lowest test-ros: export OMP_NUM_THREADS = 1
+test test-long test-docs test-all test-lowest test-ros: export OMP_NUM_THREADS = 1
 # Many tests start Restock in a process of its own: where the environment forbids files of bytecode,
 # each would compile it again, and each of these targets all tests.
-test test-long test-docs test-lowest: export PYTHONDONTWRITEBYTECODE =
+test test-long test-docs test-all test-lowest test-ros: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
@@ -49,6 +50,9 @@ test-long: $(VENV)/.dev
 
 test-docs: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m 'docs and not slow'
+
+test-all: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m 'not slow'
 
 site: $(VENV)/.dev
 	$(BIN)/python docs/build.py build/pages
@@ -67,24 +71,30 @@ test-lowest: .venv-lowest/.ready
 	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test,all]'
 	@touch $@
 
+# A Python of its own, with packages beside those of $(VENV) or in place of them.
+SITE := -c 'import sysconfig; print(sysconfig.get_path("purelib"))'
+define beside
+	$(BIN)/python -m venv $(1)
+	echo "import site; site.addsitedir('$$($(BIN)/python $(SITE))')" > "$$($(1)/bin/python $(SITE))/beside.pth"
+endef
+
 # Where there are no wheels of rclpy the tests are skipped, and say so.
 test-ros: .venv-ros/.ready
 	.venv-ros/bin/python -m pytest -rs tests/ingest/test_ros.py
 
-.venv-ros/.ready: pyproject.toml
-	$(PYTHON) -m venv .venv-ros
-	.venv-ros/bin/pip install --quiet --disable-pip-version-check -e '.[all,ros]' \
-		pytest pytest-timeout hypothesis moto[server]
+.venv-ros/.ready: pyproject.toml | $(VENV)/.dev
+	$(call beside,.venv-ros)
+	.venv-ros/bin/pip install --quiet --disable-pip-version-check 'restock[ros]'
 	@touch $@
 
-# d3rlpy pins an old gymnasium and lerobot a CUDA torch: the tests that read exports back with the
-# real libraries use a Python of their own, where there is one.
+# d3rlpy pins an old gymnasium, which pip says that Restock cannot use: the tests that read exports
+# back with d3rlpy and lerobot use a Python of their own, where there is one.
 neighbours: .venv-neighbours/.ready
 
-.venv-neighbours/.ready: Makefile
-	$(PYTHON) -m venv .venv-neighbours
-	.venv-neighbours/bin/pip install --quiet --disable-pip-version-check 'torch>=2.6,<2.14' \
-		'd3rlpy>=2.8' datasets pandas av draccus einops jsonlines psutil deepdiff pillow safetensors packaging
+.venv-neighbours/.ready: Makefile | $(VENV)/.dev
+	$(call beside,.venv-neighbours)
+	.venv-neighbours/bin/pip install --quiet --disable-pip-version-check 'd3rlpy>=2.8' \
+		datasets pandas av draccus einops jsonlines psutil deepdiff pillow safetensors packaging
 	.venv-neighbours/bin/pip install --quiet --disable-pip-version-check --no-deps lerobot accelerate
 	@touch $@
 
