@@ -11,30 +11,10 @@ class Network:
     def forward(self, inputs: tuple[Any, ...], out: Any, /) -> None: ...
     def backward(self, gradient: Any, /) -> None: ...
 
-def adam(
-    values: Any,
-    gradient: Any,
-    exp_avg: Any,
-    exp_avg_sq: Any,
-    follower: Any,
-    settings: tuple[float, float, float, float, float, float],
-    /,
-) -> None: ...
+def adam(*arrays_and_settings: Any) -> None: ...
 def gather(rows: Any, index: Any, out: Any, /) -> None: ...
 def find_places(priority: Any, sums: Any, ends: Any, at: Any, out: Any, /) -> None: ...
-def ranges(
-    origin: Any,
-    heading: Any,
-    direction: Any,
-    bearing: Any,
-    order: Any,
-    floor: Any,
-    first: Any,
-    standing: Any,
-    moving: Any,
-    out: Any,
-    /,
-) -> None: ...
+def ranges(*arrays: Any) -> None: ...
 def keep_rows(
     values: tuple[Any, Any, Any, Any],
     logged: tuple[Any, Any],

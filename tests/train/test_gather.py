@@ -1,7 +1,6 @@
-"""`gather_rows` gives the rows, whether compiled, by PyTorch's prefetching kernel, or without."""
+"""`gather_rows` gives the rows, whether compiled or not."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +32,6 @@ def way(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def forget() -> None:
-    batches._prefetching_works.cache_clear()
     batches._is_compiled.cache_clear()
 
 
@@ -78,24 +76,4 @@ def test_a_row_outside_the_table_is_refused(number: int) -> None:
 )
 def test_other_tables(rows: torch.Tensor) -> None:
     index = torch.tensor([3, 3, 0])
-    assert same(gather_rows(rows, index), rows, index)
-
-
-def wrong(rows: torch.Tensor, index: torch.Tensor, _: torch.Tensor) -> tuple[torch.Tensor]:
-    return (rows[index].bfloat16().float(),)
-
-
-def called_otherwise(*_: Any) -> None:
-    raise TypeError("takes 4 positional arguments")
-
-
-@pytest.mark.parametrize("kernel", [None, wrong, called_otherwise], ids=["gone", "wrong", "other"])
-def test_without_the_kernel(kernel: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of another PyTorch: the rows all the same, by `index_select`."""
-    if kernel is None:
-        monkeypatch.delattr(torch, "_embedding_bag_forward_only")
-    else:
-        monkeypatch.setattr(torch, "_embedding_bag_forward_only", kernel)
-    rows, index = torch.randn(50, 7), torch.tensor([49, 0, 3, 3])
-    assert not batches._prefetching_works()
     assert same(gather_rows(rows, index), rows, index)

@@ -10,6 +10,9 @@ import torch
 from torch import Tensor
 
 from restock import native
+from restock.train.dqn import behaviour
+from restock.train.dqn.config import parse_config
+from restock.train.dqn.learner import Learner
 from restock.train.dqn.network import FlatParameters, Kernel, QNetwork, clone, update_path
 
 compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
@@ -178,3 +181,22 @@ def test_passes_that_another_one_followed_are_differentiated() -> None:
     (theirs(first).square().mean() + theirs(second).square().mean()).backward()
     for one, other in zip(held.parameters(), theirs.parameters(), strict=True):
         torch.testing.assert_close(one.grad, other.grad, rtol=1e-4, atol=1e-5)
+
+
+@compiled
+@pytest.mark.parametrize("double", [True, False])
+def test_an_update_without_autograd_has_its_bits(double, monkeypatch):
+    settings = {"teacher": {"source": "operator"}, "loss": {"double": double, "huber_delta": 0.5}}
+    ours, theirs = (Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2))
+    theirs._has_kernels = False
+    for seed, weight in ((1, None), (2, normal(37, seed=5).abs()), (3, None)):
+        rows, labels = normal(37, 17, seed=seed), torch.arange(37) % 5 - 1
+        rows[:, 14] = torch.arange(37) % 4
+        labelled = behaviour.Labelled(rows[:, 3:10], labels)
+        given = {"weight": weight, "logged": 9, "labelled": labelled}
+        loss = ours.update(rows, **given)
+        monkeypatch.setattr(behaviour, "Kernel", Learner)  # what the behaviour network's is not
+        expected = theirs.update(rows, **given)
+        monkeypatch.undo()
+        assert torch.equal(loss.value, expected.value)
+        assert all(map(torch.equal, ours.moved, theirs.moved))

@@ -19,10 +19,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from restock.arrays import F32
 from restock.errors import ConfigError
 from restock.train.dqn.network import Ensemble, QNetwork
 
@@ -128,6 +130,26 @@ class DQN:
         delta = self.settings.huber_delta
         loss = dqn_loss(q, batch.action, wanted, weight=batch.weight, huber_delta=delta)
         return Loss(loss.value, loss.td, loss.q, self._penalty(q, batch))
+
+    def gradient(
+        self, q: F32, scalars: F32, next_value: F32, weight: F32 | None
+    ) -> tuple[Loss, F32]:
+        """Return the loss without penalty, and its gradient by `q` (B, A), as autograd rounds it.
+
+        `scalars` (B, 3) are action, reward and discount, `next_value` (B,) that of the next action,
+        `weight` (B,) importance weights, or None: ones.
+        """
+        chosen = np.arange(len(q)), scalars[:, 0].astype(np.int64)
+        td = q[chosen] - (scalars[:, 1] + scalars[:, 2] * next_value)
+        size, half, scale = np.abs(td), np.float32(0.5), np.full(len(q), 1 / len(q), np.float32)
+        delta = np.float32(self.settings.huber_delta)
+        each = np.where(size < delta, half * size * size, delta * (size - half * delta))
+        if weight is not None:
+            each, scale = each * weight, scale * weight
+        gradient = np.zeros_like(q)
+        gradient[chosen] = np.clip(td, -delta, delta) * scale
+        loss, *of_rows = map(torch.from_numpy, (each, td, q[chosen]))
+        return Loss(loss.mean(), *of_rows), gradient
 
     def _penalty(self, q: Tensor, batch: TrainingBatch) -> Tensor | None:
         """Sum the terms on logged rows, in proportion to their share of the batch."""

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from restock.arrays import F64
+from restock.arrays import F32, F64, Bools
 from restock.replay.mixture.mixture import value_at
 from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
@@ -34,6 +34,7 @@ from restock.train.dqn.network import (
     Ensemble,
     FlatAdam,
     FlatParameters,
+    Kernel,
     QNetwork,
     UpdatePath,
     averaging_rate,
@@ -206,6 +207,7 @@ class Behaviour(Stateful):
     @in_force.setter
     def in_force(self, ratio: float) -> None:
         self.ratio.fill_(ratio)
+        self._floor = np.float32(torch.tensor(ratio).log())  # of plausible logits, from the best on
 
     def learn(self, labelled: Labelled) -> None:
         """Make one gradient step."""
@@ -229,7 +231,22 @@ class Behaviour(Stateful):
         """Return all tensors that `move` changes."""
         return [*self.optimizer.moved, self._slow]
 
+    def plausible(self, observation: F32) -> Bools:
+        """Return plausible actions (B, A) in observations (B, D), by compiled code."""
+        assert isinstance(self._logits, Kernel)
+        logits = self._logits.values(observation)
+        return np.asarray(logits >= logits.max(axis=1, keepdims=True) + self._floor)
+
     def _fill_gradient(self, labelled: Labelled) -> None:
+        if isinstance(self._logits, Kernel):  # to the bits of what follows
+            logits = torch.from_numpy(self._logits.values(labelled.observation.numpy()))
+            likely, action = torch.log_softmax(logits, dim=1), labelled.action.numpy()
+            known = np.flatnonzero(action != UNKNOWN)
+            chosen = torch.zeros_like(likely)
+            chosen.numpy()[known, action[known]] = np.float32(-1) / np.float32(max(len(known), 1))
+            gradient = torch._log_softmax_backward_data(chosen, likely, 1, likely.dtype).numpy()
+            self._logits.descend(gradient)
+            return
         self._logits.zero_grad(set_to_none=False)
         loss = imitation_loss(self._logits(labelled.observation), labelled.action)
         loss.backward()  # type: ignore[no-untyped-call]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.state import Stateful
-from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm, make_network
+from restock.train.dqn.algorithm import DQN, Loss, TrainingBatch, make_algorithm, make_network
 from restock.train.dqn.behaviour import (
     Behaviour,
     FilteredNetwork,
@@ -31,6 +31,7 @@ from restock.train.dqn.config import PLANNER, Polyak, TargetRule, TrainConfig
 from restock.train.dqn.network import (
     FlatAdam,
     FlatParameters,
+    Kernel,
     UpdatePath,
     averaging_rate,
     clone,
@@ -101,6 +102,8 @@ class Learner(Stateful):
         # What the loss is computed with: the networks, or kernels that do the same.
         self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
         self._target = differentiable(self.path, self.target_network, self._slow)
+        is_dqn = type(self.algorithm) is DQN
+        self._has_kernels = is_dqn and [type(each) for each in self._online] == [Kernel]
         self.gradient_steps = 0
         self.behaviour: Behaviour | None = None
         self._preference: Callable[[Tensor], Tensor] | None = None
@@ -146,7 +149,9 @@ class Learner(Stateful):
             labelled: what the behaviour network learns from, where there is one.
         """
         terms = Terms(weight, logged, conservative if logged else 0.0, expert)
-        loss = self._fill_gradient(rows, terms)
+        is_plain = terms.conservative == 0 and terms.expert is None
+        fill = self._fill_by_kernels if is_plain and self._has_kernels else self._fill_gradient
+        loss = fill(rows, terms)
         self.gradient_steps += 1
         # `policy_network`, the one that is evaluated and kept, follows as an average of weights.
         self.optimizer.step(self._policy, averaging_rate(self.gradient_steps))
@@ -199,6 +204,26 @@ class Learner(Stateful):
             descended.backward()  # type: ignore[no-untyped-call]
             losses.append(Loss(loss.value.detach(), loss.td, loss.q))
         return mean_loss(losses)
+
+    def _fill_by_kernels(self, rows: Tensor, terms: Terms) -> Loss:
+        """Do the same for DQN without terms on logged rows: same bits, fewer small operations."""
+        parts = self._online[0], self._target[0], self.algorithm
+        online, target, algorithm = cast("tuple[Kernel, Kernel, DQN]", parts)
+        packed, count, size = rows.numpy(), len(rows), self.network.observation_size
+        now, after = packed[:, :size], packed[:, size : 2 * size]
+        slow = chooses = target.values(after)
+        q = online.values(now, after) if algorithm.settings.double else online.values(now)
+        if algorithm.settings.double:
+            q, chooses = q[:count], q[count:]
+        if self.behaviour is not None:
+            chooses = np.where(self.behaviour.plausible(after), chooses, -np.inf)
+        elif self._preference is not None:
+            chooses = chooses + self._preference(torch.from_numpy(after)).numpy()
+        weight = None if terms.weight is None else terms.weight.numpy()
+        next_value = slow[np.arange(count), chooses.argmax(axis=1)]
+        loss, gradient = algorithm.gradient(q, packed[:, 2 * size :], next_value, weight)
+        online.descend(gradient)
+        return loss
 
     def _batch(self, rows: Tensor, terms: Terms) -> TrainingBatch:
         parts = unpack(rows, self.network.observation_size)

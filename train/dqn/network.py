@@ -16,11 +16,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
 from restock import native
+from restock.arrays import F32
 from restock.state import Stateful
 
 N = TypeVar("N", bound=nn.Module)
@@ -202,7 +204,7 @@ class Kernel:
 
         Their gradient goes through the kernel as soon as autograd has all of it.
         """
-        values = self._forward(observation)
+        values = torch.from_numpy(self.values(observation.numpy()))
         if self._gradient is not None and torch.is_grad_enabled():
             made_by = self._passes
             values.requires_grad_().register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
@@ -214,19 +216,24 @@ class Kernel:
         """Let the next backward pass overwrite the gradient instead of adding to it."""
         self._adds = False
 
-    def _forward(self, observation: Tensor) -> Tensor:
-        out = observation.new_empty(len(observation), self._actions)
-        self._network.forward((observation.numpy(),), out.numpy())
+    def values(self, *observation: F32) -> F32:
+        """Return action values (n B, A) of n observations (B, D), outside of autograd."""
+        out = np.empty((len(observation) * len(observation[0]), self._actions), np.float32)
+        self._network.forward(observation, out)
         self._passes += 1
         return out
+
+    def descend(self, gradient: F32) -> None:
+        """Fill the parameters' gradient from that of the last pass's first values (B, A)."""
+        self._network.backward(gradient)
 
     def _backward(self, observation: Tensor, made_by: int, gradient: Tensor | None) -> None:
         assert self._gradient is not None
         assert gradient is not None
         if made_by != self._passes:  # another pass has overwritten what this one left
-            self._forward(observation)
+            self.values(observation.numpy())
         earlier = self._gradient.clone() if self._adds else None
-        self._network.backward(gradient.contiguous().numpy())
+        self.descend(gradient.contiguous().numpy())
         if earlier is not None:
             self._gradient.add_(earlier)
         self._adds = True
@@ -329,6 +336,8 @@ class FlatAdam(Stateful):
         self._moved = [list(torch.split(tensor, size)) for tensor in whole]
         self._step = torch.zeros(len(self._moved[0]), device=device)
         self._steps = 0
+        if compiled:
+            self._arrays = [tensor.detach().numpy() for tensor in whole]
 
     @torch.no_grad()
     def step(self, average: Tensor | None = None, rate: float = 0.0) -> None:
@@ -337,7 +346,12 @@ class FlatAdam(Stateful):
         if not self._compiled:
             self.move(average, rate)
             return
-        self._compiled_step(average, rate)
+        first, second = (1 - beta**self._steps for beta in _BETAS)
+        native.compiled.adam(
+            *self._arrays,
+            None if average is None else average.numpy(),
+            (*_BETAS, self.learning_rate / first, second**0.5, _EPS, rate),
+        )
 
     def count(self, steps: int) -> None:
         """Count steps that were made by `move`."""
@@ -361,19 +375,6 @@ class FlatAdam(Stateful):
         if average is not None:
             average.lerp_(self.values, rate)
 
-    def _compiled_step(self, average: Tensor | None, rate: float) -> None:
-        self._step.fill_(self._steps)
-        first, second = (1 - beta**self._steps for beta in _BETAS)
-        moved, squares = self._moments
-        native.compiled.adam(
-            self.values.detach().numpy(),
-            self.gradient.numpy(),
-            moved.numpy(),
-            squares.numpy(),
-            None if average is None else average.numpy(),
-            (*_BETAS, self.learning_rate / first, second**0.5, _EPS, rate),
-        )
-
     def forget(self) -> None:
         """Reset the moments after the parameters were replaced."""
         for tensor in (*self._moments, self._step):
@@ -390,6 +391,7 @@ class FlatAdam(Stateful):
         """Return Adam's moments per parameter, in the network's order."""
         if not self._steps:
             return {}
+        self._step.fill_(self._steps)
         moments = zip(*(self._flat.views(each) for each in self._moments), strict=True)
         return {
             str(index): {"step": self._step[0], **dict(zip(_MOMENTS, pair, strict=True))}

@@ -6,18 +6,14 @@ from two sources that share one packed row layout, by one gather each. The share
 is logged.
 
 The gather: `torch.index_select` copies one row after the other and waits for the memory of each.
-The compiled gather (`restock.native`) asks for rows well ahead of the one that it copies. Without
-it, the kernel behind `torch.nn.EmbeddingBag` does so, a little less far, with those that it adds
-up: with one row in every bag the sum is the row. That kernel is not part of PyTorch's public
-interface, so it is tried on a small table before it is used: where it is missing, or gives anything
-but the rows, `index_select` takes its place.
+The compiled gather (`restock.native`) asks for rows well ahead of the one that it copies.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,7 +32,6 @@ from restock.state import Stateful
 from restock.train.dqn.config import LossConfig, TrainConfig
 from restock.train.feed.logs import Coded, Logs
 
-_TRIED_WIDTHS = (1, 16, 189)  # floats: below, at and above what a vector register holds
 _NO_ROWS: Ints = np.empty(0, np.int64)
 _NO_SHARES = np.empty(0)
 _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, _NO_SHARES)
@@ -220,14 +215,17 @@ class Batches(Stateful):
             self._draws.gather(drawn.rows, read.numpy())
 
         def gather() -> Tensor:
-            parts = []
+            logged, rows = (
+                len(drawn.rows),
+                torch.empty(len(drawn.rows) + len(slots), self._fresh.shape[1]),
+            )
             if read is not None:
-                parts.append(read)
-            elif self.logs is not None and len(drawn.rows):
-                parts.append(gather_rows(self.logs.rows, torch.from_numpy(drawn.rows)))
+                rows[:logged] = read
+            elif self.logs is not None and logged:
+                gather_rows(self.logs.rows, torch.from_numpy(drawn.rows), rows[:logged])
             if len(slots):
-                parts.append(gather_rows(self._fresh, torch.from_numpy(slots)))
-            return parts[0] if len(parts) == 1 else torch.cat(parts)
+                gather_rows(self._fresh, torch.from_numpy(slots), rows[logged:])
+            return rows
 
         wanted = _NO_SHARES if self.controller is None else self.controller.wanted
         return ReplayBatch(gather, weight, drawn.rows, drawn.strata, slots, drawn.quota, wanted)
@@ -307,72 +305,21 @@ def _refuse_unknown(experts: Sequence[str], policies: list[str]) -> None:
             )
 
 
-def gather_rows(rows: Tensor, index: Tensor) -> Tensor:
-    """Gather rows `index` (B,) int64 of `rows` (n, W) into a new tensor (B, W) on their device.
+def gather_rows(rows: Tensor, index: Tensor, out: Tensor | None = None) -> Tensor:
+    """Gather rows `index` (B,) int64 of `rows` (n, W) into `out` (B, W), a new tensor if None.
 
-    Values equal those of `rows.index_select(0, index)`, NaN and infinities included; without the
-    compiled gather the sign of a negative zero may be lost.
+    All bits equal those of `rows.index_select(0, index)`, NaN and infinities included.
 
     Raises:
         RuntimeError, IndexError: a row number outside the table.
     """
-    if _has_a_faster_way(rows) and _is_plain(index):
-        if _is_compiled():
-            batch = rows.new_empty(len(index), rows.shape[1])
-            native.compiled.gather(rows.detach().numpy(), index.numpy(), batch.numpy())
-            return batch
-        if _prefetching_works():
-            return _sum_of_one_each(rows, index)
-    return rows.index_select(0, index)
+    on_cpu = rows.device.type == index.device.type == "cpu" and not rows.requires_grad
+    is_plain = rows.dtype == torch.float32 and rows.dim() == 2 and rows.is_contiguous()
+    if _is_compiled() and on_cpu and is_plain and index.is_contiguous():
+        batch = rows.new_empty(len(index), rows.shape[1]) if out is None else out
+        native.compiled.gather(rows.numpy(), index.numpy(), batch.numpy())
+        return batch
+    return torch.index_select(rows, 0, index, out=out)
 
 
-@cache
-def _is_compiled() -> bool:
-    return native.is_used()
-
-
-def _has_a_faster_way(rows: Tensor) -> bool:
-    """Return whether such a table can be read ahead: float32 in main memory, row by row."""
-    return (
-        rows.dtype == torch.float32
-        and rows.device.type == "cpu"
-        and rows.dim() == 2
-        and rows.is_contiguous()
-        and not (rows.requires_grad and torch.is_grad_enabled())  # it has no gradient
-    )
-
-
-def _is_plain(index: Tensor) -> bool:
-    """Return whether these are row numbers as samplers give them.
-
-    Those are int64, in main memory and contiguous.
-    """
-    return index.dtype == torch.int64 and index.device.type == "cpu" and index.is_contiguous()
-
-
-def _sum_of_one_each(rows: Tensor, index: Tensor) -> Tensor:
-    """Gather rows with `torch.embedding_bag`'s kernel; bag i is row `index[i]` alone."""
-    summed: Tensor = torch._embedding_bag_forward_only(rows, index, _counted(len(index)))[0]
-    return summed
-
-
-@cache
-def _prefetching_works() -> bool:
-    """Return whether that kernel is there and gives the rows, tried on tables of a few widths."""
-    index = torch.tensor([6, 0, 3, 3, 1])
-    for width in _TRIED_WIDTHS:
-        rows = torch.linspace(-3.0, 7.0, 7 * width).view(7, width)
-        rows[1], rows[3, 0], rows[6, -1] = torch.inf, torch.nan, torch.finfo().tiny / 4
-        try:
-            given = _sum_of_one_each(rows, index)
-        except (AttributeError, RuntimeError, TypeError):  # gone, or called otherwise
-            return False
-        if not torch.equal(given.nan_to_num(9.0), rows[index].nan_to_num(9.0)):
-            return False
-    return True
-
-
-@lru_cache(maxsize=64)
-def _counted(count: int) -> Tensor:
-    """Return where each bag begins, (count,)."""
-    return torch.arange(count)
+_is_compiled = cache(native.is_used)

@@ -43,6 +43,7 @@ from restock.state import Stateful, restored, saved
 from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
 from restock.train.dqn.config import GIVEN, TeacherConfig
 from restock.train.dqn.learner import Learner
+from restock.train.feed.batches import gather_rows
 from restock.train.feed.logs import Coded, Logs
 
 Label = NDArray[np.int16]
@@ -372,25 +373,26 @@ class Imitation(Stateful):
         rows = drawn.sample(logged, self._rng)
         fresh = self.batch_size - logged
         slots = self.ring.sample(fresh, self._rng) if fresh else np.empty(0, np.int64)
-        parts = [self._logged_states(rows), self._fresh_states(slots)]
-        observation, action = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        observation, action = self._states(rows, slots)
         if self._mirror is not None:
             turned = self._rng.random(len(observation)) < 0.5
             observation[turned] = self._mirror.observation(observation[turned])
             action[turned] = self._mirror.action(action[turned])
         return Labelled(torch.from_numpy(observation), torch.from_numpy(action))
 
-    def _logged_states(self, rows: Ints) -> tuple[F32, Ints]:
-        """Return observations (n, D) of logged rows and the actions (n,) that were taken."""
-        if self.logs is None or not len(rows):
-            return self._fresh_states(np.empty(0, np.int64))
-        packed = self.logs.rows[torch.from_numpy(rows)].numpy()
-        return packed[:, self.ring.columns["observation"]], packed[:, -3].astype(np.int64)
+    def _states(self, rows: Ints, slots: Ints) -> tuple[F32, Ints]:
+        """Return observations (n, D) of logged rows, then of the ring's, and actions (n,).
 
-    def _fresh_states(self, slots: Ints) -> tuple[F32, Ints]:
-        """Return observations (n, D) of slots of the ring and the teacher's answers (n,)."""
-        observation = self.ring.rows[slots, self.ring.columns["observation"]]
-        return observation, self.ring.meta["teacher_action"][slots].astype(np.int64)
+        Those are what was taken in the logs, and what the teacher answered in the ring's states.
+        """
+        logged, fresh = len(rows), torch.from_numpy(self.ring.rows)
+        packed = torch.empty(logged + len(slots), fresh.shape[1])
+        if self.logs is not None and logged:
+            gather_rows(self.logs.rows, torch.from_numpy(rows), packed[:logged])
+        gather_rows(fresh, torch.from_numpy(slots), packed[logged:])
+        taken, answered = packed[:logged, -3].numpy(), self.ring.meta["teacher_action"][slots]
+        action = np.concatenate([taken.astype(np.int64), answered])
+        return packed.numpy()[:, self.ring.columns["observation"]], action
 
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
         """Return rows of the run's table `teacher`: the filter's effect by source and condition.
@@ -399,15 +401,16 @@ class Imitation(Stateful):
         """
         rng = np.random.default_rng([self._seed, 8, learner.gradient_steps])
         groups: dict[tuple[str, str], tuple[F32, Ints]] = {}
+        none = np.empty(0, np.int64)
         if self.logs is not None and len(self.cloned):
             codes = self.logs.condition.codes[self.cloned]
             for code in np.unique(codes).tolist():
                 rows = _some(self.cloned[codes == code], rng)
-                groups["logs", self.logs.condition.names[code]] = self._logged_states(rows)
+                groups["logs", self.logs.condition.names[code]] = self._states(rows, none)
         for code, name in enumerate(self.ring.conditions):
             slots = _some(np.sort(self.ring.by_condition.members(code)), rng)
             if len(slots):
-                groups["fresh", name] = self._fresh_states(slots)
+                groups["fresh", name] = self._states(none, slots)
         return [
             {"source": source, "condition": name, **_measured(learner, *states)}
             for (source, name), states in groups.items()
