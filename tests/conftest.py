@@ -45,9 +45,9 @@ def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "OpeConfig", partial(ope.OpeConfig, model=QUICK))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def summaries_once() -> Iterator[None]:
-    """For files that write the same few recordings again and again: each is summarised once."""
+    """Many tests write the same few recordings: each is summarised once a process."""
     from restock.ingest.store import writer
 
     with pytest.MonkeyPatch.context() as patch:

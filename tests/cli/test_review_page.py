@@ -55,6 +55,19 @@ def store(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "store"))
 
 
+@pytest.fixture
+def in_process(store: Path) -> Iterator[tuple[Server, list[str]]]:
+    said: list[str] = []
+    review = Review(Location.of(store))
+    with Server(review, said.append) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        yield server, said
+        server.shutdown()
+        thread.join()
+    review.close()
+
+
 def rows(path: Path, query: str) -> list[tuple]:
     with Store(path) as store:
         return store.sql(query).fetchall()
@@ -143,20 +156,19 @@ def test_another_condition_a_mark_a_note_and_undo(browser, store, tmp_path):
     assert (condition, True) in found
 
 
-def test_the_ends_of_an_event_can_be_dragged(browser, store):
-    with ServedReview(store) as server:
-        tab = opened(browser, server.address)
-        tab.run("document.querySelector('.handle').scrollIntoView({block: 'center'})")
-        box = "document.querySelector('.handle[data-end=\"1\"]').getBoundingClientRect()"
-        x, y = tab.run(f"[{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]")
-        before = tab.text("#yes")
-        tab.drag((x, y), (x + 80, y))
-        assert before.split() == ["Yes", "y"]
-        assert ".." in tab.text("#yes")
-        press(tab, "y")
-        (entry,) = Journal.of(Location.of(store)).counting()
-        assert int(entry.verdict.split("..")[1]) > entry.last_step
-        tab.close()
+def test_the_ends_of_an_event_can_be_dragged(browser, in_process, store):
+    tab = opened(browser, in_process[0].address)
+    tab.run("document.querySelector('.handle').scrollIntoView({block: 'center'})")
+    box = "document.querySelector('.handle[data-end=\"1\"]').getBoundingClientRect()"
+    x, y = tab.run(f"[{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]")
+    before = tab.text("#yes")
+    tab.drag((x, y), (x + 80, y))
+    assert before.split() == ["Yes", "y"]
+    assert ".." in tab.text("#yes")
+    press(tab, "y")
+    (entry,) = Journal.of(Location.of(store)).counting()
+    assert int(entry.verdict.split("..")[1]) > entry.last_step
+    tab.close()
 
 
 def test_names_stay_text(browser, tmp_path):
@@ -221,8 +233,8 @@ def test_two_people_and_two_servers_lose_no_verdict(browser, store):
     assert len(rows(store, "FROM corrections")) == 1
 
 
-def test_a_file_gives_the_verdicts_back(browser, store, made, tmp_path, capsys):
-    same, page = Path(shutil.copytree(made, tmp_path / "same")), tmp_path / "page.html"
+def test_a_file_gives_the_verdicts_back(browser, store, tmp_path, capsys):
+    page = tmp_path / "page.html"
     assert main(["review", str(store), "--out", str(page)]) == 0
     assert "open it in a browser" in capsys.readouterr().err
     tab = opened(browser, page.as_uri())
@@ -242,9 +254,8 @@ def test_a_file_gives_the_verdicts_back(browser, store, made, tmp_path, capsys):
         assert json.loads(capsys.readouterr().out)["verdicts"] == 2
     assert main(["review", str(store), str(file)]) == 0  # the same again
     assert "no verdict is new" in capsys.readouterr().out
-    names = ("episode_id", "condition", "first_step", "last_step", "verdict")
-    by_csv(same, [tuple(one[name] for name in names) for one in saved])
-    assert rows(store, LABELS) == rows(same, LABELS)
+    found = [(row[1], row[2]) for row in rows(store, CORRECTIONS)]
+    assert sorted(found) == sorted((one["condition"], one["verdict"] == "yes") for one in saved)
 
 
 @pytest.mark.parametrize("text", ["[{}]", "hello", '[{"kind": "verdict"}]', "[" * 99])
@@ -256,30 +267,27 @@ def test_a_file_without_verdicts_is_refused(store, tmp_path, text, capsys):
     assert not (store / NAME).exists()
 
 
-def test_precision_is_estimated_in_random_order(browser, store):
-    with ServedReview(store) as server:
-        tab = opened(browser, server.address)
-        assert tab.text("#estimate") == ""
-        tab.run(
-            "document.getElementById('order').value = 'random';"
-            "document.getElementById('order').dispatchEvent(new Event('change'))"
-        )
-        tab.wait(READY)
-        press(tab, *"yynyyyny")
-        low, high = wilson(6, 8)
-        assert f"6 of 8 labels are right: 0.75 (95 %: {low:.2f} to {high:.2f})" in tab.text(
-            "#estimate"
-        )
-        press(tab, "ArrowRight", "n")  # past one: it says so, and does not count what comes after
-        assert "6 of 8 labels" in tab.text("#estimate")
-        assert "1 after a skipped one" in tab.text("#estimate")
-        tab.close()
+def test_precision_is_estimated_in_random_order(browser, in_process):
+    tab = opened(browser, in_process[0].address)
+    assert tab.text("#estimate") == ""
+    tab.run(
+        "document.getElementById('order').value = 'random';"
+        "document.getElementById('order').dispatchEvent(new Event('change'))"
+    )
+    tab.wait(READY)
+    press(tab, *"yynyyyny")
+    low, high = wilson(6, 8)
+    told = f"6 of 8 labels are right: 0.75 (95 %: {low:.2f} to {high:.2f})"
+    assert told in tab.text("#estimate")
+    press(tab, "ArrowRight", "n")  # past one: it says so, and does not count what comes after
+    assert "6 of 8 labels" in tab.text("#estimate")
+    assert "1 after a skipped one" in tab.text("#estimate")
+    tab.close()
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (768, 1024), (1440, 900)])
-def test_the_page_fits_a_phone_and_a_thumb(browser, store, width, height):
-    with ServedReview(store) as server:
-        tab = opened(browser, server.address, width=width, height=height)
+def test_the_page_fits_a_phone_and_a_thumb(browser, in_process):
+    for width, height in ((390, 844), (768, 1024), (1440, 900)):
+        tab = opened(browser, in_process[0].address, width=width, height=height)
         assert tab.run("document.documentElement.scrollWidth") <= width
         sizes = tab.run(
             "[...document.querySelectorAll('nav button')].map((b) => b.getBoundingClientRect())"
@@ -302,19 +310,6 @@ def asked(address: str, method: str, path: str, **headers: str) -> tuple[int, st
     text = answer.read().decode()
     link.close()
     return answer.status, text
-
-
-@pytest.fixture
-def in_process(store: Path) -> Iterator[tuple[Server, list[str]]]:
-    said: list[str] = []
-    review = Review(Location.of(store))
-    with Server(review, said.append) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-        thread.start()
-        yield server, said
-        server.shutdown()
-        thread.join()
-    review.close()
 
 
 def test_only_the_page_is_answered(in_process):

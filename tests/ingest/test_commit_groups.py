@@ -25,8 +25,6 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 
-pytestmark = pytest.mark.usefixtures("summaries_once")
-
 
 def waiting(
     store: StoreWriter,

@@ -22,8 +22,6 @@ from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.query import fetch
 from restock.replay.store.store import Store
 
-pytestmark = pytest.mark.usefixtures("summaries_once")
-
 DAMAGES = ("cut", "missing", "a page", "numbers")
 
 

@@ -22,8 +22,6 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
-pytestmark = pytest.mark.usefixtures("summaries_once")
-
 
 def name_of(n: int) -> str:
     return f"{n:016x}"

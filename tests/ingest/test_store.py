@@ -26,8 +26,6 @@ from restock.ingest.store.removal import remove_recordings
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
-pytestmark = pytest.mark.usefixtures("summaries_once")
-
 
 def test_what_is_written_is_read_with_every_type(place):
     manifest, rows = one(1)

@@ -14,8 +14,6 @@ from restock.ingest.store.lineage import _read
 from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
-pytestmark = pytest.mark.usefixtures("summaries_once")
-
 
 @pytest.fixture(scope="module")
 def versions(tmp_path_factory) -> tuple[Path, int]:

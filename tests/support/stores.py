@@ -228,6 +228,8 @@ def summarised_once(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     key = digest.digest()
     if key not in _summaries:
         _summaries[key] = summarised(manifest, rows)
+        if len(_summaries) > 100:
+            del _summaries[next(iter(_summaries))]
     return _summaries[key]
 
 
