@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import pytest
 from support.browser import Browser, Tab
 from support.served_review import ServedReview
-from support.stores import manifest, one, recording_transitions
+from support.stores import manifest, recording_transitions
 
 from restock.cli import main
 from restock.errors import LabelError
@@ -46,7 +46,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("made") / "store"
     for recording in (1, 2):
-        StoreWriter(path).write(*one(recording))
+        table = recording_transitions(recording, episodes=3)  # some 50 events in all
+        StoreWriter(path).write(manifest(table), table)
     return path
 
 
@@ -172,7 +173,7 @@ def test_the_ends_of_an_event_can_be_dragged(browser, in_process, store):
 
 
 def test_names_stay_text(browser, tmp_path):
-    table = replaced(recording_transitions(1), {"source_file": f"{HOSTILE}.mcap"})
+    table = replaced(recording_transitions(1, episodes=1), {"source_file": f"{HOSTILE}.mcap"})
     path = tmp_path / "store"
     StoreWriter(path).write(manifest(table, tags={"robot": HOSTILE}), table)
     page = tmp_path / "page.html"
@@ -386,7 +387,7 @@ def test_a_verdict_on_replaced_rows_is_refused_in_a_sentence(in_process, store):
     review = in_process[0].review
     review.give([given(review)])
     recording = review.data["events"][0]["recording"]
-    table = recording_transitions(int(recording, 16), ingest="b")
+    table = recording_transitions(int(recording, 16), ingest="b", episodes=3)
     stamps = table["stamp_ns"].to_numpy().copy()
     stamps[1:] += 7 * 10**9
     table = replaced(table, {"stamp_ns": stamps})
