@@ -1,13 +1,14 @@
-"""Restock's updates from a full buffer, as its benchmarks time them."""
+"""Restock's updates from a full buffer, as its benchmarks time them, and an update's products."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
-from train_peers import ACTIONS, DISCOUNT, OBSERVATION, ROWS, Arrays
+from train_peers import ACTIONS, DISCOUNT, OBSERVATION, ROWS, Arrays, Updates
 
 from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.config import TrainConfig, parse_config
@@ -19,6 +20,27 @@ from restock.train.feed.fresh_log import EpisodeLabels
 from restock.train.feed.logs import Coded, Logs
 from restock.train.feed.update_blocks import Made, UpdateBlocks
 from restock.train.run.run import Run
+
+
+def products(
+    batch: int, forward: int = 2, backward: int = 1, observation: int = OBSERVATION
+) -> Updates:
+    """Return the matrix products of an update alone, of so many passes of the batch."""
+    sizes = [observation, 256, 256, ACTIONS]
+    weights = [torch.randn(after, before) for before, after in itertools.pairwise(sizes)]
+    values = [torch.randn(batch, size) for size in sizes]
+    into = [torch.empty_like(weight) for weight in weights]
+
+    def update(updates: int) -> None:
+        for _ in range(updates):
+            for layer in (0, 1, 2) * forward:
+                torch.mm(values[layer], weights[layer].t())
+            for layer in (2, 1, 0) * backward:
+                torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
+                if layer:
+                    torch.mm(values[layer + 1], weights[layer])
+
+    return update
 
 
 def config(batch: int, **changes: Any) -> TrainConfig:

@@ -16,7 +16,6 @@ Figures are CPU times. `--check` exits 1 where a target of the design is missed.
 
 from __future__ import annotations
 
-import itertools
 import sys
 import tempfile
 import time
@@ -28,10 +27,8 @@ from typing import Any
 import numpy as np
 import torch
 from harness import finish, in_turns, medians, option_parser
-from own_updates import Restock, config
+from own_updates import Restock, config, products
 from train_peers import (
-    ACTIONS,
-    OBSERVATION,
     Arrays,
     Updates,
     cleanrl,
@@ -61,25 +58,6 @@ def in_place(settings: TrainConfig, arrays: Arrays) -> Updates:
         for _ in range(updates):
             learner.update(rows)
             learner.target.after(learner.gradient_steps)
-
-    return update
-
-
-def products(batch: int) -> Updates:
-    """Return the matrix products of an update alone: two passes forward, one backward."""
-    sizes = [OBSERVATION, 256, 256, ACTIONS]
-    weights = [torch.randn(after, before) for before, after in itertools.pairwise(sizes)]
-    values = [torch.randn(batch, size) for size in sizes]
-    into = [torch.empty_like(weight) for weight in weights]
-
-    def update(updates: int) -> None:
-        for _ in range(updates):
-            for layer in (0, 1, 2) * 2:
-                torch.mm(values[layer], weights[layer].t())
-            for layer in (2, 1, 0):
-                torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
-                if layer:
-                    torch.mm(values[layer + 1], weights[layer])
 
     return update
 

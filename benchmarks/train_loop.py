@@ -9,8 +9,11 @@ none. "restock" learns as its peers do; "restock_default" has LayerNorm, 3-step 
 the teacher who is asked in every state and the network that learns from it. Stable-Baselines3 steps
 Restock's own vector environment, so that the learners are what is compared, and once more 16 single
 environments, as its users make them (`make_vec_env`). All are timed from the end of the warm-up, in
-turns, by wall clock and CPU. `--check` exits 1 where a target of the design is missed.
-Stable-Baselines3 is left out where it is not installed.
+turns, by wall clock and CPU. Stable-Baselines3 is left out where it is not installed.
+
+Each has a limit, measured in the same turns: the physics of an environment step and the matrix
+products of its recipe's passes (by `torch.mm`), and nothing else. The targets compare how many
+times its limit each takes: `--check` exits 1 where one is missed.
 """
 
 from __future__ import annotations
@@ -27,18 +30,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import finish, option_parser
+from harness import cpu_us, finish, option_parser
+from own_updates import products
+from twin import physics
 
 from restock.ingest.profile.profile import load_profile
-from restock.train.dqn.config import parse_config
+from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.feed.practice import make_twin
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new
 
 ENVS, BATCH, WARMUP, UPDATES_PER_STEP = 16, 128, 1_600, 0.125
-# Of the default recipe: times its environment steps a second on the same vector environment.
+# So many times the peer's on the same vector environment, at least: of the default recipe, the part
+# that its limit is of a step, by wall clock and CPU.
 TARGETS = {"env_steps_per_s": 2.0, "env_steps_per_cpu_s": 1.5}
 FAIR, SINGLE = "stable_baselines3_same_env", "stable_baselines3_single_envs"
+# Passes of the batch per update, forward and backward. The default recipe's are the network's at s
+# and s', the target's, and the behaviour network's at s' and at its own states.
+PASSES = {"restock": (2, 1), "restock_default": (5, 2), FAIR: (2, 1), SINGLE: (2, 1)}
 
 
 @dataclass
@@ -98,6 +107,20 @@ def restock(steps: int, seed: int, settings: Sequence[str] = ()) -> Stretch:
         finally:
             session.close()
     return stretch
+
+
+def limits() -> dict[str, float]:
+    """Return the CPU seconds of an environment step's physics and products alone."""
+    size = load_profile(TrainConfig().profile).task.observation_size
+    step_us = cpu_us(physics(ENVS).run, 100) / ENVS
+    updates_us = {
+        passes: cpu_us(partial(products(BATCH, *passes, size), 200), 1) / 200
+        for passes in set(PASSES.values())
+    }
+    return {
+        name: (step_us + UPDATES_PER_STEP * updates_us[passes]) / 1e6
+        for name, passes in PASSES.items()
+    }
 
 
 def as_vec_env(env: Any) -> Any:
@@ -194,9 +217,12 @@ def main() -> int:
     for name in left_out:
         del contenders[name]
     runs: dict[str, list[Stretch]] = {name: [] for name in contenders}
+    alone: list[dict[str, float]] = []
     for seed in range(rounds):
+        alone.append(limits())
         for name, contender in contenders.items():
             runs[name].append(contender(steps, seed))
+    limit_s = {name: float(np.median([each[name] for each in alone])) for name in contenders}
     rates = {
         name: {
             "env_steps_per_s": float(np.median([steps / each.took[0] for each in stretches])),
@@ -211,26 +237,49 @@ def main() -> int:
         for name in (FAIR, SINGLE)
         if name in rates
     }
+    # What the limit is of a step, over the same of the peer.
+    to_limit = {
+        pair: {unit: each[unit] * limit_s[own] / limit_s[name] for unit in TARGETS}
+        for pair, each in ratios.items()
+        for own, name in [pair.split(" / ")]
+    }
+    possible = {
+        pair: 1 / (rates[name]["env_steps_per_cpu_s"] * limit_s[own])
+        for pair in ratios
+        for own, name in [pair.split(" / ")]
+    }
     missed = [
-        f"the default recipe, in the same environment: {fair[unit]:.2f}x {unit}, target {target}x"
+        f"the default recipe's limit of its step, over the peer's: {fair[unit]:.2f}x {unit},"
+        f" target {target}x"
         for unit, target in TARGETS.items()
-        if (fair := ratios.get(f"restock_default / {FAIR}")) and fair[unit] < target
+        if (fair := to_limit.get(f"restock_default / {FAIR}")) and fair[unit] < target
     ]
     lines = [
         f"{name:30s} {rate['env_steps_per_s']:7.0f} env steps/s"
         f" {rate['updates_per_s']:6.0f} updates/s"
-        f" {rate['env_steps_per_cpu_s']:7.0f} env steps/CPU s"
+        f" {rate['env_steps_per_cpu_s']:7.0f} env steps/CPU s, limit {1 / limit_s[name]:.0f}:"
+        f" {1 / (rate['env_steps_per_cpu_s'] * limit_s[name]):.2f} times its limit"
         for name, rate in rates.items()
     ]
     lines += [
         f"{name}: {ratio['env_steps_per_s']:.2f}x by wall clock,"
-        f" {ratio['env_steps_per_cpu_s']:.2f}x by CPU"
+        f" {ratio['env_steps_per_cpu_s']:.2f}x by CPU (at its limit {possible[name]:.2f}x);"
+        f" each over its limit: {to_limit[name]['env_steps_per_s']:.2f}x by wall clock,"
+        f" {to_limit[name]['env_steps_per_cpu_s']:.2f}x by CPU"
         for name, ratio in ratios.items()
     ]
     lines += [f"{name}: not installed, left out" for name in left_out]
     if left_out:
         lines.append("end to end, in the same environment: not measured")
-    answer = {"steps": steps, "rates": rates, "ratios": ratios, "left_out": left_out}
+    answer = {
+        "steps": steps,
+        "rates": rates,
+        "limit_s": limit_s,
+        "ratios": ratios,
+        "to_limit": to_limit,
+        "possible": possible,
+        "left_out": left_out,
+    }
     return finish(options, answer, missed, lines)
 
 
