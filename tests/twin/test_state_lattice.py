@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from restock import native
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import PALLET_HALF_M, Warehouse, default_warehouse
 from restock.train.twin.floors.planner import Planner
@@ -10,9 +11,10 @@ from restock.train.twin.floors.state_lattice import (
     Motion,
     StateLattice,
     Window,
+    box_gap,
     floor_gap,
     lattice_around,
-    near_floor_gap,
+    near_gap,
     rectangle,
 )
 from restock.train.twin.missions.mission import length_m
@@ -102,13 +104,18 @@ def against(floor: Warehouse, plan: np.ndarray) -> bool:
     return False
 
 
-@pytest.mark.parametrize("layouts", ["default", "generated:test"])
-def test_the_clearance_of_near_points_is_that_of_the_floor(layouts: str) -> None:
+@pytest.mark.parametrize(("layouts", "way"), [("default", "1"), ("generated:test", "0")])
+def test_the_clearance_of_near_points_is_exact(layouts, way, monkeypatch):
+    monkeypatch.setenv(native.SWITCH, way)
     floor = open_floors(layouts)[-1]
     rng = np.random.default_rng(0)
     middle = rng.uniform((0.0, 0.0), (floor.width_m, floor.depth_m), (200, 2))
     x, y = np.moveaxis(middle[:, None] + rng.uniform(-0.6, 0.6, (200, 12, 2)), -1, 0)
-    exact, near = floor_gap(floor, x, y), near_floor_gap(floor, x, y, 0.3)
+    own = np.concatenate([middle + 0.5, np.full((200, 2), 0.2)], axis=1)
+    own[100:, :2] = np.inf  # not there
+    of_own = box_gap(x, y, own[:, :2].T[..., None], own[:, 2:].T[..., None])
+    exact = np.minimum(floor_gap(floor, x, y), of_own)
+    near = near_gap(floor, own[:, None], x, y, 0.3)
     close = exact < 0.3
     assert 0.2 < close.mean() < 1.0
     np.testing.assert_array_equal(near[close], exact[close])

@@ -381,10 +381,7 @@ class Imitation(Stateful):
         return Labelled(torch.from_numpy(observation), torch.from_numpy(action))
 
     def _states(self, rows: Ints, slots: Ints) -> tuple[F32, Ints]:
-        """Return observations (n, D) of logged rows, then of the ring's, and actions (n,).
-
-        Those are what was taken in the logs, and what the teacher answered in the ring's states.
-        """
+        """Return observations (n, D) and actions (n,): the logs', then the teacher's answers."""
         logged, fresh = len(rows), torch.from_numpy(self.ring.rows)
         packed = torch.empty(logged + len(slots), fresh.shape[1])
         if self.logs is not None and logged:

@@ -27,6 +27,7 @@ static PyMethodDef module_methods[] = {
     {"view_plans", view_plans, METH_VARARGS, view_plans_doc},
     {"find_returns", find_returns, METH_VARARGS, find_returns_doc},
     {"find_came", find_came, METH_VARARGS, find_came_doc},
+    {"near_boxes", near_boxes, METH_VARARGS, near_boxes_doc},
     {NULL, NULL, 0, NULL},
 };
 

@@ -303,3 +303,62 @@ static PyObject *find_came(PyObject *Py_UNUSED(module), PyObject *args) {
 done:
     return released(view, held, answer);
 }
+
+PyDoc_STRVAR(
+    near_boxes_doc,
+    "near_boxes(x, y, shared, own, room, robots, within)\n--\n\n"
+    "How far points are from boxes: `train.twin.floors.state_lattice.near_gap`, to the last bit.\n\n"
+    "All are flat float64. Lowers `room` (n, P) at `x` and `y` (n, P) of n `robots` to the gaps to the\n"
+    "`shared` boxes (R, 4) and to those of their `own` (n, K, 4), if they are less than `within`.");
+
+static void lower(const double *box, const double *x, const double *y, double *room, Size points) {
+    for (Size i = 0; i < points; i++) {
+        double aside = fabs(x[i] - box[0]) - box[2], along = fabs(y[i] - box[1]) - box[3];
+        double far = aside > along ? aside : along;
+        if (far < room[i]) {
+            double gap = far > 0 ? hypot(aside > 0 ? aside : 0, along > 0 ? along : 0) : far;
+            room[i] = gap < room[i] ? gap : room[i];
+        }
+    }
+}
+
+static PyObject *near_boxes(PyObject *Py_UNUSED(module), PyObject *args) {
+    enum { X, Y, SHARED, OWN, ROOM, ALL };
+    static const char *names[ALL] = {"x", "y", "shared", "own", "room"};
+    PyObject *from[ALL], *answer = NULL;
+    Py_buffer view[ALL];
+    Size robots;
+    double within;
+    if (!PyArg_ParseTuple(args, "OOOOOnd", &from[0], &from[1], &from[2], &from[3], &from[4], &robots,
+                          &within))
+        return NULL;
+    int held = get_vectors(from, view, ALL, ROOM, names);
+    if (held < ALL)
+        goto done;
+    Size all = view[X].shape[0], points = robots > 0 ? all / robots : 0;
+    Size shared = view[SHARED].shape[0] / 4, own = points ? view[OWN].shape[0] / 4 / robots : 0;
+    if (robots * points != all || view[Y].shape[0] != all || view[ROOM].shape[0] != all ||
+        view[SHARED].shape[0] != 4 * shared || view[OWN].shape[0] != 4 * own * robots) {
+        wrong_shape("an argument");
+        goto done;
+    }
+    for (Size n = 0; points && n < robots; n++) {
+        const double *x = (const double *)view[X].buf + n * points;
+        const double *y = (const double *)view[Y].buf + n * points;
+        double low[2] = {x[0], y[0]}, high[2] = {x[0], y[0]};
+        for (Size i = 1; i < points; i++) {
+            low[0] = least_of(x[i], low[0]), high[0] = x[i] > high[0] ? x[i] : high[0];
+            low[1] = least_of(y[i], low[1]), high[1] = y[i] > high[1] ? y[i] : high[1];
+        }
+        for (Size m = 0; m < shared + own; m++) {
+            const double *box = (const double *)view[m < shared ? SHARED : OWN].buf;
+            box += 4 * (m < shared ? m : n * own + m - shared);
+            if (low[0] - within < box[0] + box[2] && high[0] + within > box[0] - box[2] &&
+                low[1] - within < box[1] + box[3] && high[1] + within > box[1] - box[3])
+                lower(box, x, y, (double *)view[ROOM].buf + n * points, points);
+        }
+    }
+    answer = Py_NewRef(Py_None);
+done:
+    return released(view, held, answer);
+}

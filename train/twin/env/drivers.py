@@ -28,15 +28,14 @@ from restock.state import Stateful
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.layout import PALLET_HALF_M, Warehouse, pallet_half_m
+from restock.train.twin.floors.layout import PALLET_HALF_M, pallet_half_m
 from restock.train.twin.floors.planner import PLAN_POINTS
 from restock.train.twin.floors.state_lattice import (
     Motion,
     StateLattice,
     Window,
-    box_gap,
     lattice_around,
-    near_floor_gap,
+    near_gap,
     rectangle,
 )
 from restock.train.twin.physics.scenery import RETREATING, WALKING
@@ -260,24 +259,6 @@ def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> t
     return ends, speed
 
 
-def _room_m(floor: Warehouse, pallets: F64, x: F64, y: F64, within_m: float) -> F64:
-    """Return how far points (n, …) are from racks, walls and their pallets (n, K, 3).
-
-    Exact if it is below `within_m`.
-    """
-    room = near_floor_gap(floor, x, y, within_m)
-    each = (-1, *(1,) * (x.ndim - 1))
-    for column in range(pallets.shape[1]):
-        rows = np.flatnonzero(pallets[:, column, 0] > 0)
-        if len(rows):
-            middle, half = (
-                part.T.reshape(2, *each)
-                for part in (pallets[rows, column, :2], pallet_half_m(pallets[rows, column, 2]))
-            )
-            room[rows] = np.minimum(room[rows], box_gap(x[rows], y[rows], middle, half))
-    return room
-
-
 def _outlines(poses: F64, outline: F64) -> tuple[F64, F64]:
     """Return x and y (..., K) of the points of an outline (K, 2) at poses (..., 3)."""
     cos, sin = np.cos(poses[..., 2, None]), np.sin(poses[..., 2, None])
@@ -296,12 +277,15 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     beyond_m = float(np.hypot(*outline.T).max()) + ROOMY_M  # of a middle: all of it has room
     room = np.full(ends.shape[:3], ROOMY_M)
     on, pallets = env.layout[ids], env.simulation.pallets[ids]
+    boxes = np.concatenate([pallets[..., :2], pallet_half_m(pallets[..., 2])], axis=-1)
+    boxes[pallets[..., 0] <= 0, :2] = np.inf  # not placed
     for index in np.unique(on):
         rows = np.flatnonzero(on == index)
         floor, pose = env.floors[index], ends[rows]
-        close = _room_m(floor, pallets[rows], pose[..., 0], pose[..., 1], beyond_m) < beyond_m
+        close = near_gap(floor, boxes[rows], pose[..., 0], pose[..., 1], beyond_m) < beyond_m
         robot, *plan = np.nonzero(close)
-        gap = _room_m(floor, pallets[rows[robot]], *_outlines(pose[close], outline), ROOMY_M)
+        outlines = _outlines(pose[close], outline)
+        gap = near_gap(floor, boxes[rows[robot]], *outlines, ROOMY_M)
         room[rows[robot], *plan] = gap.min(axis=1)
     people = np.full(ends.shape[:3], 9.0)
     traffic = env.simulation.traffic

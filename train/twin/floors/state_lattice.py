@@ -15,6 +15,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from restock import native
 from restock.arrays import F64, Bools, Ints
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import CELL_M, smooth_plan
@@ -326,22 +327,26 @@ def _wall_gap(floor: Warehouse, x: F64, y: F64) -> F64:
     return np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
 
 
-def near_floor_gap(floor: Warehouse, x: F64, y: F64, within_m: float) -> F64:
-    """Return `floor_gap` of points (n, …) of n robots, exact if it is below `within_m`.
+def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64:
+    """Return `floor_gap` of points (n, …) of n robots, or that to their `own` boxes if smaller.
 
-    Racks farther from all points of a robot are left out: a floor made of scans has hundreds.
+    Exact if it is below `within_m`: boxes farther from all points of a robot are left out, as a
+    floor made of scans has hundreds. `own` (n, K, 4) are middles and half sizes.
     """
-    room = _wall_gap(floor, x, y)
-    over = tuple(range(1, x.ndim))
+    room = np.ascontiguousarray(_wall_gap(floor, x, y))
+    racks = np.array([(*rack.center, *rack.half_size) for rack in floor.racks]).reshape(-1, 4)
+    if native.is_used():
+        native.compiled.near_boxes(*map(np.ravel, (x, y, racks, own, room)), len(x), within_m)
+        return room
+    over, each = tuple(range(1, x.ndim)), (4, -1, *(1,) * (x.ndim - 1))
     low = np.stack([x.min(axis=over), y.min(axis=over)], axis=-1) - within_m  # (n, 2)
     high = np.stack([x.max(axis=over), y.max(axis=over)], axis=-1) + within_m
-    corners = np.array([rack.edges for rack in floor.racks]).reshape(-1, 4)
-    near = (low[:, None] < corners[:, 2:]) & (high[:, None] > corners[:, :2])  # (n, racks, 2)
-    for rack, beside in zip(floor.racks, np.asarray(near.all(axis=2)).T, strict=True):
-        rows = np.flatnonzero(beside)
+    for box in (*racks[:, None], *own.swapaxes(0, 1)):  # (1, 4) or (n, 4)
+        middle, half = box[:, :2], box[:, 2:]
+        rows = np.flatnonzero(((low < middle + half) & (high > middle - half)).all(axis=1))
         if len(rows):
-            gap = box_gap(x[rows], y[rows], rack.center, rack.half_size)
-            room[rows] = np.minimum(room[rows], gap)
+            beside = np.broadcast_to(box, (len(x), 4))[rows].T.reshape(each)
+            room[rows] = np.minimum(room[rows], box_gap(x[rows], y[rows], beside[:2], beside[2:]))
     return room
 
 

@@ -21,7 +21,7 @@ from restock.errors import ConfigError, RunError
 from restock.ingest.task.task import Body
 from restock.train.twin.floors.layout import AGENTS, NO_PATCH, PATCHES, Walk, Warehouse, no_pallets
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.floors.state_lattice import near_floor_gap
+from restock.train.twin.floors.state_lattice import near_gap
 from restock.train.twin.missions import KINDS, MISSIONS
 from restock.train.twin.missions.mission import length_m, point_along
 from restock.train.twin.physics.perturbation import Perturbation
@@ -116,7 +116,7 @@ def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode
             cos, sin = np.cos(heading), np.sin(heading)
             points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + place
             corners = points[None, :, 0], points[None, :, 1]
-            if near_floor_gap(warehouse, *corners, AISLE_ROOM_M).min() > 0:
+            if near_gap(warehouse, np.empty((1, 0, 4)), *corners, AISLE_ROOM_M).min() > 0:
                 return replace(episode, start=(*place, heading))
     return episode
 
