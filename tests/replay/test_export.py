@@ -19,7 +19,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from ruamel.yaml import YAML
-from support.long import one_in
 from support.neighbours import read_with
 from support.panels import panel_of
 from support.stores import TASK, recording_transitions, write_store
@@ -277,25 +276,26 @@ def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path):
 
 
 @pytest.mark.long  # another Python starts
-@pytest.mark.parametrize("continuous", one_in(2, [False, True]))
-def test_d3rlpy_reads_its_data_set_and_trains_on_it(store_path, tmp_path, continuous):
+def test_d3rlpy_reads_its_data_sets_and_trains_on_them(store_path, tmp_path):
     pytest.importorskip("h5py")
-    export_dataset(store_path, "d3rlpy", tmp_path / "a.h5", query=SLIP, continuous=continuous)
-    found = read_with("d3rlpy", tmp_path / "a.h5")
-    expected, counts = of(store_path, query=SLIP, continuous=continuous)
-    assert found["transitions"] == counts.transitions
-    assert found["discrete"] != continuous
-    assert found["trained"]
-    for episode, t in zip(found["episodes"], expected, strict=True):
-        assert episode["terminated"] == t.terminated
-        np.testing.assert_allclose(np.squeeze(episode["actions"], -1) if not continuous
-                                   else episode["actions"], t.actions, rtol=1e-6)  # fmt: skip
-        np.testing.assert_allclose(episode["rewards"], t.rewards, rtol=1e-6)
-        np.testing.assert_allclose(episode["first"], t.observations[:-1, 0], rtol=1e-6)
-        steps = slice(1, -1) if t.terminated else slice(1, None)  # there it gives zeros
-        expected_next = t.observations[steps, 0]
-        np.testing.assert_allclose(episode["next_first"][: len(expected_next)], expected_next)
-        assert episode["terminal"] == [0.0] * (len(t) - 1) + [float(t.terminated)]
+    files = {False: tmp_path / "actions.h5", True: tmp_path / "commands.h5"}
+    for continuous, file in files.items():
+        export_dataset(store_path, "d3rlpy", file, query=SLIP, continuous=continuous)
+    for continuous, found in zip(files, read_with("d3rlpy", *files.values()), strict=True):
+        expected, counts = of(store_path, query=SLIP, continuous=continuous)
+        assert found["transitions"] == counts.transitions
+        assert found["discrete"] != continuous
+        assert found["trained"]
+        for episode, t in zip(found["episodes"], expected, strict=True):
+            assert episode["terminated"] == t.terminated
+            actions = np.reshape(episode["actions"], t.actions.shape)
+            np.testing.assert_allclose(actions, t.actions, rtol=1e-6)
+            np.testing.assert_allclose(episode["rewards"], t.rewards, rtol=1e-6)
+            np.testing.assert_allclose(episode["first"], t.observations[:-1, 0], rtol=1e-6)
+            steps = slice(1, -1) if t.terminated else slice(1, None)  # there it gives zeros
+            expected_next = t.observations[steps, 0]
+            np.testing.assert_allclose(episode["next_first"][: len(expected_next)], expected_next)
+            assert episode["terminal"] == [0.0] * (len(t) - 1) + [float(t.terminated)]
 
 
 @pytest.mark.long  # another Python starts

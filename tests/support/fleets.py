@@ -8,7 +8,6 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 from deltalake import write_deltalake
-from scipy.signal import lfilter
 
 from restock.ingest.store.version import FORMAT
 from support.stores import TASK, manifest, recording_transitions, views_over
@@ -76,6 +75,8 @@ def wander(
     rng: np.random.Generator, rows: int, deviation: float, memory: float = 0.9
 ) -> np.ndarray:
     """Return an AR(1) process (rows,) of that standard deviation."""
+    from scipy.signal import lfilter  # which takes long to import, for all who collect tests
+
     drawn = rng.normal(0, deviation * np.sqrt(1 - memory**2), rows)
     return np.asarray(lfilter([1.0], [1.0, -memory], drawn))
 

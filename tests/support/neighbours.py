@@ -12,7 +12,7 @@ import pytest
 from support.paths import ROOT
 
 
-def read_with(library: str, path: Path) -> Any:
+def read_with(library: str, *paths: Path) -> Any:
     """Read with the real library, in a Python that has it; skip the test if none has."""
     apart = ROOT / ".venv-neighbours" / "bin" / "python"
     python = os.environ.get("RESTOCK_NEIGHBOURS_PYTHON") or str(
@@ -22,11 +22,11 @@ def read_with(library: str, path: Path) -> Any:
     if subprocess.run([python, "-c", probe], check=False).returncode:
         pytest.skip(f"{python} has no {library}")
     done = subprocess.run(
-        [python, str(ROOT / "tests" / "replay" / f"read_with_{library}.py"), str(path)],
+        [python, ROOT / "tests" / "replay" / f"read_with_{library}.py", *paths],
         capture_output=True,
         text=True,
         check=False,
-        cwd=path.parent,
+        cwd=paths[0].parent,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])

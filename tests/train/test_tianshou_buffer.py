@@ -19,13 +19,20 @@ from support.library_buffers import (
 from restock.errors import MixtureError
 from restock.replay.panel.panel import Panel
 
-pytest.importorskip("tianshou")
-
-from tianshou.data import Batch
-
-from restock.train.libraries.tianshou_buffer import MixtureVectorReplayBuffer
-
 pytestmark = pytest.mark.long  # half a minute to import, train and fill
+
+
+# Imported by these tests alone: each process that collects the tests would wait for it.
+def buffer_of(*args: Any, **options: Any) -> Any:
+    from restock.train.libraries.tianshou_buffer import MixtureVectorReplayBuffer
+
+    return MixtureVectorReplayBuffer(*args, **options)
+
+
+def batch_of(**columns: Any) -> Any:
+    from tianshou.data import Batch
+
+    return Batch(**columns)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +54,7 @@ def test_targets_are_of_single_logged_and_of_n_fresh_steps(trained, panel, n_ste
         returns = prepared.returns.numpy().ravel()
 
         def value(observation: np.ndarray) -> float:
-            seen = Batch(obs=observation[None], info=[None])
+            seen = batch_of(obs=observation[None], info=[None])
             best = int(algorithm.policy(seen).act[0])
             return float(algorithm.policy(seen, model=algorithm.model_old).logits[0, best])
 
@@ -71,7 +78,7 @@ def test_targets_are_of_single_logged_and_of_n_fresh_steps(trained, panel, n_ste
 
 
 def test_a_reset_forgets_what_was_collected_and_keeps_the_logs(panel: Panel) -> None:
-    buffer = MixtureVectorReplayBuffer(100, 1, panel=panel, logs_share=0.5)
+    buffer = buffer_of(100, 1, panel=panel, logs_share=0.5)
     _add(buffer, 5)
     assert len(buffer) == len(panel) + 5
     assert (buffer.sample_indices(8) < 100).sum() == 4
@@ -83,7 +90,7 @@ def test_a_reset_forgets_what_was_collected_and_keeps_the_logs(panel: Panel) -> 
 
 
 def test_a_blown_up_step_is_not_learnt_from() -> None:
-    buffer = MixtureVectorReplayBuffer(100, 1)
+    buffer = buffer_of(100, 1)
     _add(buffer, 4, invalid=3)
     assert buffer.feed.invalid_steps == 1
     assert set(buffer.sample_indices(200).tolist()) == {0, 1, 2}
@@ -94,7 +101,7 @@ def _add(buffer: Any, steps: int, invalid: int = -1) -> None:
     for step in range(steps):
         seen = np.full((1, size), step, np.float32)
         info = np.array([{"invalid": step == invalid}])
-        row = Batch(
+        row = batch_of(
             obs=seen,
             act=np.array([1]),
             rew=np.array([0.5]),
@@ -109,19 +116,19 @@ def _add(buffer: Any, steps: int, invalid: int = -1) -> None:
 def test_a_panel_of_several_steps_is_refused(tmp_path: Path) -> None:
     several = make_panel(make_store(tmp_path), tmp_path / "panel", n_step=3, post="full")
     with pytest.raises(MixtureError, match="its rows span 3 steps"):
-        MixtureVectorReplayBuffer(100, 1, panel=several)
+        buffer_of(100, 1, panel=several)
 
 
 def test_without_logs_and_without_steps_there_is_nothing_to_draw() -> None:
     with pytest.raises(MixtureError, match="no fresh row to draw"):
-        MixtureVectorReplayBuffer(100, 1).sample_indices(4)
+        buffer_of(100, 1).sample_indices(4)
 
 
 def test_commands_of_logs_stand_beside_continuous_fresh_ones(panel: Panel) -> None:
     commands = np.linspace(-1, 1, 2 * len(panel)).reshape(-1, 2)
-    buffer = MixtureVectorReplayBuffer(50, 1, panel=panel, logs_share=0.5, commands=commands)
+    buffer = buffer_of(50, 1, panel=panel, logs_share=0.5, commands=commands)
     seen = np.zeros((1, TASK.observation_size), np.float32)
-    row = Batch(
+    row = batch_of(
         obs=seen,
         act=np.array([[0.25, -0.5]]),
         rew=np.array([0.0]),
