@@ -1,5 +1,6 @@
 """Fixtures that several rooms' tests share."""
 
+import os
 import signal
 from collections.abc import Iterator
 from functools import partial
@@ -14,6 +15,9 @@ from support.stores import recording_transitions, summarised_once, write_store
 # Times are not asserted: on a loaded machine the first example of a property may take long.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+# Tianshou has Numba compile loops over its buffer, which takes longer than they do for a few rows.
+os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a script: processes that the tests interrupt would inherit it.

@@ -87,16 +87,6 @@ def opened(browser: Browser, address: str, **size: int) -> Tab:
     return tab
 
 
-def by_csv(store: Path, verdicts: list[tuple[str, str, int, int, str]]) -> None:
-    """Give verdicts as a spreadsheet does: episode, condition, first and last step, verdict."""
-    file = store.parent / "same.csv"
-    with file.open("w", newline="") as out:
-        lines = csv.writer(out)
-        lines.writerow(["episode_id", "condition", "first_step", "last_step", "verdict"])
-        lines.writerows(verdicts)
-    assert main(["review", str(store), str(file)]) == 0
-
-
 def test_thirty_events_by_keys_equal_those_by_csv(browser, store, made, tmp_path):
     same = Path(shutil.copytree(made, tmp_path / "same"))
     with Store(store) as read:
@@ -120,7 +110,11 @@ def test_thirty_events_by_keys_equal_those_by_csv(browser, store, made, tmp_path
         tab.close()
         code, _ = server.end()
     assert code == 0
-    by_csv(same, verdicts)
+    with (file := tmp_path / "same.csv").open("w", newline="") as out:
+        lines = csv.writer(out)
+        lines.writerow(["episode_id", "condition", "first_step", "last_step", "verdict"])
+        lines.writerows(verdicts)
+    assert main(["review", str(same), str(file)]) == 0
     assert rows(store, CORRECTIONS) == rows(same, CORRECTIONS)
     assert rows(store, LABELS) == rows(same, LABELS)
     assert rows(store, LABELS) != rows(made, LABELS)

@@ -32,8 +32,7 @@ def read(path: str) -> dict[str, object]:
         show_progress=False,
         logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
     )
-    found = {"transitions": dataset.transition_count, "discrete": discrete, "episodes": episodes}
-    return found | {"trained": True}
+    return {"transitions": dataset.transition_count, "discrete": discrete, "episodes": episodes}
 
 
 sys.stdout.write("\n" + json.dumps([read(path) for path in sys.argv[1:]]) + "\n")

@@ -149,31 +149,26 @@ def test_false_alarms_of_correlated_steps_keep_their_level(seed):
 
 
 def test_false_alarms_of_rates_keep_their_level():
-    rng, lines = np.random.default_rng(5), []
-    for robot in range(300):
-        for week in range(4):
-            for number in range(3):
-                # Some drives meet far more of it than others: not Poisson.
-                rate = rng.gamma(2, 1.0)
-                for episode in range(5):
-                    lines.append(
-                        {
-                            "robot": f"r{robot}",
-                            "site": f"r{robot}",
-                            "recording_id": f"{robot}-{week}-{number}",
-                            "episode_id": f"{robot}-{week}-{number}/{episode}",
-                            "start_time": np.datetime64(WEEKS[week], "us").item(),
-                            "condition": "wheel_slip",
-                            "zone": None,
-                            "driven_h": 1.0,
-                            "steps": 0,
-                            "events": int(rng.poisson(rate)),
-                        }
-                    )
-    schema = pa.Table.from_pylist(lines).schema.set(6, pa.field("zone", pa.string()))
-    connection = of_samples(
-        samples({("none", "none", 0): [np.ones(1)]}), pa.Table.from_pylist(lines, schema)
-    )
+    rng = np.random.default_rng(5)
+    robot, week, number, episode = (part.ravel() for part in np.indices((300, 4, 3, 5)))
+    names = [f"r{one}" for one in robot]
+    drives = [f"{name}-{at}-{one}" for name, at, one in zip(names, week, number, strict=True)]
+    # Some drives meet far more of it than others: not Poisson.
+    rate = rng.gamma(2, 1.0, (300, 4, 3, 1)) * np.ones(5)
+    conditions = {
+        "robot": names,
+        "site": names,
+        "recording_id": drives,
+        "episode_id": [f"{drive}/{one}" for drive, one in zip(drives, episode, strict=True)],
+        "start_time": np.array(WEEKS, "datetime64[us]")[week],
+        "condition": ["wheel_slip"] * len(names),
+        "zone": pa.nulls(len(names), pa.string()),
+        "driven_h": np.ones(len(names)),
+        "steps": np.zeros(len(names), int),
+        "events": rng.poisson(rate).ravel(),
+    }
+    nothing = samples({("none", "none", 0): [np.ones(1)]})
+    connection = of_samples(nothing, pa.table(conditions))
     found = rows(connection, "FROM drift WHERE part = 'conditions' AND period = '2026-03-23'")
     assert len(found) == 300
     alarms = sum(row["p"] < 0.05 for row in found)
