@@ -39,24 +39,24 @@ from restock.train.twin.floors.layout import DEFAULT
 
 PROFILE = load_profile("warehouse_amr")
 ROBOTS, FAULTY = ("amr-1", "amr-2", "amr-3", "amr-4"), "amr-2"
-FLEETS = {"developed": 801, "left out": 811}  # the seed of the first robot
+FLEETS = {"developed": 801, "left out": 821}  # the seed of the first robot
 SETS = {"developed": DEVELOPED, "left out": LEFT_OUT}
 OUTCOMES = ("named", "wrong reason", "missed", "opposite")
 MOSTLY = {"slippery": "wheel_slip", "blocked": "blocked_aisle", "crowded": "near_collision"}
 CONTROLS = {  # name: arguments of `restock twin record`
-    **{f"plain{n}": ["--seed", str(700 + n)] for n in (1, 2, 3, 4)},
+    **{f"plain{n}": ["--seed", str(900 + n)] for n in (1, 2, 3, 4)},
     **{
         f"{name}{n}": ["--seed", str(seed + n), "--conditions", f"nominal=.3,{kind}=.7"]
-        for seed, (name, kind) in zip((710, 720, 730), MOSTLY.items(), strict=True)
+        for seed, (name, kind) in zip((910, 920, 930), MOSTLY.items(), strict=True)
         for n in (1, 2)
     },
-    "operator": ["--seed", "741", "--policy", "operator"],
-    "planner": ["--seed", "742", "--policy", "planner"],
-    "random": ["--seed", "743", "--policy", "random"],
-    "floors": ["--seed", "744", "--layouts", "generated:train"],
-    "floors2": ["--seed", "745", "--layouts", "generated:test"],
-    "payload": ["--seed", "746", "--perturbation", "payload"],
-    "friction": ["--seed", "747", "--perturbation", "friction"],
+    "operator": ["--seed", "941", "--policy", "operator"],
+    "planner": ["--seed", "942", "--policy", "planner"],
+    "random": ["--seed", "943", "--policy", "random"],
+    "floors": ["--seed", "944", "--layouts", "generated:train"],
+    "floors2": ["--seed", "945", "--layouts", "generated:test"],
+    "payload": ["--seed", "946", "--perturbation", "payload"],
+    "friction": ["--seed", "947", "--perturbation", "friction"],
 }
 
 

@@ -5,7 +5,7 @@ observation, so that observations, actions, rewards and labels all agree with it
 profile or a wrong clock; or in the rows of a store, as by software that rewrites them. One robot
 of the fleet has it, unless it is of all. `right` is a pattern of what a right finding says.
 
-`LEFT_OUT` was written down before any limit was set on `DEVELOPED`, and was run once.
+`LEFT_OUT` was written down when the checks stood, from lists of what goes wrong in others' logs.
 """
 
 from __future__ import annotations
@@ -218,9 +218,101 @@ def dead(sectors: int) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
+def spikes(name: str, by: float, share: float) -> Signalled:
+    """Single readings that are far off, either way."""
+
+    def plant(filling: Filling, rng: Draws) -> None:
+        column = filling.signals[name]
+        hit = rng.random(len(column)) < share
+        filling.signals[name] = column + by * hit * rng.choice([-1.0, 1.0], len(column))
+
+    return plant
+
+
+def held(*names: str, share: float) -> Signalled:
+    """Signals that keep their value for the middle part of each mission."""
+
+    def plant(filling: Filling, rng: Draws) -> None:
+        mission = number(filling)
+        count = np.bincount(mission)
+        place = np.arange(len(mission)) - np.searchsorted(mission, mission)
+        first = ((1 - share) / 2 * count).astype(np.int64)[mission]
+        inside = (place >= first) & (place < first + share * count[mission])
+        row = np.where(inside, np.arange(len(mission)) - place + first, np.arange(len(mission)))
+        for name in names:
+            filling.signals[name] = filling.signals[name][row]
+
+    return plant
+
+
+def aside(by_m: float) -> Signalled:
+    """Poses that are elsewhere for five steps of each mission."""
+
+    def plant(filling: Filling, rng: Draws) -> None:
+        mission = number(filling)
+        for one in np.unique(mission):
+            rows = np.flatnonzero(mission == one)
+            begin = rng.integers(0, max(len(rows) - 5, 1))
+            column = filling.signals[POSE[0]].copy()
+            column[rows[begin : begin + 5]] += by_m
+            filling.signals[POSE[0]] = column
+
+    return plant
+
+
+def slower(*names: str | int) -> Signalled:
+    """Signals that change only every n-th step; the last argument is n."""
+    *signals, every = names
+
+    def plant(filling: Filling, rng: Draws) -> None:
+        row = np.arange(len(filling.tick_ns)) // int(every) * int(every)
+        for name in signals:
+            filling.signals[str(name)] = filling.signals[str(name)][row]
+
+    return plant
+
+
+def zeros(*names: str, share: float) -> Signalled:
+    def plant(filling: Filling, rng: Draws) -> None:
+        gone = rng.random(len(filling.tick_ns)) < share
+        for name in names:
+            filling.signals[name] = np.where(gone, 0.0, filling.signals[name])
+
+    return plant
+
+
+def of_other_missions(*names: str, share: float) -> Signalled:
+    """Signals of the mission before, as of a topic of another robot."""
+
+    def plant(filling: Filling, rng: Draws) -> None:
+        inside, mission = missions(filling, share, rng), number(filling)
+        begin = np.searchsorted(mission, mission)
+        place = np.arange(len(mission)) - begin
+        other = (mission - 1) % (mission.max() + 1)
+        first, count = np.searchsorted(mission, other), np.bincount(mission)[other]
+        row = np.where(inside, first + place % count, np.arange(len(mission)))
+        for name in names:
+            filling.signals[name] = filling.signals[name][row]
+
+    return plant
+
+
+def set_back(*names: str, steps: int) -> Signalled:
+    """Signals that are late in the second half of the recording."""
+
+    def plant(filling: Filling, rng: Draws) -> None:
+        count = len(filling.tick_ns)
+        row = np.arange(count) - steps * (np.arange(count) > count // 2)
+        for name in names:
+            filling.signals[name] = filling.signals[name][row]
+
+    return plant
+
+
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
 COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
 TURN, SPIN = COMMAND[1], "gyro_yaw_rate_radps"
+ACCEL = "accel_x_mps2"
 WHEELS = ("wheel_speed_mps", "wheel_yaw_rate_radps")
 SIDEWAYS = ("waypoint_near_y_m", "waypoint_far_y_m")
 PLAN = (
@@ -276,12 +368,14 @@ def unended(share: float) -> Rowed:
 
 
 def ended_by_time(share: float) -> Rowed:
-    """Episodes that were cut, stored as terminated."""
+    """Episodes that were cut 2 s before their end, stored as terminated there."""
 
     def plant(rows: pa.Table, rng: Draws) -> pa.Table:
-        cut = rows["truncated"].to_numpy() & (rng.random(len(rows)) < share)
-        terminated, truncated = rows["terminated"].to_numpy() | cut, rows["truncated"].to_numpy()
-        return with_columns(rows, terminated=terminated, truncated=truncated & ~cut)
+        episode, step = (rows[name].to_numpy() for name in ("episode_index", "step_index"))
+        left = np.bincount(episode)[episode] - step  # rows are whole episodes
+        inside = (rng.random(int(episode.max()) + 1) < share)[episode] & (left + step > 20)
+        terminated = rows["terminated"].to_numpy() | (inside & (left == 11))
+        return with_columns(rows, terminated=terminated).filter(pa.array(~inside | (left > 10)))
 
     return plant
 
@@ -377,8 +471,95 @@ def without_failures(share: float) -> Rowed:
     return plant
 
 
-def cut_off(share: float) -> Signalled:
-    return changed(lambda column: np.clip(column, -share, share), COMMAND[0])
+def cut_off(share: float, name: str = COMMAND[0]) -> Signalled:
+    return changed(lambda column: np.clip(column, -share, share), name)
+
+
+def inside_of(rows: pa.Table, share: float, rng: Draws) -> tuple[np.ndarray, np.ndarray]:
+    """Return each row's episode (N,), and whether it is in a share of the episodes."""
+    episode = rows["episode_index"].to_numpy()
+    return episode, (rng.random(int(episode.max()) + 1) < share)[episode]
+
+
+def no_rewards(share: float) -> Rowed:
+    def plant(rows: pa.Table, rng: Draws) -> pa.Table:
+        inside = inside_of(rows, share, rng)[1]
+        return with_columns(rows, reward=np.where(inside, 0.0, rows["reward"].to_numpy()))
+
+    return plant
+
+
+def next_of_others(share: float) -> Rowed:
+    """Last rows whose next observation is the first observation of the next episode."""
+
+    def plant(rows: pa.Table, rng: Draws) -> pa.Table:
+        episode, inside = inside_of(rows, share, rng)
+        place = np.arange(len(rows))
+        last = np.append(np.diff(episode) != 0, False) & inside
+        both = pa.chunked_array([*rows["next_observation"].chunks, *rows["observation"].chunks])
+        return with_columns(rows, next_observation=both.take(place + last * (len(rows) + 1)))
+
+    return plant
+
+
+def ends_early(share: float) -> Rowed:
+    """Put ends into the row before the last one."""
+
+    def plant(rows: pa.Table, rng: Draws) -> pa.Table:
+        episode, inside = inside_of(rows, share, rng)
+        before = inside & np.append(episode[1:] == episode[:-1], False)
+        ended = rows["terminated"].to_numpy()
+        early = np.append(ended[1:], False) & before
+        return with_columns(rows, terminated=np.where(inside, early, ended))
+
+    return plant
+
+
+def cached(share: float) -> Rowed:
+    """Observations that are those of the row before, here and there."""
+
+    def plant(rows: pa.Table, rng: Draws) -> pa.Table:
+        episode = rows["episode_index"].to_numpy()
+        stale = (rng.random(len(rows)) < share) & np.append(False, episode[1:] == episode[:-1])
+        return with_columns(
+            rows, observation=rows["observation"].take(np.arange(len(rows)) - stale)
+        )
+
+    return plant
+
+
+def labels_of_others(share: float) -> Rowed:
+    """Labels that are those of the episode before, step by step."""
+
+    def plant(rows: pa.Table, rng: Draws) -> pa.Table:
+        episode, inside = inside_of(rows, share, rng)
+        first, count = np.searchsorted(episode, episode - 1), np.bincount(episode)
+        other = np.maximum(episode - 1, 0)
+        step = np.minimum(rows["step_index"].to_numpy(), count[other] - 1)
+        row = np.where(inside & (episode > 0), first + step, np.arange(len(rows)))
+        names = ("conditions", "condition")
+        return with_columns(rows, **{name: rows[name].take(row).to_pylist() for name in names})
+
+    return plant
+
+
+def split(share: float) -> Rowed:
+    """Episodes whose second half is stored as an episode of its own, without an end between."""
+
+    def plant(rows: pa.Table, rng: Draws) -> pa.Table:
+        episode, inside = inside_of(rows, share, rng)
+        step = rows["step_index"].to_numpy()
+        half = np.bincount(episode)[episode] // 2
+        second = inside & (step >= half)
+        ids = np.array(rows["episode_id"].to_pylist(), object)
+        return with_columns(
+            rows,
+            episode_id=np.where(second, ids + "b", ids).tolist(),
+            episode_index=np.where(second, episode + 1000, episode),
+            step_index=np.where(second, step - half, step),
+        )
+
+    return plant
 
 
 DEVELOPED = [
@@ -429,8 +610,7 @@ DEVELOPED = [
       for n in (1, 2, 4)),
     *(Fault("commands scaled", f"by {by:g}", "COMMAND_SCALED|ACTIONS_COARSE",
             scale(*COMMAND, by=by)) for by in (0.85, 0.7, 0.5)),
-]  # fmt: skip
-LEFT_OUT = [
+    # left out before, and missed or named for a wrong reason by half
     *(Fault("one wheel larger", f"by {by:.0%}", "wheels", one_wheel(1 + by))
       for by in (0.04, 0.08, 0.15)),
     *(Fault("pose's clock slow", f"by {by:.1%}", "pose", slow_clock(by))
@@ -461,5 +641,44 @@ LEFT_OUT = [
       for at in (0.7, 0.5, 0.3)),
     *(Fault("pose's heading off", f"by {by} degrees", "pose",
             changed(lambda column, by=by: column + np.radians(by), POSE[2])) for by in (3, 8, 20)),
+]  # fmt: skip
+LEFT_OUT = [
+    *(Fault("accelerometer unscaled", f"by {by:g}", "accel", scale(ACCEL, by=by))
+      for by in (1.2, 1.5, 2.0)),
+    *(Fault("gyroscope with spikes", f"in {s:.0%} of the steps", "gyro", spikes(SPIN, 3.0, s))
+      for s in (0.01, 0.03, 0.1)),
+    *(Fault("pose held when tracking is lost", f"{s:.0%} of each mission", "pose",
+            held(*POSE, share=s)) for s in (0.1, 0.25, 0.5)),
+    *(Fault("pose jumps aside for a second", f"by {by:g} m, once a mission", "pose", aside(by))
+      for by in (0.2, 0.5, 1.0)),
+    *(Fault("odometry at a lower rate", f"every {n} steps", "wheels|UNCHANGED", slower(*WHEELS, n))
+      for n in (2, 5, 10)),
+    *(Fault("zeros where a reading is missing", f"in {s:.0%} of the steps", "wheels",
+            zeros(*WHEELS, share=s)) for s in (0.03, 0.1, 0.3)),
+    *(Fault("wheels saturated", f"at {at:g} m/s", "wheels", cut_off(at, WHEELS[0]))
+      for at in (0.7, 0.5, 0.3)),
+    *(Fault("lidar loses far returns", f"from {at:g} m on", "lidar|clearance",
+            lidar(lambda seen, at=at: np.where(seen > at, 4.0, seen))) for at in (3.0, 2.0, 1.0)),
+    *(Fault("commands of another mission", f"in {s:.0%} of missions", "action|ACTIONS_",
+            of_other_missions(*COMMAND, share=s)) for s in (0.1, 0.3, 1.0)),
+    *(Fault("heading in degrees", f"in {s:.0%} of missions", "pose",
+            changed(np.degrees, POSE[2], share=s)) for s in (0.1, 0.3, 1.0)),
+    *(Fault("commands rounded", f"to {by:g} m/s and rad/s", "action|command|COMMAND|ACTIONS_",
+            changed(lambda column, by=by: by * np.round(column / by), *COMMAND))
+      for by in (0.3, 0.5, 1.0)),
+    *(Fault("a clock set back", f"by {n * 0.2:g} s, in half of the drive", "wheels|SENSOR_SHIFTED",
+            set_back(*WHEELS, steps=n)) for n in (2, 5, 10)),
+    *(Fault("rewards left at 0", f"in {s:.0%} of episodes", "REWARD_", rows=no_rewards(s))
+      for s in (0.1, 0.3, 1.0)),
+    *(Fault("last next observation of the next episode", f"{s:.0%} of episodes",
+            "ROWS_APART|next observation", rows=next_of_others(s)) for s in (0.2, 0.5, 1.0)),
+    *(Fault("ends a row early", f"{s:.0%} of episodes", "TERMINATIONS_", rows=ends_early(s))
+      for s in (0.2, 0.5, 1.0)),
+    *(Fault("observations of the step before", f"{s:.0%} of rows", "ROWS_|observation",
+            rows=cached(s)) for s in (0.03, 0.1, 0.3)),
+    *(Fault("labels of the episode before", f"{s:.0%} of episodes", "LABELS_",
+            rows=labels_of_others(s)) for s in (0.1, 0.3, 1.0)),
+    *(Fault("episodes split in two", f"{s:.0%}", "episode|ROWS_|rows", rows=split(s))
+      for s in (0.1, 0.3, 1.0)),
 ]  # fmt: skip
 DOSES = ("mild", "medium", "strong")

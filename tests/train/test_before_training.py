@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,75 +89,92 @@ def _late(rows: FedRows) -> FedRows:
     return _acted(rows, np.where(known, rows.action[place], 0))
 
 
-def _degrees(rows: FedRows) -> FedRows:
-    """Return the gyroscope's readings, and the slip that is the wheels' less them."""
-    gyro, slip = map(rows.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
+def _entries(rows: FedRows, change: Callable[..., None], *names: str) -> FedRows:
+    """Return rows whose observations are changed; `change` gets one and the places of `names`."""
+    places = [rows.task.observation_names.index(name) for name in names]
     made = [rows.observation.copy(), rows.next_observation.copy()]
     for held in made:
-        held[:, slip] += held[:, gyro]
-        held[:, gyro] *= 180 / np.pi
-        held[:, slip] -= held[:, gyro]
+        change(held, *places)
     return replace(rows, observation=made[0], next_observation=made[1])
 
 
-def _other_rows(rows: FedRows) -> FedRows:
-    order = np.random.default_rng(0).permutation(len(rows))
-    return replace(rows, next_observation=rows.next_observation[order])
+def _added(rows: FedRows, to: str, of: str, by: float) -> FedRows:
+    def change(held: Any, at: int, other: int) -> None:
+        held[:, at] += by * held[:, other]
+
+    return _entries(rows, change, to, of)
 
 
-def _ahead(rows: FedRows) -> FedRows:
-    return replace(rows, observation=rows.next_observation)
+def _gyroscope(rows: FedRows, by: Any, bias: float = 0.0) -> FedRows:
+    def change(held: Any, gyro: int, slip: int) -> None:
+        read = by * held[:, gyro] + bias
+        held[:, slip] += held[:, gyro] - read
+        held[:, gyro] = read
+
+    return _entries(rows, change, "gyro_yaw_rate", "slip_yaw_rate")
+
+
+def _shuffled(values: Any) -> Any:
+    return np.random.default_rng(0).permutation(values)
 
 
 def _twice(rows: FedRows) -> FedRows:
-    some = rows.episode < 3
-    arrays = {
-        item.name: np.concatenate([value, value[some]])
-        for item in fields(rows)
-        if isinstance(value := getattr(rows, item.name), np.ndarray)
-    }
-    arrays["episode"][len(rows) :] += rows.episode.max() + 1
-    return FedRows(task=rows.task, **arrays)
+    again: Any = np.flatnonzero(rows.episode < 3)
+    both = rows.take(np.append(np.arange(len(rows)), again))
+    both.episode[len(rows) :] += rows.episode.max() + 1
+    return both
 
 
-def _half_swapped(rows: FedRows) -> FedRows:
-    half = np.random.default_rng(0).random(len(rows)) < 0.5
-    return _acted(rows, np.where(half, _swapped(rows).action, rows.action))
+def _lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
+    """Return rows with other clearances (N, S) in m, of which entries are roots."""
+    first = rows.task.observation_names.index("clearance_-175deg")
+    most, count = rows.task.range_max_m, rows.task.sectors
+
+    def put(held: Any) -> None:
+        sectors = slice(first, first + count)
+        seen = change(held[:, sectors] ** 2 * most)
+        held[:, sectors] = np.sqrt(np.clip(seen / most, 0, 1))
+
+    made = _entries(rows, put)
+    before, known = made.before(1)
+    closing = made.sectors() - made.sectors()[before] * known[:, None]
+    made.observation[known, first + count : first + 2 * count] = closing[known]
+    made.next_observation[:, first + count :][:, :count] = made.sectors(after=True) - made.sectors()
+    return made
 
 
-def _lidar_halved(rows: FedRows) -> FedRows:
-    """Return rows whose clearances, of which entries are roots, are half of what they were."""
-    names = rows.task.observation_names
-    sectors = [at for at, name in enumerate(names) if name.startswith(("clearance_", "closing_"))]
-    made = [rows.observation.copy(), rows.next_observation.copy()]
-    for held in made:
-        held[:, sectors] *= np.sqrt(0.5)
-    return replace(rows, observation=made[0], next_observation=made[1])
+def _cut(rows: FedRows) -> FedRows:
+    """Return episodes without their last second, stored as terminated there."""
+    following, known = rows.before(-5)
+    cut = rows.take(known & (rows.episode[following] == rows.episode))
+    return replace(cut, terminated=cut.last)
 
 
 PLANTED: dict[str, tuple[Plant, str]] = {
-    "a gyroscope in degrees": (_degrees, "SENSOR_SCALED"),
-    "a lidar's ranges halved": (_lidar_halved, "LIDAR_SCALED"),
-    "left and right in half of the rows": (_half_swapped, "ACTIONS_MIXED"),
+    "a gyroscope in degrees": (lambda rows: _gyroscope(rows, 180 / np.pi), "SENSOR_SCALED"),
+    "a gyroscope with a bias": (lambda rows: _gyroscope(rows, 1, 0.1), "SENSOR_BIASED"),
+    "a heading 8 degrees off": (lambda rows: _added(rows, "lateral_speed", "localised_speed", 0.14),
+                                "SENSOR_TURNED"),
+    "a lidar's ranges halved": (lambda rows: _lidar(rows, lambda seen: seen / 2), "LIDAR_SCALED"),
+    "left and right in half of the rows": (
+        lambda r: _acted(r, np.where(_shuffled(r.step % 2 > 0), _swapped(r).action, r.action)),
+        "ACTIONS_MIXED"),
     "left and right": (_swapped, "ACTIONS_MIRRORED"),
     "actions .4 s late": (_late, "ACTIONS_SHIFTED"),
-    "actions changed after ingest": (
-        lambda rows: replace(rows, action=_swapped(rows).action),
-        "ACTIONS_CHANGED",
-    ),
+    "actions changed after ingest": (lambda rows: replace(rows, action=_swapped(rows).action),
+                                     "ACTIONS_CHANGED"),
     "rewards twice": (lambda rows: replace(rows, reward=2 * rows.reward), "REWARD_SCALED"),
-    "rewards of other rows": (
-        lambda rows: replace(rows, reward=np.random.default_rng(0).permutation(rows.reward)),
-        "REWARD_",
-    ),
-    "terminations": (
-        lambda rows: replace(rows, terminated=np.zeros(len(rows), np.bool_)),
-        "TERMINATIONS_LOST",
-    ),
-    "next observations of other rows": (_other_rows, "ROWS_APART"),
-    "observations of the step after": (_ahead, "FUTURE_IN_OBSERVATION"),
+    "rewards of other rows": (lambda rows: replace(rows, reward=_shuffled(rows.reward)), "REWARD_"),
+    "terminations": (lambda rows: replace(rows, terminated=rows.terminated & False),
+                     "TERMINATIONS_LOST"),
+    "time-outs as terminations": (_cut, "TERMINATIONS_WRONG"),
+    "next observations of other rows": (
+        lambda rows: replace(rows, next_observation=_shuffled(rows.next_observation)),
+        "ROWS_APART"),
+    "observations of the step after": (
+        lambda rows: replace(rows, observation=rows.next_observation), "FUTURE_IN_OBSERVATION"),
     "episodes twice": (_twice, "EPISODES_REPEATED"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("with_twin", [True, False])
@@ -173,8 +190,8 @@ def test_sound_rows_are_healthy(logs: FedRows, twin: FedRows, with_twin: bool) -
 def test_what_is_wrong_is_named(logs: FedRows, twin: FedRows, fault: str) -> None:
     plant, cause = PLANTED[fault]
     for against in (twin, None):
-        if against is None and cause == "LIDAR_SCALED":
-            continue  # nothing else in the rows gives a distance
+        if against is None and cause in ("LIDAR_SCALED", "SENSOR_BIASED"):
+            continue  # nothing else in the rows gives a distance, or a zero
         found = diagnose_rows(plant(logs), against, "there is none")
         assert found.verdict == "BUFFER"
         assert found.findings[0].cause.startswith(cause)
@@ -226,13 +243,7 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(kind, tagged, part, lo
     assert (
         compared.note == f"3 {kind} with 500 rows were compared: {several} of {several} recordings"
     )
-    first, slip = map(logs.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
-    wrong = third == "r2"
-    made = [fleet.observation.copy(), fleet.next_observation.copy()]
-    for held in made:
-        held[wrong, slip] -= 0.5 * held[wrong, first]
-        held[wrong, first] *= 1.5
-    found = diagnose_rows(replace(fleet, observation=made[0], next_observation=made[1]), twin)
+    found = diagnose_rows(_gyroscope(fleet, np.where(third == "r2", 1.5, 1.0)), twin)
     assert [one.cause for one in found.findings] == ["SENSOR_SCALED"]
     assert f"in 1 of 3 {kind} ({part}): the scale of the logs' gyroscope is 1." in (
         found.findings[0].text
@@ -241,21 +252,56 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(kind, tagged, part, lo
     assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
 
 
-def test_a_wheel_radius_off_in_one_robot_is_named(logs, twin):
-    """Check that 8 % of one robot's wheels are found: two sensors of one motion must agree."""
-    robot = np.array([f"r{one}" for one in logs.episode % 3])
-    fleet = replace(logs, recording=robot, robot=robot)
-    made = [logs.observation.copy(), logs.next_observation.copy()]
-    for held in made:
-        held[robot == "r1", logs.task.observation_names.index("wheel_speed")] *= 0.92
-    worn = replace(fleet, observation=made[0], next_observation=made[1])
-    found = diagnose_rows(worn, twin, files={"r1": "monday.mcap"})
-    (one,) = [one for one in found.findings if one.cause == "SENSOR_SCALED"]
-    assert (
-        "in 1 of 3 robots (robot r1: monday.mcap): the scale of the logs' wheels (speed) is 0.92"
-        in one.text
-    )
-    assert one.evidence == ("gain: speed of the pose to the wheels, robot r1",)
+def _drivers(rows: FedRows, *names: str) -> Any:
+    return np.array(names)[rows.episode // 3 % 2]
+
+
+def _of_one(rows: FedRows, plant: Plant) -> FedRows:
+    """Plant a fault in the second of three robots, each with two drivers."""
+    robot = np.array([f"r{one}" for one in rows.episode % 3])
+    driver = _drivers(rows, "planner", "operator")
+
+    def without_proposal(held: Any, *places: int) -> None:
+        held[np.ix_(driver == "operator", places)] = 0
+
+    rows = _entries(rows, without_proposal, "nav_known", "nav_speed", "nav_yaw_rate")
+    counted = np.full((len(rows), 2), len(rows))
+    rows = replace(rows, recording=robot, robot=robot, driver=driver, counted=counted)
+    faulty = plant(rows)
+
+    def of_both(name: str) -> Any:
+        sound, new = getattr(rows, name), getattr(faulty, name)
+        return np.where((robot == "r1").reshape(-1, *[1] * (sound.ndim - 1)), new, sound)
+
+    names = ("observation", "next_observation", "pose", "driver", "counted")
+    return replace(rows, **{name: of_both(name) for name in names})
+
+
+OF_ONE: dict[str | None, tuple[Plant, str]] = {
+    None: (lambda rows: rows, ""),
+    "wheels": (lambda rows: _added(rows, "wheel_speed", "wheel_speed", -0.08),
+               "the scale of the logs' wheels (speed) is 0.92"),
+    "short": (lambda rows: _lidar(rows, lambda seen: seen - 0.25), "lidar measures -0.2"),
+    "blind": (lambda rows: _lidar(rows, lambda seen: np.where(np.arange(36) < 9, 4.0, seen)),
+              "racks and walls in 25% of its sectors (degrees from ahead: -175,"),
+    "elsewhere": (lambda r: replace(r, pose=r.pose + np.outer(r.episode % 2, [1, 1, 0])),
+                  "lidar does not see the racks where the pose has them"),
+    "drivers": (lambda rows: replace(rows, driver=_drivers(rows, "operator", "planner")),
+                "drive as another policy"),
+    "lost": (lambda rows: replace(rows, counted=np.add(rows.counted, [40, 0])),
+             "of the rows that were written of these recordings are gone"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", OF_ONE)
+def test_a_fault_of_one_robot_is_named_and_nothing_else(logs, twin, fault):
+    plant, said = OF_ONE[fault]
+    fleet, floors = _of_one(logs, plant), floors_of("default")
+    found = diagnose_rows(fleet, twin, files={"r1": "monday.mcap"}, floors=floors)
+    texts = [one.text for one in found.findings]
+    start = "in 1 of 3 robots (robot r1: monday.mcap): "
+    assert all(text.startswith(start) for text in texts)
+    assert [said in text for text in texts] == [True] * (fault is not None)
 
 
 def test_a_check_in_many_parts_is_corrected_for_their_number():
@@ -296,11 +342,11 @@ def test_racks_elsewhere_than_on_the_twins_floor_are_named(tuesday):
 
 def test_goals_of_other_missions_are_no_scale_of_the_plan(tuesday):
     rows = tuesday.rows
-    place = rows.task.observation_names.index("goal_distance")
-    made = [rows.observation.copy(), rows.next_observation.copy()]
-    for held in made:  # the robot drives away from them
+
+    def away(held: Any, place: int) -> None:  # the robot drives away from them
         held[rows.episode % 2 == 0, place] = 0.95 - held[rows.episode % 2 == 0, place]
-    found = diagnose_rows(replace(rows, observation=made[0], next_observation=made[1]), None)
+
+    found = diagnose_rows(_entries(rows, away, "goal_distance"), None)
     assert "GOALS_OF_OTHERS" in {one.cause for one in found.findings}
     assert not any("plan is" in one.text for one in found.findings)
     (one,) = [one for one in found.findings if one.cause == "GOALS_OF_OTHERS"]
@@ -411,7 +457,7 @@ def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None
     logs, store = ROOT / "sample_logs/amr_tuesday", StoreWriter(tmp_path / "store")
     ingest(logs, load_profile("warehouse_amr"), store=store)
     as_stored = open_rows(tmp_path / "store")
-    assert _is_in_order(as_stored.rows)
+    assert (np.diff(as_stored.rows.logged_ns)[as_stored.rows.joined[1:]] > 0).all()
     compared = {row.check: row for row in as_stored.comparisons}
     assert len(compared) > 3
     assert {row.status for row in compared.values()} <= {"ok", "not run"}
@@ -445,7 +491,7 @@ def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> Non
     meta = panel.meta
     _rewrite(panel, condition=["blocked_aisle"] * len(meta))
     opened = open_rows(panel.path)
-    assert _is_in_order(opened.rows)
+    assert (np.diff(opened.rows.logged_ns)[opened.rows.joined[1:]] > 0).all()
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
     (finding,) = [one for one in found if one.cause.startswith("LABELS_")]
     assert finding.cause == "LABELS_CHANGED"
@@ -454,11 +500,6 @@ def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> Non
     _rewrite(panel, action=[99, *meta["action"].to_pylist()[1:]])
     with pytest.raises(PanelError, match=r"has action 99, and the task has actions 0 to \d"):
         open_rows(panel.path)
-
-
-def _is_in_order(rows: FedRows) -> bool:
-    """Whether each step of an episode was logged after the one before."""
-    return bool((np.diff(rows.logged_ns)[rows.joined[1:]] > 0).all())
 
 
 def _rewrite(panel: Panel, **columns: list[Any]) -> None:

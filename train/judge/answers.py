@@ -52,15 +52,16 @@ class Response:
         gain = (xy @ kernel) / np.maximum(moved, 1e-12)
         noise = self.unexplained * self.moments[:, -1, -1].sum() / self.rows
         sure = moved > _SURELY**2 * max(noise, 1e-12)
-        return int((gain < _ANSWERS)[sure].sum()), int(sure.sum())
+        known = sure.sum() >= MIN_CLUSTERS
+        return int((gain < _ANSWERS)[sure].sum() * known), int(sure.sum() * known)
 
 
 def fit_response(
-    x: F64, y: F64, cluster: Ints, lags: Ints, rng: np.random.Generator
+    x: F64, y: F64, cluster: Ints, lags: Ints, rng: np.random.Generator, *, centred: bool = False
 ) -> Response | None:
     """Fit the response of y (n,) to x (n, L) at `lags` (L,); None if too little is known.
 
-    Rows with a value that is not finite are left out.
+    Rows with a value that is not finite are left out. `centred`: to x and a constant.
     """
     known = np.isfinite(y) & np.isfinite(x).all(axis=1)
     x, y = x[known], y[known]
@@ -81,7 +82,11 @@ def fit_response(
         axis=1,
     )  # (C, W * W)
     counts = np.concatenate([np.ones((1, clusters)), cluster_counts(clusters, RESAMPLES, rng)])
-    drawn = (counts @ moments).reshape(-1, width, width)
+    drawn: F64 = (counts @ moments).reshape(-1, width, width)
+    rows = np.maximum(counts @ count, 1).astype(np.float64)[:, None]
+    mean = (counts @ sums) / rows
+    if centred:
+        drawn = drawn - rows[..., None] * mean[:, :, None] * mean[:, None, :]
     xx, xy, yy = drawn[:, :-1, :-1], drawn[:, :-1, -1], drawn[:, -1, -1]
     ridge = _RIDGE * np.trace(xx, axis1=1, axis2=2) / (width - 1)
     ridge = np.where(ridge > 0.0, ridge, ridge[0])  # a draw may have only clusters without a change
@@ -91,7 +96,6 @@ def fit_response(
     delay = (h * lags).sum(axis=1) / safe
     left = yy - 2 * (h * xy).sum(axis=1) + np.einsum("ri,rij,rj->r", h, xx, h)
     unexplained = np.clip(left / np.maximum(yy, 1e-12), 0.0, None)
-    mean = (counts @ sums) / np.maximum(counts @ count, 1)[:, None]
     offset = mean[:, -1] - (h * mean[:, :-1]).sum(axis=1)
     return Response(
         len(y), clusters, float(gain[0]), float(delay[0]), float(unexplained[0]),
@@ -137,6 +141,7 @@ WHEEL_SPEED, WHEEL_TURN = "wheels (speed)", "wheels (turn)"
 POSE, GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "pose", "gyroscope", "accelerometer", "plan", "lidar"
 COMMANDS = np.arange(-4, 8)  # lags of commands: robots answer late, logs may be wrong either way
 SENSORS = np.arange(-3, 4)
+PLANS = np.arange(-3, 7)
 NOW = np.zeros(1, np.int64)
 _JUMP_RAD = 0.8  # a plan was replaced, not turned
 _SLOW_MPS = 0.3  # slower than this a waypoint's bearing changes by turning, not by driving past it
@@ -152,7 +157,9 @@ GAIN = 1.2  # of logs over the twin's, or its inverse: robots answer differently
 ALIKE = 1.05  # of two sensors that measure one motion
 BESIDE = 1.02  # the same beside the other robots' or recordings'
 BIAS_RADPS, TURN_RADPS = 0.02, 0.06  # of a turn by one sensor where another, or an action, has none
+SIDEWAYS = 0.06  # of the way forward, about 3 degrees
 STRAYED = 0.05  # of the missions
+_STRAIGHT_RADPS = 0.15
 
 
 @dataclass(frozen=True)
@@ -164,7 +171,7 @@ class Relation:
     y: str
     lags: Ints
     of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
-    gain: float | None = 1.0  # by definition, where there is no twin to ask
+    gain: float | None = 1.0  # by definition, where there is no twin to ask; 0: in no twin either
     most: float = GAIN  # times the twin's gain, or its inverse
     offset: float = math.inf  # most of y where x is 0, less the twin's, in y's unit
 
@@ -179,7 +186,9 @@ class Relation:
             cluster = np.repeat(rows.cluster, x.shape[1])
             return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
         before = [rows.before(int(lag)) for lag in self.lags]
-        return fit_response(lagged(x, before), y, rows.cluster, self.lags, rng)
+        return fit_response(
+            lagged(x, before), y, rows.cluster, self.lags, rng, centred=self.offset < math.inf
+        )
 
     def slip_to_leave_out(self, rows: FedRows) -> SlipLeftOut:
         """Return which logged rows to leave out, so that the robot is not blamed for a wet floor.
@@ -207,7 +216,16 @@ def _left_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
 
 
 def _slips(rows: FedRows) -> Bools:
-    return np.asarray(rows.condition == "wheel_slip", np.bool_)
+    """Return which rows (N,) are labelled so, if they mostly move less or more than the wheels.
+
+    Who moves as far, but not where the pose heads, does not slip.
+    """
+    labelled = rows.condition == "wheel_slip"
+    moved = np.hypot(rows.after("localised_speed"), rows.after("lateral_speed"))
+    unlike = np.abs(np.abs(rows.after("wheel_speed")) - moved) > rows.task.slip_limit_mps / 2
+    episode = np.unique(rows.episode, return_inverse=True)[1].reshape(-1)
+    slips = 2 * np.bincount(episode, labelled & unlike) >= np.bincount(episode, labelled)
+    return np.asarray(labelled & slips[episode], np.bool_)
 
 
 def _near_slip(rows: FedRows) -> Bools:
@@ -239,6 +257,22 @@ def _on_ice(rows: FedRows, moves: F64) -> Bools:
 
 def _wheel_turn(rows: FedRows) -> F64:
     return rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
+
+
+def _pose_turn(rows: FedRows) -> F64:
+    """Return the yaw rate (rad/s) of the pose's heading to the row after; NaN if unknown."""
+    if rows.pose is None:
+        return np.full(len(rows), np.nan)
+    after, known = rows.before(-1)
+    turn = (rows.pose[after, 2] - rows.pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return np.where(known, turn, np.nan) / rows.task.control_period_s
+
+
+def _sideways(rows: FedRows) -> tuple[F64, F64]:
+    """Return the pose's speed forward and sideways, of rows that drive straight on."""
+    forward, aside = rows.after("localised_speed"), rows.after("lateral_speed")
+    straight = np.abs(rows.after("gyro_yaw_rate")) < _STRAIGHT_RADPS
+    return forward, np.where(straight & (aside != 0.0), aside, np.nan)  # 0: there was no new pose
 
 
 def _gained(rows: FedRows) -> F64:
@@ -302,11 +336,15 @@ RELATIONS = (
     Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
              lambda rows: (rows.after("gyro_yaw_rate"), _wheel_turn(rows)),
              most=ALIKE, offset=BIAS_RADPS),
+    Relation("yaw rate of the pose to the gyroscope", GYROSCOPE, POSE, SENSORS,
+             lambda rows: (rows.after("gyro_yaw_rate"), _pose_turn(rows)), offset=BIAS_RADPS),
+    Relation("motion of the pose to its heading", POSE, POSE, NOW, lambda rows: _sideways(rows),
+             0.0, SIDEWAYS),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
              lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
              lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), None),
-    Relation("remaining distance to the speed of the pose", POSE, PLAN, SENSORS,
+    Relation("remaining distance to the speed of the pose", POSE, PLAN, PLANS,
              lambda rows: (rows.after("localised_speed"), _route_speed(rows)), None),
     Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
              lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), None),
@@ -374,6 +412,11 @@ def _answer(
         of_twin[kept] = relation.fit(twin, rng, leave_out)
     expected = of_twin.get(kept)
     name, what = relation.name, f"answer of the {relation.name}"
+    if found is not None and relation.gain == 0.0:
+        turned = interval_of(found.gain, found.gains, found.clusters)
+        row = judged(f"turn: {name}", what, "difference", turned, logs=found.gain, twin=0.0,
+                     least=-relation.most, most=relation.most, logs_rows=found.rows)  # fmt: skip
+        return Answer(relation, (row,), 1.0, 0.0)
     if found is None or (twin is not None and expected is None):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")
         return Answer(relation, (not_run(f"gain: {name}", what, reason),), float("nan"), 0.0)

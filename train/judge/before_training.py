@@ -47,7 +47,7 @@ from restock.train.judge.fed_rows import (
     of_store,
     over_parts,
 )
-from restock.train.judge.mission_checks import mission_checks, with_missions
+from restock.train.judge.mission_checks import POSE, mission_checks, with_missions
 from restock.train.judge.row_checks import fed_labels, outcomes, row_order, stored, values
 from restock.train.run.run_profile import carried_profile, profile_of_panel
 from restock.train.twin.calibration.logged_steps import logged_steps
@@ -319,6 +319,7 @@ def _rows(
         logged_ns=np.zeros(len(episode), np.int64),
         condition=_labels(conditions, chosen, episode, step),
         transition_id=np.arange(len(episode), dtype=np.int64),
+        pose=np.stack([chosen["now " + name] for name in POSE], axis=1),
     )
 
 
@@ -447,7 +448,7 @@ class _Checked:
     @classmethod
     def of(
         cls, rows: FedRows, twin: FedRows | None, seed: int, of_twin: TwinFits,
-        more: Sequence[Comparison | Flags], floors: Sequence[Warehouse],
+        more: Sequence[Comparison | Flags], floors: Sequence[Warehouse], others: FedRows | None,
     ) -> _Checked:  # fmt: skip
         elsewhere = [one.of(rows) if isinstance(one, Flags) else one for one in more]
         return cls(
@@ -457,7 +458,7 @@ class _Checked:
                 *outcomes(rows, twin, seed),
                 *row_order(rows),
                 *values(rows, twin, seed),
-                *mission_checks(rows, twin, floors),
+                *mission_checks(rows, twin, floors, others),
                 *elsewhere,
             ],
         )
@@ -493,7 +494,13 @@ def diagnose_rows(
     """
     parts, compared = parts_of(rows)
     of_twin: TwinFits = {}  # the same for every part
-    checked = [_Checked.of(part.rows, twin, seed, of_twin, more, floors) for part in parts]
+    checked = [
+        _Checked.of(
+            part.rows, twin, seed, of_twin, more, floors,
+            rows.take(~np.isin(rows.transition_id, part.rows.transition_id)) if part.name else None,
+        )
+        for part in parts
+    ]  # fmt: skip
     for kind in {part.kind for part in parts[1:]}:
         inside = [place for place, part in enumerate(parts) if part.kind == kind]
         beside = zip(*(checked[place].answers for place in inside), strict=True)

@@ -7,19 +7,21 @@ share is at fault.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from statistics import median
+from typing import Any
+
+import msgspec
 
 from restock.ingest.task.task import Task
 from restock.train.judge.answers import (
-    ACCELEROMETER,
     ACTION_SPEED,
     ACTION_TURN,
     DELAY_STEPS,
     GAIN,
-    GYROSCOPE,
-    LIDAR,
     PLAN,
     POSE,
     WHEEL_SPEED,
@@ -30,54 +32,13 @@ from restock.train.judge.fed_rows import Comparison
 from restock.train.judge.mission_checks import CHOSEN
 
 GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
-_KEYS = {  # where a profile says what fills it
-    ACTION_SPEED: "[inputs.command] fields.speed_mps",
-    ACTION_TURN: "[inputs.command] fields.yaw_rate_radps",
-    "actions": "[inputs.command]",
-    WHEEL_SPEED: "[inputs.wheels] fields.speed_mps",
-    WHEEL_TURN: "[inputs.wheels] fields.yaw_rate_radps",
-    "wheels": "[inputs.wheels]",
-    GYROSCOPE: "[inputs.imu] fields.yaw_rate_radps",
-    POSE: "[inputs.pose]",
-    PLAN: "[inputs.plan]",
-    LIDAR: "[inputs.scan]",
-    ACCELEROMETER: "[inputs.imu] fields.accel_x_mps2",
-}
-VALUES = "VALUES_UNLIKE_TWIN"
-_ARRIVAL = ("terminated at the goal", "goal reward")
 GOALS = "GOALS_OF_OTHERS"
-FOLLOW_FROM = {  # checks that are off because an end is
-    GYROSCOPE: ("range: gyro_yaw_rate", "spread: gyro_yaw_rate", "lidar scale"),
-    **dict.fromkeys(
-        (WHEEL_SPEED, "wheels"),
-        ("range: wheel_speed", "spread: wheel_speed", "range: accel_x", "spread: accel_x"),
-    ),
-    POSE: (
-        *("range: localised_speed", "spread: localised_speed", "range: lateral_speed"),
-        *("spread: lateral_speed", "range: goal_distance", "spread: goal_distance", *_ARRIVAL),
-        *("lidar scale", "goals come nearer", "floor"),
-    ),
-    PLAN: ("range: goal_distance", "spread: goal_distance", *_ARRIVAL),
-    ACCELEROMETER: ("range: accel_x", "spread: accel_x"),
-    LIDAR: ("range: clearances", "spread: clearances"),
-}
 _FIRST = (  # nothing can be told of rows before these
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
+_MOST = 0.8  # of the missions: a signal that is wrong in nearly all of them is wrong alike in all
 CHANGED = "ACTIONS_CHANGED"  # then nothing that actions show is the profile's fault
 COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever else is right
-_LABELS = {  # by how the name of their checks, one a condition, begins
-    "fed labels: ": (
-        "LABELS_CHANGED",
-        "labels in the panel differ from those of its store: wrong in",
-        "something changed labels after mixing: make the panel again with `restock mix`",
-    ),
-    "labels: ": (
-        "LABELS_WRONG",
-        "labels differ from what their conditions give on the stored signals: wrong in",
-        "`restock store label STORE` computes them again; corrections by people are kept",
-    ),
-}
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
 _UNITS = (
     ((50.0, 65.0), "degrees in place of radians"),
@@ -121,7 +82,7 @@ def findings(
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
         ends.pop(PLAN, None)  # of another goal, not of another scale
-    follow = {check for end in ends for check in FOLLOW_FROM.get(end, ())}
+    follow = {check for end in ends for check in TABLES.follow.get(end, ())}
     of_rows = [one for one in of_rows if one not in found and not set(one.evidence) <= follow]
     found += [_of_end(end, off, task) for end, off in ends.items()]
     if any(one.cause == COARSE for one in of_rows):
@@ -159,6 +120,8 @@ def _distortion(end: str, off: Sequence[Answer]) -> tuple[float, float]:
     """Return the factor by which an end's values are scaled, and how many steps late they are."""
     ends = GROUPS.get(end, (end,))
     scales, delays = [], []
+    if any(one.is_off("delay") for one in off):  # no scale shows where a delay is not fitted
+        off = [one for one in off if len(one.relation.lags) > 1]
     for one in off:
         is_answer = one.relation.y in ends
         if one.gain == one.gain and one.gain and one.is_off("gain"):
@@ -174,86 +137,37 @@ def _is_shift(scale: float, delay: float) -> bool:
 
 def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     scale, delay = _distortion(end, off)
-    evidence = tuple(row.check for one in off for row in one.comparisons if row.off)
-    seconds = abs(delay) * task.control_period_s
+    rows = [row for one in off for row in one.comparisons if row.off]
+    named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # the first of each figure
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
-    key = _KEYS[end]
-    gain = 1 / scale if scale else float("inf")
+    surely, some, turn = _surely_reversed(off), named.get("missions"), named.get("turn")
+    gain = 1 / scale if scale else math.inf
+    units = ((scale, ""), (gain, "the inverse of "))
+    unit = [f": {inverse}{name}?" for by, inverse in units for (low, high), name in _UNITS
+            if low <= by <= high]  # fmt: skip
+    degrees = math.degrees(math.atan(turn.effect or 0.0)) if turn else 0.0
+    bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
     if is_action and gain < 1 / GAIN:
-        surely = _surely_reversed(off)
-        if surely and gain < -1 / GAIN:
-            return _mirrored(end, evidence)
-        share = (1 - (gain if surely else max(gain, 0))) / 2
-        return Finding(
-            "ACTIONS_MIXED",
-            f"only {max(gain, 0):.0%} of the expected motion follows from the logs' {end}, as if "
-            f"{share:.0%} of the rows had the opposite sign, or {min(1 - gain, 1):.0%} belonged to "
-            "other rows",
-            f"check some recordings one by one: {key} may be right in some and wrong in others "
-            "(robots, firmware), or actions may belong to other rows",
-            evidence,
-        )
-    if scale < 0 and _surely_reversed(off):
-        return Finding(
-            "SENSOR_MIRRORED",
-            f"the sign of the logs' {end} is opposite ({scale:+.2f} of the other signals)",
-            f"change the sign of {key} in the profile (or its frame of reference)",
-            evidence,
-        )
-    if scale > 0 and scale != 1 and not _is_shift(scale, delay):
-        unit = next((name for (low, high), name in _UNITS if low <= scale <= high), "")
-        unit = unit or next(
-            (f"the inverse of {name}" for (low, high), name in _UNITS if low <= 1 / scale <= high),
-            "",
-        )
-        return Finding(
-            "SENSOR_SCALED" if not is_action else "COMMAND_SCALED",
-            f"the scale of the logs' {end} is {scale:.3g} times that of the other signals"
-            + (f": {unit}?" if unit else ""),
-            f"scale {key} in the profile by {1 / scale:.3g}, or calibrate the sensor",
-            evidence,
-        )
-    if _is_shift(scale, delay):
-        late = delay > 0
-        slower = (
-            ""
-            if late or not is_action
-            else " (a robot with a much longer latency than the twin looks the same: `restock "
-            "twin fit` estimates its latency)"
-        )
-        return Finding(
-            "ACTIONS_SHIFTED" if is_action else "SENSOR_SHIFTED",
-            f"the time of the logs' {end} is {seconds:.2g} s ({abs(delay):.1f} steps) "
-            f"{'late' if late else 'early'} compared with the other signals{slower}",
-            f"check the stamps of {key}: `restock info --clocks` shows each topic's clock; use "
-            "the time of measurement, or correct the offset",
-            evidence,
-        )
-    if biases := [row for one in off for row in one.comparisons
-                  if row.off and row.check.startswith("offset")]:  # fmt: skip
-        return Finding(
-            "SENSOR_BIASED",
-            f"the logs' {end} differs by {abs(biases[0].effect or 0.0):.2g} rad/s from the other"
-            " signals also where these show no turn: a bias",
-            f"calibrate the sensor, or correct the zero of {key}",
-            evidence,
-        )
-    if some := [row for one in off for row in one.comparisons
-                if row.off and row.check.startswith("missions")]:  # fmt: skip
-        return Finding(
-            "ACTIONS_MIXED" if is_action else "SENSOR_MIXED",
-            f"in {some[0].logs:.0%} of the missions the logs' {end} does not follow the other"
-            f" signals ({some[0].twin:.0%} in the twin): its sign is opposite there, or it stands"
-            " still, or belongs to other rows",
-            f"check missions one by one: {key} may be right in some and wrong in others",
-            evidence,
-        )
-    return Finding(
-        "UNLIKE_TWIN",
-        f"the relation of the logs' {end} to the other signals is not that of the twin",
-        f"check {key} for values of other rows, outliers or heavy noise",
-        evidence,
-    )
+        kind = "opposite" if surely and gain < -1 / GAIN else "weak"
+    elif scale < 0 and surely:
+        kind = "reversed"
+    elif _is_shift(scale, delay):
+        kind = "early" if is_action and delay < 0 else "shifted"
+    elif some and (some.logs or 0.0) < _MOST:
+        kind = "mixed"
+    elif scale > 0 and scale != 1:
+        kind = "scaled"
+    else:
+        kind = "turned" if turn else "biased" if "offset" in named else "unlike"
+    return TABLES.ends[kind].finding(
+        tuple(row.check for row in rows), end=end, key=TABLES.keys[end], scale=scale, some=some,
+        what="ACTIONS" if is_action else "SENSOR", scaled="COMMAND" if is_action else "SENSOR",
+        way=TABLES.ways.get(end, TABLES.ways["actions"]), unit="".join(unit[:1]), gain=gain,
+        part=max(gain, 0.0), share=(1 - (gain if surely else max(gain, 0.0))) / 2,
+        others=min(1 - gain, 1.0), steps=abs(delay), late="late" if delay > 0 else "early",
+        seconds=abs(delay) * task.control_period_s, degrees=abs(degrees),
+        side="left" if degrees > 0 else "right", bias=abs(bias),
+    )  # fmt: skip
 
 
 def _surely_reversed(off: Sequence[Answer]) -> bool:
@@ -264,35 +178,16 @@ def _surely_reversed(off: Sequence[Answer]) -> bool:
     return bool(gains) and all(row.high is not None and row.high < 0 for row in gains)
 
 
-def _mirrored(end: str, evidence: tuple[str, ...]) -> Finding:
-    what = {
-        ACTION_TURN: "the logs' left is the twin's right",
-        ACTION_SPEED: "the logs' forward is the twin's backward",
-    }.get(end, "the logs' actions are the opposite of the twin's")
-    return Finding(
-        "ACTIONS_MIRRORED",
-        what,
-        f"swap the sign of {_KEYS[end]} in the profile, and ingest the logs again",
-        evidence,
-    )
-
-
 def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Finding:
     evidence = tuple(row.check for row, _, _ in moved)
     mirror = all(
         task.actions[other] == (task.actions[place][0], -task.actions[place][1])
         for _, place, other in moved
     )
-    if mirror:
-        return _mirrored(ACTION_TURN, evidence)
     names = task.action_names
     pairs = "; ".join(f"{names[place]!r} is {names[other]!r}" for _, place, other in moved)
-    return Finding(
-        "ACTIONS_PERMUTED",
-        f"the logs' actions are other actions of the twin: {pairs}",
-        "the logs were made with another table of actions, or other units: use the [task] actions "
-        "of their robot, check [inputs.command], and ingest them again",
-        evidence,
+    return TABLES.ends["opposite" if mirror else "permuted"].finding(
+        evidence, key=TABLES.keys[ACTION_TURN], way=TABLES.ways[ACTION_TURN], pairs=pairs
     )
 
 
@@ -300,170 +195,51 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
     """Return findings of checks that imply their cause; the first one claims a check."""
     left = {row.check: row for row in off}
     found: list[Finding] = []
-    for kind in KINDS:
+    for kind in TABLES.kinds:
         beside = not kind.beside or any(check in left for check in kind.beside)
         if kind.checks[0] in left and beside:
             used = tuple(check for check in kind.checks if check in left)
-            text = kind.text.format(**{name.replace(" ", "_"): row for name, row in left.items()})
-            found.append(Finding(kind.cause, text, kind.remedy, used))
-            for check in used:
-                del left[check]
-    for prefix, (cause, text, remedy) in _LABELS.items():
-        if used := tuple(name for name in left if name.startswith(prefix)):
-            shares = ", ".join(
-                f"{name.removeprefix(prefix)} {left[name].logs:.0%}" for name in used
-            )
-            found.append(Finding(cause, f"{text} {shares}", remedy, used))
+            by_name = {name.replace(" ", "_"): row for name, row in left.items()}
+            found.append(kind.finding(used, **by_name))
             left = {name: row for name, row in left.items() if name not in used}
-    for name in [one for one in left if one.startswith(CHOSEN)]:
-        row, condition = left.pop(name), name.removeprefix(CHOSEN)
-        found.append(
-            Finding(
-                "CHOSEN_ON_OUTCOME",
-                f"{condition} comes from failures: {row.twin:.0%} of its missions succeed, and"
-                f" {row.logs:.0%} of the others that met the same situations: missions that handled"
-                " it well are missing, or not called so",
-                f"keep missions with {condition} that went well, or draw by situation:"
-                ' [each_condition] kind = "exposure" in the mixture',
-                (name,),
-            )
-        )
-    found += [
-        Finding(
-            VALUES,
-            f"{row.what}: {row.logs:.3g} in the logs" + (f" ({row.note})" if row.note else ""),
-            "check the unit and the source of this value in the profile",
-            (name,),
-        )
-        for name, row in left.items()
-    ]
+    for prefix, kind in TABLES.labels.items():
+        if used := tuple(name for name in left if name.startswith(prefix)):
+            each = (f"{name.removeprefix(prefix)} {left[name].logs:.0%}" for name in used)
+            found.append(kind.finding(used, shares=", ".join(each)))
+            left = {name: row for name, row in left.items() if name not in used}
+    for name, row in left.items():
+        kind = TABLES.ends["chosen" if name.startswith(CHOSEN) else "value"]
+        note = f" ({row.note})" if row.note else ""
+        found.append(kind.finding((name,), row=row, of=name.removeprefix(CHOSEN), note=note))
     return found
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A cause that checks of rows imply. `text` has each check's comparison by its name."""
+    """A cause, as `causes.toml` has it."""
 
     cause: str
-    checks: tuple[str, ...]  # the first must be off; the others belong to it
     text: str
     remedy: str
-    beside: tuple[str, ...] = ()  # one of these must be off too
+    checks: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+
+    def finding(self, evidence: tuple[str, ...], **known: Any) -> Finding:
+        """Return the finding of this cause, its words filled in with what is `known`."""
+        cause, text, remedy = (one.format(**known) for one in (self.cause, self.text, self.remedy))
+        return Finding(cause, text, remedy, evidence)
 
 
-KINDS = (
-    Kind(
-        "FUTURE_IN_OBSERVATION",
-        ("foresight", "chain", "unchanged", "previous action", "own action", "closing"),
-        "in {foresight.logs:.0%} of the rows where the action changes, the observation already "
-        "contains the new action: observations are from one step later",
-        "observations must contain only what was known before acting: ingest the logs again",
-        beside=("chain", "unchanged"),
-    ),
-    Kind(
-        "ROWS_APART",
-        ("chain", "unchanged", "closing", "previous action", "own action"),
-        "in {chain.logs:.0%} of the rows the next observation is not the observation of the next "
-        "row: next observations are stale, or belong to other rows",
-        "ingest the logs again; look for software that rewrites rows after ingest",
-    ),
-    Kind(
-        "ROWS_UNCHANGED",
-        ("unchanged", "closing"),
-        "in {unchanged.logs:.0%} of the rows in which the robot moves the next observation is the"
-        " observation itself",
-        "topics may be slower than the control clock: use a longer control_period_s, or record "
-        "them faster",
-    ),
-    Kind(
-        "REWARD_DIFFERENT",
-        ("reward rows", "goal reward", "reward scale"),
-        "{reward_rows.logs:.0%} of the logs' rewards differ from the task's rewards for their "
-        "rows: they may belong to other rows, or to another definition",
-        "ingest the logs again with this profile",
-    ),
-    Kind(
-        "REWARD_SCALED",
-        ("reward scale", "goal reward"),
-        "the logs' rewards are {reward_scale.effect:.3g} times the task's rewards for their rows",
-        "ingest the logs again with this profile, and scale rewards nowhere else",
-    ),
-    Kind(
-        "REWARD_DIFFERENT",
-        ("goal reward",),
-        "reaching the goal earns {goal_reward.logs:.3g} in the logs and {goal_reward.twin:.3g} in "
-        "the twin",
-        "ingest the logs again with this profile",
-    ),
-    Kind(
-        "TERMINATIONS_LOST",
-        ("terminated at the goal", "terminations"),
-        "{terminated_at_the_goal.logs:.0%} of the logs' episodes that end at their goal are "
-        "terminated there: in the others the critic bootstraps beyond the end",
-        "check that the profile's [task] has the robot's goal radius, and ingest the logs again",
-    ),
-    Kind(
-        "TERMINATIONS_WRONG",
-        ("goes on after its end",),
-        "{goes_on_after_its_end.logs:.0%} of the terminated rows are not the last of their episode",
-        "terminations belong to other rows, or episodes were joined: ingest the logs again",
-    ),
-    Kind(
-        CHANGED,
-        ("own action", "previous action", "foresight"),
-        "in {own_action.logs:.0%} of the rows the next observation does not contain the row's own "
-        "action: the `action` column does not match the observations",
-        "something changed actions after ingest: ingest the logs again, and mix the panel again",
-    ),
-    Kind(
-        COARSE,
-        ("far commands",),
-        "{far_commands.logs:.0%} of the commands are more than .25 (of the fastest action) from "
-        "the action that represents them",
-        "give [task] actions that are nearer to the robot's commands, or check the unit of "
-        "[inputs.command]; the audit `far_actions` lists the rows",
-    ),
-    Kind(
-        "LIDAR_TURNED",
-        ("lidar bearing",),
-        "the logs' lidar is rotated by {lidar_bearing.effect:+.0f} degrees against the twin's: "
-        "what comes nearer when driving forward is not ahead",
-        "check the lidar's mounting: [task.body] lidar_yaw_rad, the scan's frame, [inputs.scan]",
-    ),
-    Kind(
-        "LIDAR_SCALED",
-        ("lidar scale",),
-        "the scale of the logs' lidar is {lidar_scale.effect:.2g} times the twin's: things ahead "
-        "come nearer by this factor for each metre driven",
-        "check the unit and the range of [inputs.scan], and [task] range_max_m",
-    ),
-    Kind(
-        "TERMINATIONS_WRONG",
-        ("terminations",),
-        "{terminations.logs:.0%} of the logs' terminations do not agree with their signals",
-        "ingest the logs again with this profile",
-    ),
-    Kind(
-        GOALS,
-        ("goals come nearer",),
-        "in {goals_come_nearer.logs:.0%} of the missions the robot drives and its goal comes no "
-        "nearer ({goals_come_nearer.twin:.0%} in the twin): these goals and plans belong to other "
-        "missions",
-        "check which goal is in force when a mission begins: the stamps and the order of "
-        "[inputs.goal] and [inputs.plan]",
-    ),
-    Kind(
-        "FLOOR_MOVED",
-        ("floor",),
-        "the lidar sees racks {floor.note}",
-        "correct the origin of the map or of the layout (`map_origin`), or make the floor from "
-        "these logs: `restock twin layout --from STORE --out FLOOR.toml`, and set env.layouts",
-    ),
-    Kind(
-        "EPISODES_REPEATED",
-        ("repeated episodes",),
-        "{repeated_episodes.logs:.0%} of the rows belong to episodes that are stored twice",
-        "`restock audit` lists the recordings (repeated_steps): remove one of them with `restock "
-        "store remove STORE RECORDING`",
-    ),
+@dataclass(frozen=True)
+class _Tables:
+    keys: dict[str, str]
+    ways: dict[str, str]
+    follow: dict[str, tuple[str, ...]]
+    ends: dict[str, Kind]
+    labels: dict[str, Kind]
+    kinds: tuple[Kind, ...]
+
+
+TABLES = msgspec.toml.decode(
+    (files("restock.train.judge") / "causes.toml").read_bytes(), type=_Tables
 )

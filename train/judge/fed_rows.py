@@ -213,6 +213,8 @@ class FedRows:
     pose: F64 | None = None  # (N, 3) on the map: x and y in m, heading in rad
     success: F64 | None = None  # (N,) of the row's episode; NaN is unknown
     held: NDArray[np.object_] | None = None  # (N,) lists of conditions and exposures
+    driver: NDArray[np.str_] | None = None  # (N,) who acted; "" is unknown
+    counted: Ints | None = None  # (N, 2) rows that were written of its recording, and that are held
     left_out: dict[str, int] = field(default_factory=dict)  # rows, by reason
 
     def __len__(self) -> int:

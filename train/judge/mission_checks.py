@@ -11,44 +11,73 @@ from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from scipy.stats import ttest_1samp
 
-from restock.arrays import F64, Bools
-from restock.ingest.task.surroundings import sector_returns
+from restock.arrays import F64, Bools, Ints
+from restock.ingest.task.surroundings import outline_reach, sector_returns
+from restock.ingest.task.task import Task
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
-from restock.train.judge.fed_rows import TAIL, Comparison, FedRows, not_run, shares_compared
-from restock.train.twin.floors.layout import Warehouse
+from restock.stats import clustered_quantiles
+from restock.train.judge.answers import RESAMPLES
+from restock.train.judge.fed_rows import (
+    TAIL,
+    Comparison,
+    FedRows,
+    judged,
+    not_run,
+    share_judged,
+    shares_compared,
+)
+from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
 from restock.train.twin.floors.placed import (
     NEAR_M,
     PLACED,
-    SEEN,
     WITHIN_M,
     from_walls_m,
     on_free_ground,
 )
 
+LOST = "rows lost"
 NEARER = "goals come nearer"
 AWAY = 0.05  # of the missions
 _DRIVEN_M = 2.0  # from which on a mission shows whether it goes to its goal
 _SHORTER = 0.3  # m of plan less, at least, for each metre driven
+_JUMP = 0.06  # of the plan's entry, which is in tens of metres: a plan was replaced
 _STRAIGHT = 0.7  # of the way driven, from its begin to its end: who wanders has no goal
 FLOOR = "floor"
 MOVED_M = 0.25
 _SEARCH_M, _STEP_M, _FINE_M = 2.5, 0.25, 0.05
 _RETURNS = 3000
 _MISSIONS = 6  # in which a floor is looked at
+RANGES, SECTORS, ON_RACKS = "lidar ranges", "lidar sectors", "missions racks"
+ON_FLOOR = 0.5  # of what sectors see, as far off as the others: else it is another floor
+RANGE_M = 0.1
+BLIND = 0.0  # of the sectors
+_LOOKS, _RAYS = 800, 3  # of rows, and of each sector
+_NEARBY = 0.6  # of the lidar's range: a wall nearer than that is seen
+_BETTER = 0.05  # of what sectors see, more with a move of the racks than without
+_LOOKED = 40  # times, for a sector or a mission to be judged
+DRIVEN = "driver"
+OTHER_DRIVER = 0.1  # of the stretches
+_ALIKE = 0.1  # of the others' stretches, at most, are taken for another driver's
+_STRETCH = 10  # steps
 CHOSEN = "chosen on outcome: "
 GAP = 0.3  # of the share that succeeds
 _MIN_MISSIONS = 5  # with and without
 _MET = 0.2  # of a condition's episodes, for an exposure to be their situation
 
+POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
 _SIGNALS = (
-    "SELECT t.transition_id, pose_x_m, pose_y_m, pose_yaw_rad,"
-    " CAST(e.success AS DOUBLE) AS success, t.conditions, t.exposures"
+    f"SELECT t.transition_id, {', '.join(POSE)}, CAST(e.success AS DOUBLE) AS success,"
+    " t.conditions, t.exposures, t.behaviour_policy, h.held, r.ticks - r.episode_ends"
+    " - coalesce(list_sum([one.count FOR one IN r.drops]), 0) AS written"
     " FROM transitions t SEMI JOIN fed USING (transition_id)"
-    " LEFT JOIN episodes e ON e.episode_id = t.episode_id WHERE t.task_hash = ?"
+    " LEFT JOIN episodes e ON e.episode_id = t.episode_id JOIN recordings r"
+    " ON r.recording_id = t.recording_id JOIN (SELECT recording_id, count(*) AS held FROM"
+    " transitions GROUP BY recording_id) h ON h.recording_id = t.recording_id WHERE t.task_hash = ?"
 )
 
 
@@ -64,16 +93,35 @@ def with_missions(store: Store, rows: FedRows) -> FedRows:
     held = np.empty(len(table) + 1, object)
     names = zip(table["conditions"].to_pylist(), table["exposures"].to_pylist(), strict=True)
     held[:] = [(set(a or ()), set(b or ())) for a, b in names] + [(set(), set())]
-    return replace(rows, pose=values[:, :3], success=values[:, 3], held=held[at])
+    driver = np.array([*table["behaviour_policy"].fill_null("").to_pylist(), ""])[at]
+    counted = np.stack([np.append(table[name].to_numpy(), 0) for name in ("written", "held")], 1)
+    return replace(
+        rows, pose=values[:, :3], success=values[:, 3], held=held[at], driver=driver,
+        counted=counted[at],
+    )  # fmt: skip
 
 
 def mission_checks(
-    logs: FedRows, twin: FedRows | None, floors: Sequence[Warehouse]
+    logs: FedRows, twin: FedRows | None, floors: Sequence[Warehouse], others: FedRows | None = None
 ) -> Iterator[Comparison]:
-    """Check goals, then the floor, then whether conditions are of missions that failed."""
+    """Check goals, the floor, whether conditions are of missions that failed, and who drove.
+
+    `others` are the logs' rows beside these.
+    """
+    yield _lost(logs)
     yield _nearer(logs, twin)
-    yield _on_floor(logs, floors)
+    yield from _on_floor(logs, floors, twin)
     yield from _chosen(logs)
+    yield _driven(logs, others)
+
+
+def _lost(rows: FedRows) -> Comparison:
+    what = "rows that were written of a recording and are gone"
+    if rows.counted is None:
+        return not_run(LOST, what, "no store")
+    written, held = rows.counted[np.unique(rows.recording, return_index=True)[1]].T
+    gone = np.maximum(written - held, 0).sum()
+    return share_judged(LOST, what, int(gone), int(written.sum()), 0.0)
 
 
 def _nearer(logs: FedRows, twin: FedRows | None) -> Comparison:
@@ -86,14 +134,18 @@ def _nearer(logs: FedRows, twin: FedRows | None) -> Comparison:
 
 
 def _strayed(rows: FedRows) -> tuple[int, int]:
-    """Count the missions whose plan does not become shorter, of those that show it."""
+    """Count the missions whose plan does not become shorter, of those that show it.
+
+    Who bumps into something on the way shows nothing: it may have had no goal.
+    """
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
-    seen = (now < 1.0) & (after < 1.0)
+    seen = (now < 1.0) & (after < 1.0) & (np.abs(now - after) < _JUMP)
     driven = np.abs(rows.after("localised_speed")) * rows.task.control_period_s
     mission = np.unique(rows.episode, return_inverse=True)[1].reshape(-1)
     way = np.bincount(mission, driven * seen)
     shorter = np.bincount(mission, 10.0 * (now - after) * seen)
-    long = way > _DRIVEN_M
+    bumped = np.bincount(mission, rows.last & (rows.reward < rows.task.rewards.bump / 2)) > 0
+    long = (way > _DRIVEN_M) & ~bumped
     strayed = shorter < _SHORTER * way
     if rows.pose is not None:
         first = np.flatnonzero(np.append(True, np.diff(mission) > 0)[: len(mission)])
@@ -103,12 +155,18 @@ def _strayed(rows: FedRows) -> tuple[int, int]:
     return int(strayed[long].sum()), int(long.sum())
 
 
-def _on_floor(rows: FedRows, floors: Sequence[Warehouse]) -> Comparison:
-    """Find the move of the twin's racks that fits the lidar best, and test it on other missions."""
+def _on_floor(
+    rows: FedRows, floors: Sequence[Warehouse], twin: FedRows | None
+) -> Iterator[Comparison]:
+    """Find the move of the twin's racks that fits the lidar best, and test it on other missions.
+
+    Then compare the lidar with the racks where they are.
+    """
     what = "racks against where the lidar sees them, on the twin's floor"
     if rows.pose is None or not rows.task.lidar or not floors:
         missing = "the robot has no lidar" if not rows.task.lidar else "no store with poses"
-        return not_run(FLOOR, what, missing)
+        yield not_run(FLOOR, what, missing)
+        return
     clearance = rows.sectors() ** 2 * rows.task.range_max_m
     x, y = sector_returns(rows.task, clearance)
     placed = np.isfinite(np.asarray(rows.pose, np.float64)).all(axis=1, keepdims=True)
@@ -120,7 +178,8 @@ def _on_floor(rows: FedRows, floors: Sequence[Warehouse]) -> Comparison:
     kept = slice(None, None, len(places) // (2 * _RETURNS) + 1)
     places, mission = places[kept], np.unique(mission[kept], return_inverse=True)[1].reshape(-1)
     if not len(mission) or mission.max() + 1 < _MISSIONS:
-        return not_run(FLOOR, what, "too few missions with lidar returns")
+        yield not_run(FLOOR, what, "too few missions with lidar returns")
+        return
     first = mission % 2 == 0
     by_floor = []
     for floor in floors:
@@ -130,29 +189,154 @@ def _on_floor(rows: FedRows, floors: Sequence[Warehouse]) -> Comparison:
         by_floor.append((float(near.mean()), floor, move, own, near))
     share, floor, move, own, near = max(by_floor, key=lambda one: one[0])
     driven = into_frame(rows.pose[np.isfinite(rows.pose).all(axis=1), :2], floor.map_origin)
-    if share < SEEN or on_free_ground(floor, driven + move).mean() < PLACED:
+    distance = float(np.hypot(*move))
+    ranges = list(_ranges(rows, floor, move, twin))
+    if on_free_ground(floor, driven + move).mean() < PLACED or not ranges:
         reason = (
             f"these logs are of another floor ({share:.0%} of the lidar's returns lie on racks of"
             f" {floor.name!r}): `restock twin layout --from` makes theirs, and `restock diagnose"
             " PLACE FLOOR.toml` compares with it"
         )
-        return not_run(FLOOR, what, reason)
+        yield not_run(FLOOR, what, reason)
+        return
     still = from_walls_m(floor, own) < NEAR_M
     gains = _by_mission(near.astype(float) - still, mission, ~first)
-    distance = float(np.hypot(*move))
     better = ttest_1samp(gains, 0.0, alternative="greater")
     p = float(better.pvalue) if distance > MOVED_M and np.ptp(gains) > 0 else 1.0
     sides = ((-move[0], "east", "west"), (-move[1], "north", "south"))
     way = " and ".join(
         f"{abs(by):.1f} m {plus if by > 0 else minus}" for by, plus, minus in sides if abs(by) > 0.1
     )
-    return Comparison(
+    yield Comparison(
         FLOOR, what, "m", "off" if p < TAIL else "ok" if distance <= MOVED_M else "undecided",
         logs=float(still.mean()), twin=share, effect=distance, most=MOVED_M,
         logs_rows=len(rows), p=p,
         note=f"{way} of where {floor.name!r} has them ({still.mean():.0%} of the lidar's returns"
         f" lie on its racks and walls, {share:.0%} if these are moved)",
     )  # fmt: skip
+    yield from ranges
+
+
+def _ranges(
+    rows: FedRows, floor: Warehouse, move: F64, twin: FedRows | None
+) -> Iterator[Comparison]:
+    """Compare what each sector sees with the floor's racks and walls there.
+
+    Nothing if most of it is not on this floor.
+    """
+    assert rows.pose is not None
+    kept = np.flatnonzero(np.isfinite(rows.pose).all(axis=1))
+    kept = kept[:: len(kept) // _LOOKS + 1]
+    clearance, best = rows.sectors()[kept] ** 2 * rows.task.range_max_m, ON_FLOOR
+    for by in (np.zeros(2), move):
+        least, most = _expected(rows.task, floor, rows.pose[kept], by)
+        shown = (least > 0.1) & (least < _NEARBY * rows.task.range_max_m) & (most - least < 0.6)
+        if twin is not None:
+            shown &= (twin.sectors() < 1.0).any(axis=0)  # the others are no part of its lidar
+        off = clearance - least
+        near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < NEAR_M
+        if (share := near[shown].sum() / max(shown.sum(), 1)) >= best:
+            plain, away, alike, best = shown, off, near, share + _BETTER
+    if best == ON_FLOOR:
+        return
+    cluster = np.broadcast_to(rows.cluster[kept][:, None], away.shape)[plain]
+    (middle,) = clustered_quantiles(
+        away[plain], cluster, (0.5,), rng=np.random.default_rng(0), resamples=RESAMPLES
+    )
+    what = "how much farther the lidar sees than to the floor's racks and walls"
+    yield judged(RANGES, what, "difference", middle, logs=middle.value, twin=0.0, least=-RANGE_M,
+                 most=RANGE_M, logs_rows=len(kept))  # fmt: skip
+    looked, seen = plain.sum(axis=0), (alike & plain).sum(axis=0)
+    blind, judged_ones = seen < looked / 2, looked >= _LOOKED
+    bearings = (np.flatnonzero(blind & judged_ones) + 0.5) * 360 / rows.task.sectors - 180
+    what = "sector that mostly sees nothing of the floor's racks and walls"
+    yield share_judged(SECTORS, what, len(bearings), int(judged_ones.sum()), BLIND,
+                       note=", ".join(f"{one:+.0f}" for one in bearings))  # fmt: skip
+    plain &= ~blind
+    mission = np.unique(rows.episode[kept], return_inverse=True)[1].reshape(-1)
+    looked, seen = (np.bincount(mission, one.sum(axis=1)) for one in (plain, alike & plain))
+    blind, judged_ones = seen < looked / 2, looked >= _LOOKED
+    what = "mission in which the lidar mostly does not see the floor's racks where they are"
+    yield share_judged(ON_RACKS, what, int((blind & judged_ones).sum()), int(judged_ones.sum()),
+                       AWAY)  # fmt: skip
+
+
+def _expected(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, F64]:
+    """Return the clearance (N, S) of each sector from poses (N, 3), by racks and edges alone.
+
+    The least and the most of some rays of it.
+    """
+    width = 2 * np.pi / task.sectors
+    inside = (np.arange(_RAYS) + 0.5) / _RAYS * width
+    bearing = (np.arange(task.sectors)[:, None] * width - np.pi + inside).reshape(-1)
+    yaw = pose[:, 2:] - floor.map_origin[2]
+    ahead = task.body.lidar_x_m * np.concatenate([np.cos(yaw), np.sin(yaw)], axis=1)
+    x, y = (into_frame(pose[:, :2], floor.map_origin) + move + ahead).T[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = 1 / np.stack([np.cos(yaw + bearing), np.sin(yaw + bearing)])
+
+        nearest = np.full(along.shape[1:], 1e6)
+        for rack in (Rect(0.0, 0.0, floor.width_m, floor.depth_m), *floor.racks):
+            ends = [np.stack([rack.edges[at] - x, rack.edges[at + 1] - y]) * along for at in (0, 2)]
+            near, far = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
+            hit = far if nearest.min() == 1e6 else near  # the floor's edges, from inside
+            nearest = np.where((hit > 0) & (near <= far), np.minimum(nearest, hit), nearest)
+    clear = (nearest - outline_reach(bearing, task.body)).reshape(len(pose), task.sectors, _RAYS)
+    return clear.min(axis=2), clear.max(axis=2)
+
+
+def _driven(rows: FedRows, others: FedRows | None) -> Comparison:
+    """Compare who is said to have driven with whose driving in the other rows it is like."""
+    what = "stretch of a driver that is driven like another's in the other rows"
+    if others is None or rows.driver is None or others.driver is None:
+        return not_run(DRIVEN, what, "no other rows of a store to compare with")
+    names = [name for name in np.unique(others.driver).tolist() if name]
+    stretch = [_stretches(one) for one in (rows, others)]
+    names = [one for one in names if (stretch[1][1] == one).sum() >= _MIN_MISSIONS]
+    if len(names) < 2:
+        return not_run(DRIVEN, what, "fewer than two known drivers in the other rows")
+    style, known = _style(others), np.isin(others.driver, names)
+    middle, spread = style[known].mean(axis=0), style[known].std(axis=0) + 1e-9
+    (style, own) = ((each - middle) / spread for each in (style, _style(rows)))
+    right = np.stack([others.driver == name for name in names], axis=1)[known]
+    weight = (right / right.sum(axis=0)).sum(axis=1, keepdims=True)  # each driver's alike
+    square = (style[known] * weight).T @ style[known] + 1e-3 * np.eye(style.shape[1])
+    fit = np.linalg.solve(square, (style[known] * weight).T @ right)
+    level = (style[known] * weight).sum(axis=0) / len(names) @ fit
+
+    def wrong(one: FedRows, style: F64, of: tuple[Ints, NDArray[np.str_]]) -> tuple[int, int]:
+        each = (np.bincount(of[0]) >= _STRETCH) & np.isin(of[1], names)
+        like = np.stack([np.bincount(of[0], score) for score in (style @ fit - level).T], axis=1)
+        said = np.array(names)[like.argmax(axis=1)]
+        return int((said != of[1])[each].sum()), int(each.sum())
+
+    usual = wrong(others, style, stretch[1])
+    if usual[0] > _ALIKE * usual[1]:
+        return not_run(DRIVEN, what, "the drivers drive alike")
+    return shares_compared(DRIVEN, what, wrong(rows, own, stretch[0]), usual, -1.0, OTHER_DRIVER)
+
+
+def _stretches(rows: FedRows) -> tuple[Ints, NDArray[np.str_]]:
+    """Return the stretch (N,) of each row, of one driver in one episode, and their drivers."""
+    assert rows.driver is not None
+    begins = np.append(True, (np.diff(rows.episode) != 0) | (rows.driver[1:] != rows.driver[:-1]))
+    return np.cumsum(begins) - 1, rows.driver[begins]
+
+
+def _style(rows: FedRows) -> F64:
+    """Return what a row (N, F) shows of how its driver answers to the plan and to obstacles."""
+    speed, turn = (rows.command() / np.abs(rows.task.actions).max(axis=0).clip(1e-9)).T
+    near = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
+    shown = [speed, np.abs(turn), turn * near, np.abs(turn - near), speed * np.abs(near)]
+    shown += [rows.action != rows.previous_action(), speed * rows.now("goal_distance")]
+    shown += [
+        np.abs(rows.now("nav_speed") - speed),
+        np.abs(rows.now("nav_yaw_rate") - turn) * rows.now("nav_known"),
+    ]
+    if rows.task.lidar:
+        middle = rows.task.sectors // 2
+        shown.append(speed * rows.sectors()[:, middle - 2 : middle + 2].min(axis=1))
+    return np.stack([*shown, *np.eye(len(rows.task.actions))[rows.action].T], axis=1, dtype=float)
 
 
 def _best_move(floor: Warehouse, places: F64) -> F64:

@@ -45,58 +45,30 @@ _MIN_STEPS = 10  # of an episode, for its repetition to be no accident
 
 
 def row_order(rows: FedRows) -> Iterator[Comparison]:
-    """Check rows against the rows before and after them."""
+    """Check rows against the rows before and after them: which are off, of which."""
     joined, before = rows.joined, np.maximum(np.arange(len(rows)) - 1, 0)
-    count = int(joined.sum())
-    apart = _differ(rows.next_observation[before], rows.observation) & joined
-    yield share_judged(
-        "chain", "next observation is not the observation of the next row", int(apart.sum()), count,
-        MOST,
-    )  # fmt: skip
-    acted = rows.previous_action() != rows.action[before]
-    yield share_judged(
-        "previous action", "observation does not hold the action of the row before",
-        int((acted & joined).sum()), count, MOST,
-    )  # fmt: skip
-    after = rows.previous_action(after=True) != rows.action
-    yield share_judged(
-        "own action", "next observation does not hold the row's own action", int(after.sum()),
-        len(rows), MOST,
-    )  # fmt: skip
-    yield _foresight(rows, joined)
+    held, previous = rows.previous_action(), rows.action[before]
+    apart = _differ(rows.next_observation[before], rows.observation)
     change = rows.sectors() - rows.sectors()[before]
     names = enumerate(rows.task.observation_names)
     first = next((place for place, name in names if name.startswith("closing_")), 0)
     closing = rows.observation[:, first : first + rows.task.sectors]
-    unlike = (np.abs(change - closing) > 10 * _EQUAL).any(axis=1) & joined
-    yield share_judged(
-        "closing", "clearances did not change as in the observation", int(unlike.sum()),
-        count, MOST,
-    )  # fmt: skip
-    yield _still(rows)
-    yield _repeated(rows)
-
-
-def _foresight(rows: FedRows, joined: Bools) -> Comparison:
-    """Count observations that contain the action taken afterwards instead of the one before."""
-    before = np.maximum(np.arange(len(rows)) - 1, 0)
-    changed = joined & (rows.action != rows.action[before])
-    knows = changed & (rows.previous_action() == rows.action)
-    return share_judged(
-        "foresight", "observation contains the action that is only taken "
-            "afterwards", int(knows.sum()),
-        int(changed.sum()), MOST,
-    )  # fmt: skip
-
-
-def _still(rows: FedRows) -> Comparison:
-    """Count moving rows whose next observation equals the current one."""
     moving = np.abs(rows.now("wheel_speed")) > 0.1
-    same = ~_differ(rows.observation, rows.next_observation) & moving
-    return share_judged(
-        "unchanged", "next observation is the observation, though the robot moves",
-        int(same.sum()), int(moving.sum()), MOST,
-    )  # fmt: skip
+    same = ~_differ(rows.observation, rows.next_observation)
+    for check, what, off, of in (
+        ("chain", "next observation is not the observation of the next row", apart, joined),
+        ("previous action", "observation does not hold the action of the row before",
+         held != previous, joined),
+        ("own action", "next observation does not hold the row's own action",
+         rows.previous_action(after=True) != rows.action, np.ones(len(rows), np.bool_)),
+        ("foresight", "observation contains the action that is only taken afterwards",
+         held == rows.action, joined & (rows.action != previous)),
+        ("closing", "clearances did not change as in the observation",
+         (np.abs(change - closing) > 10 * _EQUAL).any(axis=1), joined),
+        ("unchanged", "next observation is the observation, though the robot moves", same, moving),
+    ):  # fmt: skip
+        yield share_judged(check, what, int((off & of).sum()), int(of.sum()), MOST)
+    yield _repeated(rows)
 
 
 def _repeated(rows: FedRows) -> Comparison:
@@ -124,6 +96,7 @@ def _differ(first: F32, second: F32) -> Bools:
 SCALE = 1.05
 OTHER = 0.05  # of the rows
 LOST = 0.05  # of the ends
+UNCAUSED = "terminated without cause"
 _JUMP_M = 0.9  # a plan was replaced
 _TOUCHING_M = 0.05
 _TELLING = 0.05  # of a reward: more than float32 and a noisy clearance make
@@ -212,11 +185,14 @@ def _unlike(rows: FedRows, implied: F64, scale: float) -> tuple[int, int]:
 
 
 def _ends(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
-    inside = logs.terminated & ~logs.last
-    yield share_judged(
-        "goes on after its end", "row is terminated and its episode goes on", int(inside.sum()),
-        int(logs.terminated.sum()), LOST,
-    )  # fmt: skip
+    weight, ends = logs.task.rewards, logs.terminated
+    cause = arrived(logs) | (logs.reward > weight.goal / 2) | (logs.reward < weight.bump / 2)
+    for check, what, off, of in (
+        ("goes on after its end", "row is terminated and its episode goes on", ~logs.last, ends),
+        (UNCAUSED, "terminated row neither at its goal nor in a bump, by plan and reward",
+         ~cause, ends & logs.last),
+    ):  # fmt: skip
+        yield share_judged(check, what, int((off & of).sum()), int(of.sum()), LOST)
     if logs.task.goal == "none":
         for check in ("terminated at the goal", "goal reward"):
             yield not_run(check, "what happens on arrival", "the task has no goal")
