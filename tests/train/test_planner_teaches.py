@@ -216,10 +216,10 @@ def test_runs_without_a_mean_are_refused(tmp_path: Path, capsys, teacher, why: s
 
 
 def test_a_stopped_run_ends_as_a_whole_one(tmp_path: Path) -> None:
-    settings = config(**BY_PLANNER)
+    settings = config(**BY_PLANNER, schedule={"env_steps": 800})
     whole = run_to_end(tmp_path / "whole", settings)
     stopped = session(tmp_path / "stopped", settings)
-    requested = iter(range(150))
+    requested = iter(range(130))
     with pytest.raises(Exception, match="restock train --resume"):
         train(stopped, stop=lambda: next(requested, None) is None)
     stopped.close()

@@ -287,7 +287,7 @@ def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(tmp_path: Path) -> 
         calls += 1
         return None if calls > 100 else forward(env, observation)
 
-    settings = config(**TAUGHT)
+    settings = config(**TAUGHT, schedule={"env_steps": 800})
     live = session(tmp_path / "a", settings, teacher=late)
     with pytest.raises(TeacherFailed, match=r"returned nothing.*; a checkpoint was written"):
         train(live)
@@ -299,9 +299,9 @@ def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(tmp_path: Path) -> 
     np.testing.assert_array_equal(again.ring.rows, live.ring.rows)
     result = train(again)
     again.close()
-    assert result.env_steps == 1600
+    assert result.env_steps == 800
     assert again.progress.online_updates == int(
-        (1600 - again.progress.online_from) * settings.schedule.updates_per_env_step
+        (800 - again.progress.online_from) * settings.schedule.updates_per_env_step
     )
 
 
