@@ -82,7 +82,7 @@ def fit_response(
         axis=1,
     )  # (C, W * W)
     counts = np.concatenate([np.ones((1, clusters)), cluster_counts(clusters, RESAMPLES, rng)])
-    drawn: F64 = (counts @ moments).reshape(-1, width, width)
+    drawn: F64 = np.asarray(counts @ moments, np.float64).reshape(-1, width, width)
     rows = np.maximum(counts @ count, 1).astype(np.float64)[:, None]
     mean = (counts @ sums) / rows
     if centred:
