@@ -1,9 +1,10 @@
 """The compiled code of `restock/compiled/`: whether it is installed, and whether it is used.
 
 It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
-network, the gather of a batch and the record of its rows, draws by priority, the twin's lidar, and
-what robots see of their plans and of who comes near. Without it PyTorch, NumPy and MuJoCo do the
-same, updates and ranges to the rounding of sums. RESTOCK_NATIVE=0 (or no, false, off) selects that.
+network, the gather of a batch and the record of its rows, draws by priority, the twin's lidar, what
+robots see of their plans and of who comes near, and gaps to racks and pallets. Without it
+PyTorch, NumPy and MuJoCo do the same, updates and ranges to the rounding of sums. RESTOCK_NATIVE=0
+(or no, false, off) selects that.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 /* `restock._native`: an update of a plain Q network, the drawing and the record of its batches, the
- * twin's lidar, and what robots see of their plans and of who comes near, compiled.
+ * twin's lidar, what robots see of their plans and of who comes near, and gaps to boxes, compiled.
  *
  * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` and
  * `restock.ingest.task` with NumPy's and `restock.train.twin` with MuJoCo's rays, in fewer calls and
  * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/network.py`,
  * `train/feed/sampled_rows.py` and `batches.py`, `replay/sampling/rules.py`,
- * `train/twin/physics/scenery.py`, `ingest/task/surroundings.py`. Compiled with
- * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
+ * `train/twin/physics/scenery.py`, `train/twin/floors/state_lattice.py`,
+ * `ingest/task/surroundings.py`. Compiled with -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
  * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
  * importing it fails, and these do the work. Stable ABI: one build serves Python 3.11 and later.
  */
