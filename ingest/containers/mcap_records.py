@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, overload
 
@@ -28,6 +29,7 @@ from restock.ingest.decoding.columns import Channel, gather
 
 MAGIC = b"\x89MCAP0\r\n"
 Buffer: TypeAlias = "bytes | FileBytes"
+MAX_KEPT = 64 << 10  # bytes of a definition that is kept for other files
 PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
 
 
@@ -76,13 +78,13 @@ class FileBytes:
             if not 0 <= key < self._size:
                 raise IndexError(key)
             return self._read(key, key + 1)[0]
-        start, stop, _ = key.indices(self._size)
-        return self._read(start, stop)
+        start, stop = key.start or 0, key.stop
+        at = start - self._from
+        if at >= 0 and stop is not None and start <= stop <= self._from + len(self._window):
+            return self._window[at : stop - self._from]
+        return self._read(*key.indices(self._size)[:2])
 
     def _read(self, start: int, stop: int) -> bytes:
-        at = start - self._from
-        if at >= 0 and stop - self._from <= len(self._window):
-            return self._window[at : stop - self._from]
         if stop - start > self.WINDOW:
             return self._read_file(start, stop)
         self._window = self._read_file(start, min(start + self.WINDOW, self._size))
@@ -267,14 +269,20 @@ def parse(op: Op, buffer: Buffer, start: int, stop: int) -> dict[str, Any]:
     return {name: cursor.read(kind) for name, kind in FIELDS[op]}
 
 
+_SIZES = {"B": 1, "H": 2, "I": 4, "Q": 8}
+
+
 class _Cursor:
     """Reads fields one after the other, never beyond `stop`."""
 
+    HEAD = 4096  # bytes that are read at once: each access to a file takes longer than a field
+
     def __init__(self, buffer: Buffer, start: int, stop: int) -> None:
-        self.buffer, self.position, self.stop = buffer, start, stop
+        self.buffer, self.start, self.position, self.stop = buffer, start, start, stop
+        self.head = bytes(buffer[start : min(start + self.HEAD, stop)])
 
     def read(self, kind: str) -> Any:
-        if kind in ("B", "H", "I", "Q"):
+        if kind in _SIZES:
             return self._number(kind)
         if kind == "text":
             return self._text()
@@ -295,12 +303,16 @@ class _Cursor:
         return pairs
 
     def _number(self, kind: str) -> int:
-        start, stop = self._span(struct.calcsize("<" + kind))
-        return int.from_bytes(self.buffer[start:stop], "little")
+        return int.from_bytes(self._next(_SIZES[kind]), "little")
 
     def _text(self) -> str:
-        start, stop = self._span(self._number("I"))
-        return bytes(self.buffer[start:stop]).decode("utf-8", errors="backslashreplace")
+        return self._next(self._number("I")).decode("utf-8", errors="backslashreplace")
+
+    def _next(self, length: int) -> bytes:
+        start, stop = self._span(length)
+        if stop - self.start <= len(self.head):
+            return self.head[start - self.start : stop - self.start]
+        return bytes(self.buffer[start:stop])
 
     def _span(self, length: int) -> tuple[int, int]:
         start = self.position
@@ -587,21 +599,16 @@ class Definitions:
 
     def take(self, opcode: int, buffer: Buffer, at: int, stop: int) -> None:
         """Add the record whose content is buffer[at:stop], if it is a schema or a channel."""
-        if opcode == Op.SCHEMA:
-            record = parse(Op.SCHEMA, buffer, at, stop)
-            low, high = record["data"]
-            text = bytes(buffer[low:high])
-            self.schemas[record["id"]] = SchemaRecord(record["name"], record["encoding"], text)
-            self.raw[opcode, record["id"]] = bytes(buffer[at - PREFIX : stop])
-        elif opcode == Op.CHANNEL:
-            record = parse(Op.CHANNEL, buffer, at, stop)
-            self.channels[record["id"]] = ChannelRecord(
-                record["topic"],
-                record["message_encoding"],
-                record["schema_id"],
-                dict(record["metadata"]).get("offered_qos_profiles", ""),
-            )
-            self.raw[opcode, record["id"]] = bytes(buffer[at - PREFIX : stop])
+        if opcode not in (Op.SCHEMA, Op.CHANNEL):
+            return
+        raw = bytes(buffer[at - PREFIX : stop])
+        # All recordings of a robot define the same.
+        number, record = (_defined if len(raw) < MAX_KEPT else _defined.__wrapped__)(raw)
+        self.raw[opcode, number] = raw
+        if isinstance(record, SchemaRecord):
+            self.schemas[number] = record
+        else:
+            self.channels[number] = record
 
     def beneath(self, other: Definitions) -> Definitions:
         """Return both; where both define an id, what `other` says."""
@@ -658,6 +665,19 @@ class Definitions:
             )
             for number, channel in self.channels.items()
         }
+
+
+@lru_cache(1024)
+def _defined(raw: bytes) -> tuple[int, SchemaRecord | ChannelRecord]:
+    """Parse a record of a schema or a channel: its id, and what it defines."""
+    found = parse(Op(raw[0]), raw, PREFIX, len(raw))
+    if raw[0] == Op.SCHEMA:
+        low, high = found["data"]
+        return found["id"], SchemaRecord(found["name"], found["encoding"], raw[low:high])
+    qos = found["metadata"].get("offered_qos_profiles", "")
+    return found["id"], ChannelRecord(
+        found["topic"], found["message_encoding"], found["schema_id"], qos
+    )
 
 
 def definitions_in(records: bytes) -> Definitions:

@@ -244,6 +244,9 @@ def _distro_store(distro: str) -> Typestore:
     return get_typestore(_STORES[distro])
 
 
+_normalized = lru_cache(KEPT)(normalize_msgtype)
+
+
 def message_type(channel: Channel, distro: str) -> RosType:
     """Return the type of a channel's messages.
 
@@ -251,7 +254,7 @@ def message_type(channel: Channel, distro: str) -> RosType:
         CannotDecode: a service or action event, an undefined type, or a definition
             that cannot be parsed.
     """
-    name = normalize_msgtype(channel.type) if channel.type else ""
+    name = _normalized(channel.type) if channel.type else ""
     for part, kind in (("/srv/", "service"), ("/action/", "action")):
         if part in name:
             raise CannotDecode(f"{kind} events are not supported")

@@ -21,6 +21,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,7 @@ ELSEWHERE = "elsewhere"
 _NOT_IN_ROWS = ("conditions", "exposures", "condition", "tags", "noise", "robot", "limiter")
 
 
-class Profile(Checked, frozen=True):
+class Profile(Checked, frozen=True, dict=True):
     """One kind of robot. Read with `load_profile`."""
 
     name: str
@@ -142,11 +143,11 @@ class Profile(Checked, frozen=True):
         """Return both, conditions first."""
         return [*self.conditions, *self.exposures]
 
-    @property
+    @cached_property
     def labels_version(self) -> str:
         return labels_version(self.definitions)
 
-    @property
+    @cached_property
     def hash(self) -> str:
         """Return 12 hex digits of everything in the profile that rows depend on.
 

@@ -433,11 +433,8 @@ class StoreReader:
     def _listing(self, name: str) -> _Listing:
         """Return what the newest version of a table has; its log is read again if it went on."""
         known = self._listings.get(name)
-        if known is not None:
-            with self.path.translate_errors():
-                known.table.update_incremental()
-            if known.table.version() == known.at[1]:
-                return known
+        if known is not None and not self.path.goes_on(name, known.table, known.at[1]):
+            return known
         return self._listed(name, self.path.open_table(name))
 
     def _listed(self, name: str, table: DeltaTable) -> _Listing:

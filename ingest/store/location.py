@@ -253,6 +253,14 @@ class Location:
         if self.folder is not None:
             expect_whole(self.folder / name / LOG, version, where=self.text)
 
+    def goes_on(self, name: str, table: DeltaTable, version: int) -> bool:
+        """Return whether a table has commits after a version, at which it was opened."""
+        if self.folder is not None:  # looked for by its name, a commit costs a hundredth
+            return Path(f"{self.folder}/{name}/{LOG}/{version + 1:020}.json").exists()
+        with self.translate_errors():
+            table.update_incremental()
+        return bool(table.version() != version)
+
     @cached_property
     def files(self) -> pa.fs.FileSystem:
         """Return a file system whose root is the store."""
