@@ -369,7 +369,8 @@ def _context() -> ForkServerContext | SpawnContext:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["restock.ingest.batch", "restock.ingest.pipeline"])
+    used = ["restock.ingest.batch", "restock.ingest.pipeline", "duckdb", "pyarrow.compute"]
+    context.set_forkserver_preload(used)
     return context
 
 

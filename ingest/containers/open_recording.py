@@ -20,14 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from ruamel.yaml import YAML
-
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import mcap_file, ros1_file, sqlite_file
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import (
     HEAD_BYTES,
-    INVALID_YAML,
     LEROBOT_DATA,
     LEROBOT_INFO,
     NOT_KEPT,
@@ -40,6 +37,7 @@ from restock.ingest.containers.storage import (
     custom_data,
     decompress_file,
     unwatched,
+    yaml_value,
 )
 from restock.ingest.decoding.decoders import READABLE
 from restock.ingest.decoding.definitions import DEFAULT_DISTRO, choose_definitions
@@ -103,6 +101,8 @@ _NAMES = (
     f"recordings end in {', '.join(name for one in CONTAINERS for name in one.endings)}"
     " or are folders of rosbag2 or LeRobot"
 )
+# A list of each publisher's: most of the text, which no one reads, and the parser is slow.
+_QOS = re.compile(r"(?m)^( +)offered_qos_profiles:[ \t]*\n(?:\1[ -].*\n)+")
 _ZSTD = re.compile(r"\.zstd?$")
 
 
@@ -315,11 +315,9 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
         if file.stat().st_size > MAX_METADATA:
             return BagMetadata(), f"{METADATA} has {file.stat().st_size:,} bytes: not read"
         text = file.read_text(encoding="utf-8")
-        document = YAML(typ="safe", pure=True).load(text)
-        content = document["rosbag2_bagfile_information"]
-    except INVALID_YAML as error:
-        why = (str(error).splitlines() or [type(error).__name__])[0]
-        return BagMetadata(), f"{METADATA} cannot be used: {visible(why[:200])}"
+        content = yaml_value(_QOS.sub("", text), "rosbag2_bagfile_information")
+    except ValueError as error:
+        return BagMetadata(), f"{METADATA} cannot be used: {error}"
     if not isinstance(content, dict):
         return BagMetadata(), f"{METADATA} cannot be used: not a mapping"
     custom, problem = None, None

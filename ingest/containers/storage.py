@@ -12,12 +12,10 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 import zstandard
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from restock.arrays import Ints
 from restock.errors import RecordingError, visible
@@ -44,11 +42,6 @@ MAX_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
 HEAD_BYTES = 64  # by which a container claims a file
 LEROBOT_INFO, LEROBOT_DATA = "meta/info.json", "data/*/*.parquet"
 NOT_KEPT = f"not text, longer than {MAX_TEXT:,} characters, or beyond entry {MAX_ENTRIES:,}"
-# What the YAML library raises of an invalid document, or of one that it does not expect.
-INVALID_YAML = (
-    *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
-    *(RecursionError, OverflowError, NotImplementedError),
-)
 # The key, and the lines further in: two spaces in metadata.yaml, none in what storages keep.
 _CUSTOM_DATA = re.compile(
     r"^(?P<indent> {0,4})custom_data:(?P<value>.*)(?P<block>(?:\n(?:(?P=indent) .*|[ \t]*$))*)",
@@ -139,14 +132,32 @@ def _custom_data(text: str) -> tuple[dict[str, str], int]:
     if len(lines) > MAX_CUSTOM_DATA:
         raise ValueError(f"custom_data has {len(lines):,} characters: not read")
     try:
-        said = YAML(typ="base", pure=True).load(lines.strip())["custom_data"]
-    except INVALID_YAML as error:
-        why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"custom_data cannot be used: {visible(why[:200])}") from error
+        said = yaml_value(lines.strip(), "custom_data", kind="base")
+    except ValueError as error:
+        raise ValueError(f"custom_data cannot be used: {error}") from error
     if not isinstance(said, dict):
         return {}, 1
     entries = {n: v for n, v in said.items() if isinstance(n, str) and isinstance(v, str)}
     return {n: v for n, v in entries.items() if v != "~"}, len(said) - len(entries)
+
+
+def yaml_value(text: str, key: str, *, kind: str = "safe") -> Any:
+    """Parse a YAML document, and return its value of a key.
+
+    Raises:
+        ValueError: it is none, or has no such key, and why.
+    """
+    from ruamel.yaml import YAML  # slow to import, and MCAP files need none
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ=kind, pure=True).load(text)[key]
+    except (  # of an invalid document, or of one that the library does not expect
+        *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
+        *(RecursionError, OverflowError, NotImplementedError),
+    ) as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(visible(why[:200])) from error
 
 
 class Storage(Protocol):

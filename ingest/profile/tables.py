@@ -16,7 +16,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 from msgspec import Meta
@@ -252,6 +251,8 @@ def _kind(is_list: bool, length: str) -> str:
 
 @cache
 def _reserved() -> set[str]:
+    import duckdb
+
     with duckdb.connect() as connection:
         rows = connection.sql(
             "SELECT keyword_name FROM duckdb_keywords() WHERE keyword_category = 'reserved'"

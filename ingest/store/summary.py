@@ -24,9 +24,8 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -34,6 +33,9 @@ from numpy.typing import NDArray
 from restock.arrays import Bools, Ints
 from restock.errors import StoreError
 from restock.ingest.task.schema import splitmix64
+
+if TYPE_CHECKING:  # slow to import, and not for what is in the store already
+    import duckdb
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
 # Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.
@@ -244,6 +246,8 @@ def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
 @cache
 def _database() -> duckdb.DuckDBPyConnection:
     """Return one connection for all recordings: opening it takes as long as a summary."""
+    import duckdb
+
     atexit.register(_database.cache_clear)  # nanobind complains of what outlives its module
     return duckdb.connect(config={"threads": 1})
 

@@ -12,9 +12,10 @@ import atexit
 import json
 from collections.abc import Iterator
 from functools import cache, lru_cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import duckdb
+if TYPE_CHECKING:  # slow to import, and not for what is in the store already
+    import duckdb
 
 WINDOW = "WINDOW episode AS (PARTITION BY episode_index ORDER BY step_index)"
 SANDBOX: dict[str, str | bool | int | float | list[str]] = {
@@ -75,6 +76,8 @@ def sandbox() -> duckdb.DuckDBPyConnection:
 
     Opening one takes longer than the labels of an episode.
     """
+    import duckdb
+
     atexit.register(sandbox.cache_clear)  # nanobind complains of what outlives its module
     connection = duckdb.connect(config=SANDBOX)
     connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's

@@ -59,9 +59,8 @@ from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
-import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
@@ -73,6 +72,9 @@ from restock.files import first_line
 from restock.ingest.task.condition_sql import SANDBOX, SELECT, WINDOW, refusal, sandbox
 from restock.ingest.task.task import LIDAR_SIGNALS, PLAN_SIGNALS, STAND_IN_LIMITS, Noise
 from restock.toml import Checked
+
+if TYPE_CHECKING:  # slow to import, and not for what is in the store already
+    import duckdb
 
 Timing = Literal["pre", "post"]
 Kind = Literal["outcome", "exposure"]
@@ -380,6 +382,8 @@ def _evaluate(
     columns: Columns = {}
     if not requested:
         return columns
+    import duckdb
+
     with sandbox().cursor() as connection:
         named = {word.lower() for c, _ in requested for word in c.words} | {
             "episode_index",
@@ -408,6 +412,8 @@ def _evaluate(
 
 def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -> NoReturn:
     """Raise what DuckDB says of a condition's SQL as a ConfigError."""
+    import duckdb
+
     if isinstance(error, duckdb.InterruptException):
         raise ConfigError(
             f"its SQL takes too long: the conditions may take {limit_s:.0f} s on"
@@ -482,6 +488,8 @@ def _query(
     Raises:
         duckdb.Error: they do not run, give another number of values, or take longer than they may.
     """
+    import duckdb
+
     columns = ",\n".join(
         f"({getattr(condition, part)}\n) AS column_{place}"
         for place, (condition, part) in enumerate(requested)

@@ -57,9 +57,10 @@ def test_a_review_page_imports_no_learning_and_no_charts(store: Path, tmp_path: 
 
 
 def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
-    bag = write_bag(Drive(), tmp_path / "bag")
-    modules = loaded("ingest", str(bag), "--store", str(tmp_path / "store"), "--json")
-    assert modules & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
+    command = ("ingest", str(write_bag(Drive(), tmp_path / "bag")), "--store", str(tmp_path / "s"))
+    assert loaded(*command, "--json") & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
+    known = loaded(*command)
+    assert known & {"typeguard", "asyncio", "duckdb", "pyarrow.compute"} == set()
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,13 @@ import tyro
 from restock.cli import COMPLETION, JOBS, VERBS, command_of
 from restock.errors import ConfigError, ExitCode
 
+_TYPES = sys.modules.get("tyro._resolver")
+_checked = getattr(_TYPES, "is_instance", None)
+if _TYPES is not None and _checked is not None:
+    # For the items of a tuple tyro imports typeguard, and with that asyncio: a sixth of an ingest.
+    _TYPES.is_instance = lambda kind, value: (  # type: ignore[attr-defined]
+        isinstance(value, tuple) if typing.get_origin(kind) is tuple else _checked(kind, value)
+    )
 _PREPARED: list[type[Any]] = []
 _EXPLAINED: list[type[Any]] = []
 MIN_PROSE = 80  # columns that prose may take above narrower boxes, where the window has them
