@@ -384,7 +384,11 @@ def _correlation(requested: F64, did: F64, joined: Bools, lag: int) -> float:
         requested, did, joined = requested[:-lag], did[lag:], joined[:-lag] & joined[lag:]
     elif lag < 0:
         requested, did, joined = requested[-lag:], did[:lag], joined[-lag:] & joined[:lag]
-    requested, did = requested[joined], did[joined]
-    if len(requested) < MIN_FOLLOWED or requested.std() < 1e-3 or did.std() < 1e-3:
+    several = np.asarray([requested[joined], did[joined]], np.float64)  # (2, N)
+    if several.shape[1] < MIN_FOLLOWED:
         return -1.0
-    return float(np.corrcoef(requested, did)[0, 1])
+    several -= several.mean(axis=1, keepdims=True)
+    (own, shared), (_, other) = (several @ several.T).tolist()
+    if min(own, other) < 1e-6 * several.shape[1]:  # a standard deviation of 1e-3
+        return -1.0
+    return float(shared / np.sqrt(own * other))
