@@ -65,11 +65,11 @@ ROW_GROUP_ROWS = 32_768
 
 @dataclass(frozen=True)
 class Staged:
-    """A recording whose files are written and in no commit yet."""
+    """A recording whose rows are written and in no commit yet."""
 
     recording_id: str
     ingest_id: str
-    manifest: AddedFile
+    manifest: pa.Table  # its row, with its summary
     rows: AddedFile  # of `transitions`
     columns: pa.Schema  # of `transitions`
     contents: Hashes  # of its distinctive rows, (N,) ascending
@@ -191,14 +191,13 @@ class StoreWriter(TableCommits):
         contents = manifest["distinctive_rows"].combine_chunks().flatten().field("content")
         staged = Staged(
             *ids,
-            AddedFile(ids[0], own_path(*ids), len(manifest)),
+            manifest,
             AddedFile(ids[0], own_path(*ids), len(rows)),
             delta_columns(rows.schema).remove_metadata(),
             np.sort(contents.to_numpy().view(np.uint64)),
             instead_of,
         )
         try:
-            staged.manifest.size = self._write(manifest, f"{RECORDINGS}/{staged.manifest.path}")
             staged.rows.size = self._write(rows, f"{TRANSITIONS}/{staged.rows.path}")
         except BaseException:
             self.discard([staged])
@@ -222,11 +221,28 @@ class StoreWriter(TableCommits):
         return version
 
     def _commit_files(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> int:
-        self.commit(RECORDINGS, [one.manifest for one in staged], instead_of)
+        self._commit_manifests(staged, instead_of)
         version, replaced = self.commit(TRANSITIONS, [one.rows for one in staged], instead_of)
         with suppress(StoreError):  # the rows are there: what joins nothing, `clean` removes
             self.remove(RECORDINGS, replaced)
         return version
+
+    def _commit_manifests(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> None:
+        """Write and commit what is not in `recordings` already: an attempt before may have failed.
+
+        Many become one file. It stays if a part of its recordings cannot be committed.
+        """
+        held = self._listing(RECORDINGS).paths
+        new = [one for one in staged if one.ingest_id not in held]
+        made: list[AddedFile] = []
+        with self.discarded_on_failure(RECORDINGS, made):
+            if len(new) >= MIN_JOINED:
+                rows, schema = [one.manifest for one in new], delta_columns(recording_columns())
+                made.append(merge(self.path, RECORDINGS, [], [], schema, extra=rows))
+            for one in new if not made else ():
+                made.append(AddedFile(one.recording_id, one.rows.path, len(one.manifest)))
+                made[-1].size = self._write(one.manifest, f"{RECORDINGS}/{one.rows.path}")
+            self.commit(RECORDINGS, made, instead_of)
 
     def remove_recordings(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
         """Take recordings out of the store in one commit, by their ingests (recording -> ingest).
@@ -260,7 +276,7 @@ class StoreWriter(TableCommits):
         """Delete the files of recordings whose commit has not begun, with their frames."""
         with suppress(OSError, StoreError):
             for name, files in (
-                (RECORDINGS, [one.manifest for one in staged]),
+                (RECORDINGS, [one.rows for one in staged]),
                 (TRANSITIONS, [one.rows for one in staged]),
                 (FRAMES, [one.rows for one in staged]),
             ):
@@ -281,7 +297,10 @@ class StoreWriter(TableCommits):
             gone = [one for one in staged if one.ingest_id not in there]
             # Rows first: on a full disk they give back the room to take the manifests out.
             self.discard_uncommitted(TRANSITIONS, [one.rows for one in gone])
-            self.remove(RECORDINGS, {one.manifest.path for one in gone})
+            ids = {(one.recording_id, one.ingest_id) for one in gone}
+            manifests = [file for file in self.files(RECORDINGS) if file.ingests]
+            useless = [f.path for f in manifests if ids.issuperset(i[:2] for i in f.ingests)]
+            self.remove(RECORDINGS, useless)
             self.discard(gone)
 
     def clean(self, retention_hours: int = RETENTION_HOURS) -> list[str]:
@@ -369,7 +388,8 @@ class StoreWriter(TableCommits):
 
 FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writes again, at most
 MIN_FILES = 2
-FOLD_FILES = 16  # manifests of a file each, which cost each opening 10 ms, and joining one as much
+FOLD_FILES = 16  # of few manifests, which cost each opening 10 ms each, and joining one as much
+MIN_JOINED = 8  # recordings of a commit whose manifests become one file
 FULL_MANIFESTS = 500  # a file of so many is left alone; joining them again would take a second
 OPERATION = "restock store compact"
 
@@ -463,7 +483,8 @@ def fold_if_many(store: StoreWriter) -> None:
     """Fold the manifests if their number makes every opening slow."""
     if not store.path.has_table(TRANSITIONS):
         return
-    if sum(file.own for file in store.files(RECORDINGS)) >= FOLD_FILES:
+    sizes = [len(file.ingests) for file in store.files(RECORDINGS)]
+    if sum(size < FULL_MANIFESTS for size in sizes) >= FOLD_FILES:
         with suppress(StoreError):  # the ingest before it is done; queries say what is damaged
             fold(store, small=True)
 
