@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union
 
 from restock.errors import TRACEBACK, ConfigError, RecordingError, RestockError, print_traceback
-from restock.process import import_extra, in_step
+from restock.process import alone, import_extra, in_step
 
 if TYPE_CHECKING:
     from restock.errors import RestockError
@@ -79,10 +79,11 @@ class IngestJob:
         settle: Callable[[str], None] = lambda recording_id: None,
     ) -> Prepared | RestockError:
         """Read one recording and write its files; an error is returned: the others go on."""
-        from restock.ingest.pipeline import prepare
+        from restock.ingest.pipeline import preparing
 
         try:
-            return prepare(path, self.profile, watch=watch, settle=settle, **self.options)
+            how = {**self.options, "watch": watch, "settle": settle}
+            return alone(preparing(path, self.profile, **how))
         except RestockError as error:
             return error
         except MemoryError:

@@ -132,31 +132,15 @@ def ingest(
             be refused. The store is as it was.
         StoreError: the store cannot be written.
     """
-    prepared = prepare(
-        path,
-        profile,
-        store=store,
-        force=force,
-        salvage=salvage,
-        definitions=definitions,
-        repeated=repeated,
-        tags=tags or {},
-        watch=watch,
-    )
+    how: dict[str, Any] = {"store": store, "force": force, "salvage": salvage, "watch": watch}
+    how |= {"definitions": definitions, "repeated": repeated, "tags": tags or {}}
+    prepared = alone(preparing(path, profile, **how))
     if store is None:
         return prepared.result
     (outcome,) = commit_all(store, [prepared])
     if not isinstance(outcome, IngestResult):
         raise outcome
     return outcome
-
-
-def prepare(path: Path | str, profile: Profile, **how: Any) -> Prepared:
-    """Read one recording and write its files, for a commit to come (`commit_all`).
-
-    Takes what `preparing` does. Raises as `ingest`, which does both.
-    """
-    return alone(preparing(path, profile, **how))
 
 
 def preparing(
@@ -446,7 +430,8 @@ def commit_all(
     group: dict[int, Prepared] = {}
     for place, one in enumerate(prepared):
         # Of one recording the later ingest replaces the earlier, in a commit of its own.
-        if one.staged and one.staged.recording_id in {_id(other) for other in group.values()}:
+        ids = {other.staged.recording_id for other in group.values() if other.staged}
+        if one.staged and one.staged.recording_id in ids:
             outcomes |= _commit(store, group)
             group = {}
         if one.staged is None:
@@ -459,10 +444,6 @@ def commit_all(
     outcomes |= _commit(store, group)
     fold_if_many(store)
     return [outcomes[place] for place in range(len(prepared))]
-
-
-def _id(one: Prepared) -> str | None:
-    return one.staged.recording_id if one.staged else None
 
 
 def _refusal(
@@ -623,7 +604,7 @@ class CommitGroup:
 
     def settle(self, recording_id: str) -> None:
         """Commit what waits, where this recording does: it is about to be looked up."""
-        if recording_id in {_id(one) for one in self.waiting.values()}:
+        if recording_id in {one.staged.recording_id for one in self.waiting.values() if one.staged}:
             self.commit()
 
     def commit(self) -> None:

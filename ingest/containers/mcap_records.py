@@ -86,8 +86,8 @@ class FileBytes:
 
     def _read(self, start: int, stop: int) -> bytes:
         if stop - start > self.WINDOW:
-            return self._read_file(start, stop)
-        self._window = self._read_file(start, min(start + self.WINDOW, self._size))
+            return self.large(start, stop)
+        self._window = self.large(start, start + self.WINDOW)
         self._from = start
         return self._window[: max(stop - start, 0)]
 
@@ -97,9 +97,7 @@ class FileBytes:
         Raises:
             RecordingError: the file is shorter than it was when it was opened.
         """
-        return self._read_file(start, min(stop, self._size))
-
-    def _read_file(self, start: int, stop: int) -> bytes:
+        stop = min(stop, self._size)
         parts, left = list[bytes](), stop - start
         while left > 0:
             part = os.pread(self._file.fileno(), left, stop - left)

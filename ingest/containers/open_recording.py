@@ -17,6 +17,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
@@ -67,11 +68,6 @@ CONTAINERS: tuple[Container, ...] = (
     *(mcap_file.CONTAINER, sqlite_file.CONTAINER, ros1_file.CONTAINER),
     LEROBOT,
 )
-
-
-def claiming(head: bytes) -> Container | None:
-    """Return the container that claims a file by its first bytes, or None."""
-    return next((one for one in CONTAINERS if not one.files and one.claims(head)), None)
 
 
 def folder_container(folder: Path) -> Container | None:
@@ -163,7 +159,8 @@ def _found(path: Path) -> list[Path]:
             )
         return recordings
     matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207
-    every = list(dict.fromkeys(item for match in matches for item in _matched(match)))
+    found = [_within(m) if m.is_dir() else [m] * is_storage_name(m) for m in matches]
+    every = list(dict.fromkeys(chain.from_iterable(found)))
     if matches and not every:
         raise RecordingError(
             f"none of the {len(matches):,} files and folders that match is a recording",
@@ -183,12 +180,6 @@ def _refuse_special(path: Path) -> None:
             where=str(path),
             remedy="write it to a file first: recordings are read from several places at once",
         )
-
-
-def _matched(match: Path) -> list[Path]:
-    if match.is_dir():
-        return _within(match)
-    return [match] if is_storage_name(match) else []
 
 
 def _in_folder(folder: Path) -> list[Path]:
@@ -381,8 +372,8 @@ def container_of(path: Path) -> Container | None:
         )
     if head.startswith(ZSTD_MAGIC):
         return None
-    if container := claiming(head):
-        return container
+    if claiming := [one for one in CONTAINERS if not one.files and one.claims(head)]:
+        return claiming[0]
     raise RecordingError(
         "not a recording: neither an MCAP, a sqlite3 nor a ROS 1 bag file by its first bytes",
         where=where,

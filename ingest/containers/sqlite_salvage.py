@@ -199,14 +199,6 @@ def column(cell: Cell, payload: bytes, number: int) -> bytes:
     return payload[at : at + _size(cell.types[number])]
 
 
-def is_blob(kind: int) -> bool:
-    return kind >= 12 and kind % 2 == 0
-
-
-def is_text(kind: int) -> bool:
-    return kind >= 13 and kind % 2 == 1
-
-
 def _pointers(page: bytes, start: int) -> tuple[int, ...]:
     count = int.from_bytes(page[3:5], "big")
     if not count or start + 2 * count > len(page):
@@ -330,7 +322,11 @@ class SalvagedSqliteFile:
                 topic, stamp = integer(cell, 1), integer(cell, 2)
                 if topic is not None and stamp is not None:
                     yield cell.rowid, topic, stamp, page, place
-            elif len(cell.types) >= 3 and cell.types[0] == 0 and all(map(is_text, cell.types[1:])):
+            elif (
+                len(cell.types) >= 3
+                and cell.types[0] == 0
+                and all(kind >= 13 and kind % 2 for kind in cell.types[1:])
+            ):
                 self._texts.append(cell)
 
     def _channels(self) -> dict[int, Channel]:
@@ -410,5 +406,6 @@ def _is_message(types: tuple[int, ...]) -> bool:
         and types[0] == 0
         and types[1] in INT_SIZES
         and types[2] in INT_SIZES
-        and is_blob(types[3])
+        and types[3] >= 12  # a blob is even, a text odd
+        and types[3] % 2 == 0
     )

@@ -289,7 +289,7 @@ class LiveObserver:
         for topic, messages in self._buffers.items():
             if topic == self.profile.inputs.command.topic:
                 topics[topic], samples[topic] = self._commands(ticks)
-            elif messages or not self._optional(topic):
+            elif messages or not all(source.optional for source in self._inputs[topic]):
                 topics[topic] = _columns(messages)
                 stamps = np.array([message.stamp_ns for message in messages], np.int64)
                 order = np.argsort(stamps, kind="stable")
@@ -363,9 +363,6 @@ class LiveObserver:
         refused = self.ahead if ahead else self.left_out
         refused[topic] = refused.get(topic, 0) + 1
         return None
-
-    def _optional(self, topic: str) -> bool:
-        return all(source.optional for source in self._inputs[topic])
 
 
 def value_of(message: Any, path: str) -> Any:

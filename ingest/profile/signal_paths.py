@@ -366,10 +366,6 @@ def _unless_negative(values: F64, status: F64) -> F64:
     return np.where(status < 0, np.nan, values)
 
 
-def _unless_nan(values: F64) -> F64:
-    return values
-
-
 def _within(values: F64, low: F64, high: F64) -> F64:
     """Return the values with NaN outside the limits; -inf is too close to be measured (REP 117)."""
     near = np.where(np.isneginf(values), low, values)
@@ -406,7 +402,7 @@ CONVENTIONS = (
             *("percentage", "cell_voltage", "cell_temperature"),
         ),
         (),
-        _unless_nan,
+        lambda values: values,
         "NaN",
     ),
     # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". Of

@@ -244,15 +244,10 @@ def _robot_lines(seen: Evidence) -> list[str]:
     return robot.lines(*fastest, outline_guessed=not seen.footprint.measured)
 
 
-def _fixes(seen: Evidence) -> tuple[TopicInfo, Kind] | None:
-    """Return the topic of the fixes that its pose is from, or None."""
-    pose = seen.roles["pose"][:1]
-    return pose[0] if pose and pose[0][1].by_fix else None
-
-
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
     """Write how noisy its poses are, if that is more than a profile's default."""
-    if (fixes := _fixes(seen)) is None:
+    fixes = next(iter(seen.roles["pose"]), None)  # its pose's topic
+    if fixes is None or not fixes[1].by_fix:
         noise_m = trial.pose_noise_m
         if noise_m is None or noise_m <= Noise().localiser_m or not _shows_slip(seen):
             return []

@@ -79,11 +79,6 @@ def parquet_options(schema: pa.Schema) -> dict[str, Any]:
     }
 
 
-def compacted_name() -> str:
-    """Return a new path for a file of several ingests."""
-    return f"compacted/{uuid.uuid4().hex}.parquet"
-
-
 def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
     """Write a compacted file of transitions without the ingests that are not kept."""
     path = f"{TRANSITIONS}/{file.path}"
@@ -116,7 +111,7 @@ def merge(
     held = [*kept, *(Ingest(*ids, 1) for ids in rows)]
     listed = summarised or all(file.listed for file in files)
     schema = schema.with_metadata({INGESTS: packed_ingests(held)} if listed else None)
-    made = AddedFile("", compacted_name(), 0)
+    made = AddedFile("", f"compacted/{uuid.uuid4().hex}.parquet", 0)
     with (
         written_whole(place, f"{name}/{made.path}"),
         place.writing(f"{name}/{made.path}") as sink,
@@ -253,16 +248,9 @@ class TableCommits(StoreReader):
     def expect_folder(self) -> None:
         """Raise StoreError if there is a file, a panel or a run in place of the store."""
         folder = self.path.folder
-        if folder is None or not folder.exists():
-            return
-        if folder.is_file():
-            raise StoreError("is a file, not a store", where=str(self.path), remedy="give a folder")
-        if (kind := self.path.other()) is not None and not self.path.has_table(TRANSITIONS):
-            raise StoreError(
-                f"is {kind}, not a store",
-                where=str(self.path),
-                remedy="give the folder of a store, or of a new one",
-            )
+        other = folder is not None and (folder.is_file() or self.path.other())
+        if other and not self.path.has_table(TRANSITIONS):
+            raise self.path.absent()
 
     def expect_store(self) -> None:
         """Raise StoreError if there is no whole store, or if rows cannot be taken out of it.

@@ -266,7 +266,7 @@ def _joined_from(place: Location, name: str, path: str) -> list[str]:
     There are none if the log does not go back to it.
     """
     log = f"{name}/_delta_log"
-    commits = [one for one in place.listing(log) if one.endswith(".json")]
+    commits = [one for one in place.times(log) if one.endswith(".json")]
     for commit in sorted(commits, reverse=True):
         with place.reading(f"{log}/{commit}") as source:
             actions = [json.loads(line) for line in source.read().splitlines()]

@@ -292,8 +292,6 @@ class StoreReader:
         Of a version, or as it is now.
         """
         schema = recording_schema()
-        if not self.path.has_table(TRANSITIONS):
-            return schema.empty_table()
         shown = [one for one in self.shown(version) if recording_id in (None, one.recording_id)]
         found = self.manifests(shown, schema)
         if version is not None and len(found) < len(shown):
@@ -312,8 +310,7 @@ class StoreReader:
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
         """
-        made = TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
-        one = self._listing(TRANSITIONS).by_recording.get(recording_id) if made else None
+        one = self._listing(TRANSITIONS).by_recording.get(recording_id) if self._made() else None
         if one is None:
             return None
         path = self._listing(RECORDINGS).paths.get(one.ingest_id, [own_path(*one[:2])])[-1]
@@ -387,7 +384,7 @@ class StoreReader:
         import pyarrow.compute as pc  # slow to import
 
         own = own_path(recording_id, ingest_id)
-        files = self._files_of(ingest_id)
+        files = self._listing(TRANSITIONS).paths.get(ingest_id, []) if self._made() else []
         if files in ([], [own]):  # replaced rows, and those in no commit yet, lie there as well
             with damage_named(self.path, f"{TRANSITIONS}/{own}"), suppress(FileNotFoundError):
                 return self.path.read(f"{TRANSITIONS}/{own}")
@@ -402,10 +399,9 @@ class StoreReader:
         reported = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
         return with_ends(rows, reported.get(ingest_id))
 
-    def _files_of(self, ingest_id: str) -> list[str]:
-        """Return the active files of transitions that hold rows of an ingest."""
-        made = TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
-        return self._listing(TRANSITIONS).paths.get(ingest_id, []) if made else []
+    def _made(self) -> bool:
+        """Return whether there is a table of transitions; raise as `has_table`."""
+        return TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
 
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
         """Yield the recording of each of these ingests and the ends of its episodes.
@@ -450,6 +446,8 @@ class StoreReader:
 
     def shown(self, version: Version | None = None) -> list[Ingest]:
         """Return the ingests whose transitions are in the store."""
+        if not self._made():
+            return []
         held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
         return list({one.ingest_id: one for one in held}.values())
 

@@ -232,7 +232,8 @@ class Location:
                             f"has no version {version}: its newest is {newest}", where=self.text
                         )
                     table.load_as_version(version)
-                self._expect_whole(name, table.version())
+                if self.folder is not None:  # S3 keeps all of a commit or nothing; a disk may not
+                    expect_whole(self.folder / name / LOG, table.version(), where=self.text)
                 expect_format(table, where=self.text)
                 expect_readable(table, where=self.text)
                 return table
@@ -247,11 +248,6 @@ class Location:
                 + f": {first_line(error)}",
                 where=self.text,
             ) from error
-
-    def _expect_whole(self, name: str, version: int) -> None:
-        """See that a disk kept a table's commits whole, up to a version; S3 keeps all or none."""
-        if self.folder is not None:
-            expect_whole(self.folder / name / LOG, version, where=self.text)
 
     def goes_on(self, name: str, table: DeltaTable, version: int) -> bool:
         """Return whether a table has commits after a version, at which it was opened."""
@@ -356,10 +352,6 @@ class Location:
         """Read a Parquet file's schema, with its metadata. Raises as `read` does."""
         with self.translate_errors(), self.files.open_input_file(path) as file:
             return plain_text(pq.read_schema(file))
-
-    def listing(self, folder: str) -> set[str]:
-        """Return the files below a folder of the store, by their paths in that folder."""
-        return set(self.times(folder))
 
     def times(self, folder: str) -> dict[str, float]:
         """Return the files below a folder by their paths in it, and when each was written.

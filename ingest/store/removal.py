@@ -116,23 +116,16 @@ def _named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     found = [
         row
         for row in live
-        if (is_prefix and row["recording_id"].startswith(digits)) or _same_path(row, name)
+        if (is_prefix and row["recording_id"].startswith(digits))
+        or _absolute(row["source_file"]) == _absolute(name)
     ]
-    return found or [row for row in live if _ends_with(row, name)]
-
-
-def _same_path(row: Mapping[str, Any], name: str) -> bool:
-    return row["source_file"] == name or _absolute(row["source_file"]) == _absolute(name)
+    parts = PurePath(name).parts  # `logs/b.mcap` ends in `b.mcap`
+    ends = [(row, PurePath(row["source_file"]).parts[-len(parts) :]) for row in live if parts]
+    return found or [row for row, end in ends if end == parts]
 
 
 def _absolute(path: str) -> str:
     return os.path.normpath(Path(path).absolute())
-
-
-def _ends_with(row: Mapping[str, Any], name: str) -> bool:
-    """Return whether a path ends in these parts, as `logs/b.mcap` ends in `b.mcap`."""
-    given = PurePath(name).parts
-    return bool(given) and PurePath(row["source_file"]).parts[-len(given) :] == given
 
 
 def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:

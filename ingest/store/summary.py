@@ -165,7 +165,7 @@ def _tables(recordings: Sequence[tuple[pa.Table, pa.Table]]) -> dict[str, pa.Tab
         custom = any(manifests["signals"].to_pylist())  # whether the profile has its own
         tables = _of_episodes(connection, rows, custom=custom)
         connection.register("transitions", rows.drop_columns(list(WIDE)))
-        connection.execute(_definitions())
+        connection.execute(_query("summary"))
         left = TABLES.keys() - tables.keys() - {"distinctive_rows"}
         return tables | {n: connection.table(n).to_arrow_table() for n in left}
 
@@ -250,11 +250,6 @@ def _database() -> duckdb.DuckDBPyConnection:
 
     atexit.register(_database.cache_clear)  # nanobind complains of what outlives its module
     return duckdb.connect(config={"threads": 1})
-
-
-@cache
-def _definitions() -> str:
-    return with_included("-- include: summary.sql")
 
 
 @cache

@@ -67,10 +67,6 @@ class EpisodeRows:
         custom = self.custom.take(pa.array(ends))
         return label_table(signals, self.episode[ends], self.step[ends], custom)
 
-    def without_signals(self) -> EpisodeRows:
-        """Return the same steps and labels without signals, which take most of the memory."""
-        return replace(self, signals={}, custom=self.custom.select([]))
-
     @classmethod
     def join(cls, parts: Sequence[EpisodeRows]) -> EpisodeRows:
         """Join steps of several groups of episodes, without their signals."""
@@ -231,7 +227,8 @@ def recording_table(
         tables.append(_sharing(made, same))
         del made
         ends.append(rows.ends_table())
-        parts.append(rows.without_signals())
+        # Signals take most of the memory.
+        parts.append(replace(rows, signals={}, custom=rows.custom.select([])))
         done(int(rows.tick.max()) + 1)
     metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
     return _joined(tables).replace_schema_metadata(metadata), EpisodeRows.join(parts)

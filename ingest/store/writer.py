@@ -98,8 +98,7 @@ class StoreWriter(TableCommits):
         `period_s` is the control period: rows further apart than half of it do not count. Those
         `ahead` of it are looked at as if they were in the store, ingests `aside` are not.
         """
-        shown = self.shown() if self.path.has_table(TRANSITIONS) else []
-        others = [one for one in shown if one.ingest_id not in aside]
+        others = [one for one in self.shown() if one.ingest_id not in aside]
         sketches = [
             *self.sketches([one for one in others if one.recording_id != recording.recording_id]),
             *(Sketch.of(one.recording_id, one.ingest_id, one.contents) for one in ahead),
@@ -275,12 +274,8 @@ class StoreWriter(TableCommits):
     def discard(self, staged: Sequence[Staged]) -> None:
         """Delete the files of recordings whose commit has not begun, with their frames."""
         with suppress(OSError, StoreError):
-            for name, files in (
-                (RECORDINGS, [one.rows for one in staged]),
-                (TRANSITIONS, [one.rows for one in staged]),
-                (FRAMES, [one.rows for one in staged]),
-            ):
-                self.path.delete(f"{name}/{file.path}" for file in files)
+            for name in (RECORDINGS, TRANSITIONS, FRAMES):
+                self.path.delete(f"{name}/{one.rows.path}" for one in staged)
 
     def take_back(self, staged: Sequence[Staged]) -> None:
         """Delete the files of recordings whose commit failed or was interrupted.
@@ -347,7 +342,7 @@ class StoreWriter(TableCommits):
         found = self._written_before(FRAMES, retention_hours)
         if not found:
             return []
-        for path in self.path.listing(RECORDINGS):
+        for path in self.path.times(RECORDINGS):
             if path.endswith(".parquet"):
                 try:
                     reported = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])

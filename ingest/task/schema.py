@@ -137,13 +137,15 @@ PROVENANCE: tuple[Column, ...] = (
 )
 
 
-def _signal_type(dtype: str) -> pa.DataType:
-    return {"int64": pa.int64(), "bool": pa.bool_()}.get(dtype, pa.float32())
-
-
+_TYPES = {"int64": pa.int64(), "bool": pa.bool_()}
 # float32 holds a millimetre up to 16 km from the map's origin; stamps stay int64.
 SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
-    Column(signal.name, _signal_type(signal.dtype), signal.meaning, nullable=signal.optional)
+    Column(
+        signal.name,
+        _TYPES.get(signal.dtype, pa.float32()),
+        signal.meaning,
+        nullable=signal.optional,
+    )
     for signal in STORED_SIGNALS
 )
 

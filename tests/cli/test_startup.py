@@ -59,8 +59,7 @@ def test_a_review_page_imports_no_learning_and_no_charts(store: Path, tmp_path: 
 def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     command = ("ingest", str(write_bag(Drive(), tmp_path / "bag")), "--store", str(tmp_path / "s"))
     assert loaded(*command, "--json") & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
-    known = loaded(*command)
-    assert known & {"typeguard", "asyncio", "duckdb", "pyarrow.compute"} == set()
+    assert loaded(*command) & {"typeguard", "asyncio", "duckdb", "pyarrow.compute"} == set()
 
 
 @pytest.mark.parametrize(
