@@ -155,13 +155,13 @@ def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
     def failing(*args, **kwargs):
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr("restock.ingest.pipeline.prepare", failing)
+    monkeypatch.setattr("restock.ingest.pipeline.preparing", failing)
     failed = IngestJob(load_profile("warehouse_amr"), None).prepare(Path("nas/run.mcap"))
     assert "nas/run.mcap: cannot be read or written: Input/output error" in str(failed)
 
 
 def test_developers_see_where_a_recording_failed(bags, monkeypatch, capsys):
-    monkeypatch.setattr("restock.ingest.pipeline.prepare", lambda path, *_, **__: path.no_such)
+    monkeypatch.setattr("restock.ingest.pipeline.preparing", lambda path, *_, **__: path.no_such)
     arguments = ["ingest", str(bags / "drive1"), "--dry-run", "--json"]
     assert main(arguments) == 2
     said = capsys.readouterr().err
