@@ -1,13 +1,14 @@
 """The store, for writing: two Delta tables of plain Parquet, and commits that are atomic.
 
-`recordings` holds one manifest row an ingest, `transitions` the rows; `ingest_id` joins them, and
-both files of an ingest have the same name in their tables. The manifest is committed first and the
-transitions second, so an ingest that is cut between the two is a manifest that joins nothing, and
-a reader sees each recording whole or not at all. A recording that is ingested again replaces its
-old rows in the same commit that adds the new ones; the manifests of what was replaced go last, by
-the writer that replaced it. A manifest that joins nothing yet is removed by its age only: another
-writer may be about to commit its transitions. Files outlive their removal by the same window, so
-that who opened a version before can read it: its manifests too, by the names of its rows' files.
+`recordings` holds one manifest row an ingest, `transitions` the rows; `ingest_id` joins them. Both
+files of an ingest have the same name, unless many of a commit share one of manifests. The manifest
+is committed first and the transitions second, so an ingest that is cut between the two is a
+manifest that joins nothing, and a reader sees each recording whole or not at all. A recording that
+is ingested again replaces its old rows in the same commit that adds the new ones; the manifests of
+what was replaced go last, by the writer that replaced it. A manifest that joins nothing yet is
+removed by its age only: another writer may be about to commit its transitions. Files outlive their
+removal by the same window, so that who opened a version before can read it: its manifests too, by
+the names of its rows' files.
 
 Frames of cameras are plain Parquet in `frames`, one file per ingest, written before both commits. A
 file is kept as long as a manifest names it.
