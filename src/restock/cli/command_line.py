@@ -29,7 +29,9 @@ _checked = getattr(_TYPES, "is_instance", None)
 if _TYPES is not None and _checked is not None:
     # For the items of a tuple tyro imports typeguard, and with that asyncio: a sixth of an ingest.
     _TYPES.is_instance = lambda kind, value: (  # type: ignore[attr-defined]
-        isinstance(value, tuple) if typing.get_origin(kind) is tuple else _checked(kind, value)
+        isinstance(value, tuple)
+        if getattr(kind, "__origin__", 0) is tuple
+        else _checked(kind, value)
     )
 _PREPARED: list[type[Any]] = []
 _EXPLAINED: list[type[Any]] = []
