@@ -601,7 +601,10 @@ class Definitions:
             return
         raw = bytes(buffer[at - PREFIX : stop])
         # All recordings of a robot define the same.
-        number, record = (_defined if len(raw) < MAX_KEPT else _defined.__wrapped__)(raw)
+        try:
+            number, record = (_defined if len(raw) < MAX_KEPT else _defined.__wrapped__)(raw)
+        except Malformed as bad:
+            raise Malformed(bad.what, at - PREFIX + bad.at) from None
         self.raw[opcode, number] = raw
         if isinstance(record, SchemaRecord):
             self.schemas[number] = record

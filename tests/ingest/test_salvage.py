@@ -33,11 +33,8 @@ def read(path: Path) -> tuple[int, list[str], int]:
         accounts = recording.accounts.values()
         decoded = sum(account.decoded for account in accounts)
         assert recording.integrity == "damaged"
-        return (
-            decoded,
-            [loss.reason for loss in recording.lost_messages],
-            sum(account.lost for account in accounts),
-        )
+        lost = sum(account.lost for account in accounts)
+        return decoded, [loss.reason for loss in recording.lost_messages], lost
 
 
 def damaged(path: Path, at: int, content: bytes, *, drop_end: int = 0) -> Path:
@@ -88,12 +85,14 @@ def test_a_wrong_length_that_leads_astray(tmp_path: Path) -> None:
 def test_without_a_summary_chunks_show_themselves(compression, tmp_path):
     path = write_mcap(tmp_path / "run.mcap", compression=compression)
     places = chunks_of(path)
-    held = sum(McapFile(path)._contents.chunks[2].counts().values())
-    wreck = b"\x05" + HUGE + b"\xff" * 60
-    decoded, reasons, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
+    chunks = McapFile(path)._contents.chunks
+    held = sum(sum(chunks[number].counts().values()) for number in (2, 4))
+    channel = b"\x04" + (99).to_bytes(8, "little") + bytes(4) + b"\xff" * 4  # a long topic
+    damaged(path, places[4][0], channel)
+    decoded, reasons, _ = read(damaged(path, places[2][0], b"\x05" + HUGE, drop_end=50))
     assert decoded == COUNT - held
-    lost = places[3][0] - places[2][0]
-    assert any(loss.startswith(f"{lost:,} bytes from byte {places[2][0]:,} on") for loss in reasons)
+    for begin, end in ((places[2][0], places[3][0]), (places[4][0] + 17, places[5][0])):
+        assert any(f"{end - begin:,} bytes from byte {begin:,} on" in loss for loss in reasons)
 
 
 def test_of_a_chunk_that_is_cut_what_is_read_is_not_called_lost(tmp_path: Path) -> None:
