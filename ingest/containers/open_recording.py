@@ -372,8 +372,8 @@ def container_of(path: Path) -> Container | None:
         )
     if head.startswith(ZSTD_MAGIC):
         return None
-    if claiming := [one for one in CONTAINERS if not one.files and one.claims(head)]:
-        return claiming[0]
+    if claim := next((one for one in CONTAINERS if not one.files and one.claims(head)), None):
+        return claim
     raise RecordingError(
         "not a recording: neither an MCAP, a sqlite3 nor a ROS 1 bag file by its first bytes",
         where=where,
