@@ -36,7 +36,6 @@ from restock.errors import TRACEBACK, ConfigError, RecordingError, RestockError,
 from restock.process import alone, import_extra, in_step
 
 if TYPE_CHECKING:
-    from restock.errors import RestockError
     from restock.ingest.containers.storage import Watch
     from restock.ingest.pipeline import CommitGroup, IngestResult, OnRepeat, Prepared
     from restock.ingest.profile.profile import Profile

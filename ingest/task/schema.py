@@ -140,13 +140,8 @@ PROVENANCE: tuple[Column, ...] = (
 _TYPES = {"int64": pa.int64(), "bool": pa.bool_()}
 # float32 holds a millimetre up to 16 km from the map's origin; stamps stay int64.
 SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
-    Column(
-        signal.name,
-        _TYPES.get(signal.dtype, pa.float32()),
-        signal.meaning,
-        nullable=signal.optional,
-    )
-    for signal in STORED_SIGNALS
+    Column(one.name, _TYPES.get(one.dtype, pa.float32()), one.meaning, nullable=one.optional)
+    for one in STORED_SIGNALS
 )
 
 COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS + PROVENANCE

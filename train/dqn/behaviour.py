@@ -42,6 +42,7 @@ from restock.train.dqn.network import (
     differentiable,
 )
 
+Values = QNetwork | Ensemble
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
 HIDDEN = (256, 256)  # widths of the behaviour network's layers
 _LEARNING_RATE = 1e-3
@@ -78,12 +79,7 @@ class FilteredNetwork(nn.Module):
 
     ratio: Tensor
 
-    def __init__(
-        self,
-        values: QNetwork | Ensemble,
-        behaviour: QNetwork | Ensemble,
-        ratio: Tensor | None = None,
-    ) -> None:
+    def __init__(self, values: Values, behaviour: Values, ratio: Tensor | None = None) -> None:
         super().__init__()
         self.values, self.behaviour = values, behaviour
         self.observation_size, self.actions = values.observation_size, values.actions
@@ -111,9 +107,7 @@ class ProposalNetwork(nn.Module):
     offset: Tensor  # (A,)
     lead: Tensor  # (D,), the margin where a proposal is known
 
-    def __init__(
-        self, values: QNetwork | Ensemble, proposal: Proposal | None, margin: float
-    ) -> None:
+    def __init__(self, values: Values, proposal: Proposal | None, margin: float) -> None:
         """`proposal` None: buffers wait for kept weights."""
         super().__init__()
         self.values = values
@@ -139,7 +133,7 @@ class ProposalNetwork(nn.Module):
         return q + self.preference(observation)
 
 
-PolicyNetwork = QNetwork | Ensemble | FilteredNetwork | ProposalNetwork
+PolicyNetwork = Values | FilteredNetwork | ProposalNetwork
 
 
 def make_behaviour(

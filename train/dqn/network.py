@@ -337,7 +337,8 @@ class FlatAdam(Stateful):
         self._step = torch.zeros(len(self._moved[0]), device=device)
         self._steps = 0
         if compiled:
-            self._arrays = [tensor.detach().numpy() for tensor in whole]
+            values, gradient, mean, square = (tensor.detach().numpy() for tensor in whole)
+            self._arrays = values, gradient, mean, square
 
     @torch.no_grad()
     def step(self, average: Tensor | None = None, rate: float = 0.0) -> None:

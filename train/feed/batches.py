@@ -215,10 +215,8 @@ class Batches(Stateful):
             self._draws.gather(drawn.rows, read.numpy())
 
         def gather() -> Tensor:
-            logged, rows = (
-                len(drawn.rows),
-                torch.empty(len(drawn.rows) + len(slots), self._fresh.shape[1]),
-            )
+            logged = len(drawn.rows)
+            rows = torch.empty(logged + len(slots), self._fresh.shape[1])
             if read is not None:
                 rows[:logged] = read
             elif self.logs is not None and logged:

@@ -274,7 +274,6 @@ def _expected(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, 
     x, y = (into_frame(pose[:, :2], floor.map_origin) + move + ahead).T[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
         along = 1 / np.stack([np.cos(yaw + bearing), np.sin(yaw + bearing)])
-
         nearest = np.full(along.shape[1:], 1e6)
         for rack in (Rect(0.0, 0.0, floor.width_m, floor.depth_m), *floor.racks):
             ends = [np.stack([rack.edges[at] - x, rack.edges[at + 1] - y]) * along for at in (0, 2)]
@@ -329,10 +328,8 @@ def _style(rows: FedRows) -> F64:
     near = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     shown = [speed, np.abs(turn), turn * near, np.abs(turn - near), speed * np.abs(near)]
     shown += [rows.action != rows.previous_action(), speed * rows.now("goal_distance")]
-    shown += [
-        np.abs(rows.now("nav_speed") - speed),
-        np.abs(rows.now("nav_yaw_rate") - turn) * rows.now("nav_known"),
-    ]
+    shown.append(np.abs(rows.now("nav_speed") - speed))
+    shown.append(np.abs(rows.now("nav_yaw_rate") - turn) * rows.now("nav_known"))
     if rows.task.lidar:
         middle = rows.task.sectors // 2
         shown.append(speed * rows.sectors()[:, middle - 2 : middle + 2].min(axis=1))

@@ -262,6 +262,11 @@ class Warehouse:
         return np.where(inside.any(axis=1), inside.argmax(axis=1), -1).astype(np.int64)
 
     @cached_property
+    def rack_boxes(self) -> F64:
+        """Return the middle and the half size of each rack, (R, 4)."""
+        return np.array([(*rack.center, *rack.half_size) for rack in self.racks]).reshape(-1, 4)
+
+    @cached_property
     def segment_edges(self) -> F64:
         """Return x_min, y_min, x_max, y_max of each aisle segment, (S, 4)."""
         return np.array([segment.area.edges for segment in self.segments]).reshape(-1, 4)

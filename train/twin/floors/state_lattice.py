@@ -334,9 +334,10 @@ def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64
     floor made of scans has hundreds. `own` (n, K, 4) are middles and half sizes.
     """
     room = np.ascontiguousarray(_wall_gap(floor, x, y))
-    racks = np.array([(*rack.center, *rack.half_size) for rack in floor.racks]).reshape(-1, 4)
+    racks = floor.rack_boxes
     if native.is_used():
-        native.compiled.near_boxes(*map(np.ravel, (x, y, racks, own, room)), len(x), within_m)
+        boxes = racks.ravel(), own.ravel(), room.ravel()
+        native.compiled.near_boxes(x.ravel(), y.ravel(), *boxes, len(x), within_m)
         return room
     over, each = tuple(range(1, x.ndim)), (4, -1, *(1,) * (x.ndim - 1))
     low = np.stack([x.min(axis=over), y.min(axis=over)], axis=-1) - within_m  # (n, 2)
