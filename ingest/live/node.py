@@ -156,6 +156,7 @@ class Ros:
     Clock: Any
     ClockType: Any
     SignalHandlerOptions: Any
+    Duration: Any
     get_message: Any  # "std_msgs/msg/Bool" -> its class
 
     def sensor_qos(self) -> Any:
@@ -187,6 +188,7 @@ def load_ros() -> Ros:
         "rclpy.executors": ("MultiThreadedExecutor",),
         "rclpy.clock": ("Clock", "ClockType"),
         "rclpy.signals": ("SignalHandlerOptions",),
+        "rclpy.duration": ("Duration",),
     }
     try:
         found = {
@@ -212,6 +214,7 @@ def _message_class(kind: str) -> Any:
 DIAGNOSTICS_S = 1.0
 DISCOVERY_S = 1.0
 MAX_AHEAD_S = 0.2  # of a stamp to the node's clock: simulators publish /clock at 10 Hz and more
+ACKED_S = 0.5  # a listener that hangs holds a last stop back at most this long, per topic
 WAKE_S = 0.2  # a signal is heard after at most this time
 NAME = "restock_policy"
 
@@ -325,7 +328,18 @@ class PolicyNode:
                 self._command(0.0, 0.0)
                 assert self.pilot is not None
                 self._say(self.pilot.profile.behaviour_policy)
+                self._await_delivery()
             self.active = False
+
+    def _await_delivery(self) -> None:
+        """Wait until the listeners have the stop: what is unsent is lost with its publisher."""
+        for name in ("command", "behaviour"):
+            try:
+                acked = self._published[name].wait_for_all_acked(self.ros.Duration(seconds=ACKED_S))
+            except RuntimeError:  # this middleware cannot say
+                continue
+            if not acked:
+                self._log(f"last {name}: not all who listen had it within {ACKED_S:g} s")
 
     def cleanup(self) -> None:
         """Take down what `configure` made."""

@@ -85,6 +85,7 @@ class Graph:
             Clock=lambda clock_type: clock_type,
             ClockType=ClockType,
             SignalHandlerOptions=None,
+            Duration=lambda seconds: seconds,
             get_message=message_class,
         )
 
@@ -120,11 +121,17 @@ class message_class:
 class Publisher:
     def __init__(self, graph: Graph, topic: str, qos: QoS | int, *, enabled: bool) -> None:
         self.graph, self.topic, self.enabled = graph, topic, enabled
+        self.unsent: tuple[int, str, Any] | None = None  # goes with its publisher
         self.qos = QoS(qos) if isinstance(qos, int) else qos
 
     def publish(self, message: Any) -> None:
         if self.enabled:
             self.graph.send(self.topic, message, self.qos)
+            self.unsent = self.graph.sent[-1]
+
+    def wait_for_all_acked(self, timeout_s: float) -> bool:
+        self.unsent = None
+        return True
 
 
 class LifecycleNode:
@@ -195,6 +202,8 @@ class LifecycleNode:
     def destroy_lifecycle_publisher(self, publisher: Publisher) -> None:
         self._managed.remove(publisher)
         publisher.enabled = False
+        if publisher.unsent is not None:
+            self.graph.sent.remove(publisher.unsent)
 
     def destroy_subscription(self, subscription: Any) -> None:
         topic, entry = subscription
