@@ -1,27 +1,22 @@
-"""Several recordings: one after the other, in several processes, or on a Ray cluster.
+"""Several recordings: one after the other, or in several processes.
 
 If a process dies (killed, or out of memory), the recording it was reading fails by name; another
 process replaces it. The processes write files. This process commits them, several at once, so that
 a fleet's recordings are not two commits each. Processes are forked from a server that has imported
 what they need once: forking this process, with its threads, would not be safe. The server imports
 in parallel with this process.
-
-On a Ray cluster (of RAY_ADDRESS, or one started on this machine) every machine must have Restock
-installed, and see recordings and store by the same paths: a shared file system, or a store on S3.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import re
 import signal
-import socket
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from multiprocessing import forkserver
@@ -30,10 +25,10 @@ from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, Union
 
-from restock.errors import TRACEBACK, ConfigError, RecordingError, RestockError, print_traceback
-from restock.process import alone, import_extra, in_step
+from restock.errors import TRACEBACK, RecordingError, RestockError, print_traceback
+from restock.process import alone, in_step
 
 if TYPE_CHECKING:
     from restock.ingest.containers.storage import Watch
@@ -42,7 +37,6 @@ if TYPE_CHECKING:
     from restock.ingest.store.writer import StoreWriter
 
 Result = tuple[Path, Union["IngestResult", RestockError]]
-Engine = Literal["processes", "ray"]
 A = TypeVar("A")
 T = TypeVar("T")
 D = TypeVar("D")
@@ -149,18 +143,14 @@ def ingest_all(
     job: IngestJob,
     *,
     workers: int = 1,
-    engine: Engine = "processes",
     watch: Watch | None = None,
 ) -> Iterator[Result]:
     """Yield each recording's outcome or error, in the order of `paths`, after its commit.
 
     One worker reads a recording and writes its files. This process commits the files of some
-    seconds together, so the store is the same as with one worker. With Ray, `workers` is the number
-    of processes if Ray is started on this machine. `watch` gets the progress of a recording if they
-    are read one after the other. If the caller stops early, uncommitted recordings are not kept.
-
-    Raises:
-        ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
+    seconds together, so the store is the same as with one worker. `watch` gets the progress of a
+    recording if they are read one after the other. If the caller stops early, uncommitted
+    recordings are not kept.
     """
     from restock.ingest.pipeline import CommitGroup
 
@@ -168,12 +158,10 @@ def ingest_all(
     here = replace(job)  # others get the job without what its writer has read
     group = CommitGroup(here.writer)
     some = min(workers, len(taken))
-    if engine == "ray":
-        read = prepare_on_ray(job, taken, workers=workers, patience_s=group.due_in_s)
-    elif some <= 1:
-        read = _one_by_one(here, taken, group, watch)
-    else:
+    if some > 1:
         read = _by_workers(job, taken, some, group)
+    else:
+        read = _one_by_one(here, taken, group, watch)
     next_up = 0
     try:
         with closing(read):
@@ -380,112 +368,3 @@ def _size(path: object) -> int:
         return sum(map(_size, path if isinstance(path, Sequence) else ()))
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
-
-
-CONNECT_S = 5
-ENVIRONMENT = "AWS_"  # what the tasks are given of this process's environment
-
-
-def prepare_on_ray(
-    job: IngestJob,
-    paths: Sequence[Path],
-    *,
-    workers: int = 1,
-    patience_s: Callable[[], float | None] = lambda: None,
-) -> Generator[tuple[int, Prepared | RestockError] | None]:
-    """Yield what was made of each recording, with its place in `paths`, as it comes.
-
-    Yields None if nothing came for `patience_s()` seconds. Nothing is committed here.
-
-    Raises:
-        ConfigError: Ray is not installed, or the cluster does not answer.
-    """
-    with cluster(workers) as ray:
-        # A task that died may have written files: it is not tried again unasked.
-        task = ray.remote(_task).options(num_cpus=1, max_retries=0)
-        aws = {name: value for name, value in os.environ.items() if name.startswith(ENVIRONMENT)}
-        begun = {
-            task.remote(job, path, str(Path.cwd()), aws): place for place, path in enumerate(paths)
-        }
-        while begun:
-            ready, _ = ray.wait(list(begun), timeout=patience_s())
-            if not ready:
-                yield None
-            for result in ready:
-                place = begun.pop(result)
-                yield place, _answer(ray, result, paths[place])
-
-
-def _answer(ray: Any, result: Any, path: Path) -> Prepared | RestockError:
-    try:
-        answer: Prepared | RestockError = ray.get(result)
-    except ray.exceptions.OutOfMemoryError:
-        return out_of_memory(path)
-    except ray.exceptions.RayError as error:
-        return RecordingError(
-            f"the process that read it died ({type(error).__name__})", where=str(path), remedy=AGAIN
-        )
-    return answer
-
-
-@contextmanager
-def cluster(workers: int) -> Iterator[Any]:
-    """Return Ray, connected to a cluster."""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
-    ray = import_extra("ray", "the engine ray")
-    if ray.is_initialized():  # by the caller
-        yield ray
-        return
-    address = os.environ.get("RAY_ADDRESS")
-    _expect(address)
-    quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
-    try:
-        if address:
-            ray.init(address=address, **quiet)
-        else:
-            ray.init(address="local", num_cpus=max(workers, 1), include_dashboard=False, **quiet)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise ConfigError(
-            f"no Ray cluster at {address}: {str(error).splitlines()[0]}"
-            if address
-            else f"Ray does not start: {str(error).splitlines()[0]}",
-            remedy="check RAY_ADDRESS, or unset it to start one here" if address else None,
-        ) from error
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
-
-
-def _expect(address: str | None) -> None:
-    """Check that a cluster's address answers: Ray itself would wait for minutes."""
-    match = re.fullmatch(r"(?:ray://)?([^:/]+):(\d+)", address or "")
-    if match is None:  # none, or a word like "auto"
-        return
-    try:
-        socket.create_connection((match[1], int(match[2])), timeout=CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        raise ConfigError(
-            f"no Ray cluster at {address}: {error}",
-            remedy="check RAY_ADDRESS, or unset it to start one here",
-        ) from error
-
-
-def _task(
-    job: IngestJob, path: Path, folder: str, environment: dict[str, str]
-) -> Prepared | RestockError:
-    """Prepare one recording on whatever machine runs the task."""
-    from restock.ingest.containers.mcap_file import ChunkReader
-
-    ChunkReader.ahead = False  # the task was given one core
-    os.environ.update(environment)
-    try:
-        os.chdir(folder)
-    except OSError:
-        return RecordingError(
-            f"the worker machine has no folder {folder}",
-            where=str(path),
-            remedy="put the recordings in a folder that all machines of the cluster can read",
-        )
-    return job.prepare(path)

@@ -187,7 +187,6 @@ EXTRAS = {
     **dict.fromkeys(("av", "h5py", "minari", "stable_baselines3", "tianshou"), "libraries"),
     **dict.fromkeys(("wandb", "mlflow"), "track"),
     "mcp": "mcp",
-    "ray": "ray",
 }
 
 

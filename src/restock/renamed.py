@@ -144,7 +144,7 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "twin layout --png": "give the picture to --out, too: --out floor.toml --out floor.png",
     "coverage gaps --by": "leave it out: a cell is a condition, zone, action and robot",
     "gate --junit": "it is always RUN/gate/junit.xml",
-    "ingest --engine": 'from Python: ingest_all(paths, job, engine="ray")',
+    "ingest --engine": "call restock.ingest.ingest in the cluster's tasks: docs/scale.md",
     "mix --verify": "it is `restock store verify PANEL` now",
     "store label --all": "give the profile the name of the recordings' own",
     "store label --review": "`restock review STORE` shows the events on a page; --out review.csv",
