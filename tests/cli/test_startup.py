@@ -43,7 +43,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_query_imports_no_learning_and_no_readers(store: Path) -> None:
     modules = loaded("sql", str(store), "FROM coverage, transitions LIMIT 9", "--json")
-    assert modules & (SLOW | {"pyarrow.compute", "rich"}) == set()
+    assert modules & (SLOW | {"pyarrow.compute", "rich", "tyro"}) == set()
     assert "duckdb" in modules
 
 
@@ -59,7 +59,7 @@ def test_a_review_page_imports_no_learning_and_no_charts(store: Path, tmp_path: 
 def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     command = ("ingest", str(write_bag(Drive(), tmp_path / "bag")), "--store", str(tmp_path / "s"))
     assert loaded(*command, "--json") & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
-    assert loaded(*command) & {"typeguard", "asyncio", "duckdb", "pyarrow.compute"} == set()
+    assert loaded(*command) & {"asyncio", "duckdb", "pyarrow.compute", "tyro"} == set()
 
 
 @pytest.mark.parametrize(

@@ -228,24 +228,17 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
     if FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
         _start_no_blas_threads()
 
-    import tyro
+    from restock.cli.words import parse_plain, refuse_empty_paths
 
-    from restock.cli.command_line import prepared, printed, refuse_empty_paths
+    command = command_of(name)
+    parsed = parse_plain(command, rest)
+    if parsed is None:
+        from restock.cli.command_line import parse
 
-    explained = bool({"-h", "--help"} & set(rest))
-    try:
-        command = prepared(command_of(name), explained=explained)
-        with printed(help_asked=explained):
-            parsed = tyro.cli(
-                command,
-                prog=prog,
-                description=command.__doc__ if explained else None,
-                args=rest,
-                use_underscores=False,
-                config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
-            )
-    except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
-        return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
+        try:
+            parsed = parse(command, prog, rest)
+        except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
+            return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     if any(not arg or (arg.startswith("--") and arg.endswith("=")) for arg in rest):
         refuse_empty_paths(parsed)
     with work_goes_on() if name in PRINTS_ON_THE_WAY else nullcontext():

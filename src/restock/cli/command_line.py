@@ -11,42 +11,29 @@ import re
 import shutil
 import sys
 import textwrap
-import types
 import typing
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
 import tyro
 
 from restock.cli import COMPLETION, JOBS, VERBS, command_of
+from restock.cli.words import Positional, Repeated, declared
 from restock.errors import ConfigError, ExitCode
 
-_TYPES = sys.modules.get("tyro._resolver")
-_checked = getattr(_TYPES, "is_instance", None)
-if _TYPES is not None and _checked is not None:
-    # For the items of a tuple tyro imports typeguard, and with that asyncio: a sixth of an ingest.
-    _TYPES.is_instance = lambda kind, value: (  # type: ignore[attr-defined]
-        isinstance(value, tuple)
-        if getattr(kind, "__origin__", 0) is tuple
-        else _checked(kind, value)
-    )
 _PREPARED: list[type[Any]] = []
-_EXPLAINED: list[type[Any]] = []
 MIN_PROSE = 80  # columns that prose may take above narrower boxes, where the window has them
 MIN_COLUMNS = 30  # columns: in a few, tyro lays its boxes out without end
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _OPTIONS = re.compile(r"\[(?:OPTIONS|-(?:[^][]|\[[^][]*\])*)\] ?")  # in a line of usage
+_MARKS = {Positional: tyro.conf.Positional, Repeated: tyro.conf.UseAppendAction}
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
-def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
-    """Return the dataclass with types for which tyro's help is plain and its parsing quick.
-
-    Args:
-        explained: also read the text of each option, because help is about to be printed.
+def prepared(command: type[Any]) -> type[Any]:
+    """Return the dataclass with types of which tyro makes plain help, and each option's text.
 
     `X | None` becomes `Optional[X]`, whose values tyro checks itself; for `X | None` it imports
     typeguard, and with that asyncio. An optional option shows what it takes, not `{None}|STR`, and
@@ -54,18 +41,12 @@ def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
     """
     if command not in _PREPARED:
         _PREPARED.append(command)
-        hints = typing.get_type_hints(command, include_extras=True)
-        for field in dataclasses.fields(command):
-            field.type = _prepared(hints[field.name], field.default)
-            command.__annotations__[field.name] = field.type
-    if explained and command not in _EXPLAINED:
-        _EXPLAINED.append(command)
-        texts = _texts(command)
+        hints, texts = typing.get_type_hints(command, include_extras=True), _texts(command)
         command.__doc__ = _joined(inspect.getdoc(command) or "")
         for field in dataclasses.fields(command):
-            if text := texts.get(field.name):
-                field.type = Annotated[field.type, tyro.conf.arg(help=text)]
-                command.__annotations__[field.name] = field.type
+            marked = _prepared(hints[field.name], field.default)
+            field.type = Annotated[marked, tyro.conf.arg(help=texts.get(field.name))]
+            command.__annotations__[field.name] = field.type
     return command
 
 
@@ -90,74 +71,45 @@ def _joined(text: str) -> str:
     return "\n\n".join(one if one.startswith(" ") else " ".join(one.split()) for one in paragraphs)
 
 
-def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> None:
-    """Refuse options that would do nothing: those of these fields whose value is not the default.
-
-    Raises:
-        ConfigError: one was given.
-    """
-    for field in dataclasses.fields(command):
-        if field.name in names and getattr(command, field.name) != field.default:
-            name = field.name.removesuffix("_dir").replace("_", "-")
-            raise ConfigError(
-                why, where=f"--no-{name}" if field.default is True else f"--{name}", remedy=remedy
-            )
-
-
-def refuse_empty_paths(command: Any) -> None:
-    """Refuse paths that were given as an empty word: Python takes that for the working directory.
-
-    Raises:
-        ConfigError: there is one; names the option or the argument.
-    """
-    for field in dataclasses.fields(command):
-        value = getattr(command, field.name)
-        if Path() in (value if isinstance(value, list | tuple) else (value,)):
-            raise ConfigError(
-                "the path is empty: is a variable of the shell not set?",
-                where=field.name.replace("_", "-"),
-                remedy='give a path; "." is the working directory',
-            )
-
-
 def _prepared(hint: Any, default: Any) -> Any:
-    """Return a type with its metavar and its hint on the default, unless it has its own."""
-    bare, *extras = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
-    if typing.get_origin(bare) in (types.UnionType, typing.Union):
-        kinds = [kind for kind in typing.get_args(bare) if kind is not type(None)]
-        optional = len(kinds) < len(typing.get_args(bare))
-        bare = typing.Optional[kinds[0]] if optional else typing.Union[tuple(kinds)]  # noqa: UP007, UP045
-        if optional and typing.get_origin(kinds[0]) is Literal:
-            extras.insert(0, _one_of(kinds[0]))
-        elif optional:
-            extras.insert(0, tyro.conf.arg(metavar=_metavar(kinds[0])))
-    elif bare in _METAVARS:
-        extras.insert(0, tyro.conf.arg(metavar=_METAVARS[bare]))
-    if default in (None, ()) or isinstance(default, bool) or typing.get_origin(bare) is tuple:
-        extras.insert(0, tyro.conf.arg(help_behavior_hint=""))
-    return Annotated[(bare, *extras)] if extras else bare
-
-
-def _one_of(literal: Any) -> tyro.constructors.PrimitiveConstructorSpec[str | None]:
-    """Describe an option that takes one of a few names, or is left out.
-
-    tyro's own also takes None, and lists it among the names, in an order that changes.
-    """
-    names = typing.get_args(literal)
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=_metavar(literal),
-        instance_from_str=lambda given: given[0],
-        is_instance=lambda value: value is None or value in names,
-        str_from_instance=lambda value: [str(value)],
-        choices=names,
-    )
+    """Return a type with tyro's marks of what it is declared to be, and its hint on the default."""
+    kind, optional, how = declared(hint)
+    choices: Any = Literal[how.choices] if how.choices else None
+    if optional and typing.get_origin(kind) is Literal:  # of which tyro would list None, too
+        choices = kind
+    shown = choices or optional or kind in _METAVARS
+    silent = default in (None, ()) or isinstance(default, bool) or typing.get_origin(kind) is tuple
+    marks: list[Any] = [
+        how,  # for `parse_plain`
+        tyro.conf.arg(
+            name=how.name,
+            metavar=how.metavar or (_metavar(choices or kind) if shown else None),
+            constructor=choices,
+            help_behavior_hint="" if silent else None,
+        ),
+    ]
+    marks += [mark for cls, mark in _MARKS.items() if isinstance(how, cls)]
+    return Annotated[(typing.Optional[kind] if optional else kind, *marks)]  # noqa: UP045
 
 
 def _metavar(kind: Any) -> str:
     if typing.get_origin(kind) is Literal:
         return "{" + ",".join(map(str, typing.get_args(kind))) + "}"
     return _METAVARS.get(kind) or str(getattr(kind, "__name__", kind)).upper()
+
+
+def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
+    """Parse a command line with tyro, which exits after printing its help or its complaint."""
+    command = prepared(command)
+    with printed(help_asked=bool({"-h", "--help"} & set(words))):
+        return tyro.cli(
+            command,
+            prog=prog,
+            description=command.__doc__,
+            args=words,
+            use_underscores=False,
+            config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
+        )
 
 
 class _Held(io.TextIOWrapper):

@@ -17,9 +17,8 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from restock.cli.output import plain
+from restock.cli.words import Positional
 from restock.errors import ConfigError, QueryError, RestockError, RunError
 from restock.process import expect_installed
 
@@ -40,7 +39,7 @@ class McpCommand:
     An assistant starts it itself: name `restock-mcp PLACE` in its settings.
     """
 
-    place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PLACE")]
+    place: Annotated[str, Positional("PLACE")]
     """What the questions are about."""
     rows: int = 200
     """How many rows of a query, or entries of a list, an answer has at most."""

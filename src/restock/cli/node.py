@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
-
 from restock.cli.output import print_json, say
+from restock.cli.words import Option, Positional
 from restock.errors import ConfigError, quoted
 
 if TYPE_CHECKING:
@@ -27,18 +26,18 @@ class NodeCommand:
     Example: `restock-node policy.onnx --activate --ros-args -p use_sim_time:=true`
     """
 
-    policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY.onnx")]
+    policy: Annotated[Path, Positional("POLICY.onnx")]
     """The policy file that `restock export RUN --to onnx` wrote."""
     drive: bool = False
     """Publish commands: sets the parameter shadow to false."""
     activate: bool = False
     """Configure and activate at once, without a lifecycle manager."""
-    on: Annotated[Path | None, tyro.conf.arg(metavar="RECORDING")] = None
+    on: Annotated[Path | None, Option("RECORDING")] = None
     """Instead of starting a node, play this recording to the policy with its limiter, and print the
     results."""
-    profile: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    profile: Annotated[str | None, Option("NAME|FILE")] = None
     """With --on: use this profile instead of the one in the policy file."""
-    write_profile: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
+    write_profile: Annotated[Path | None, Option("FILE.toml")] = None
     """Write the policy's profile with extra columns for the topics that the node publishes, to
     ingest recordings of drives with this policy."""
 

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import duckdb
-import tyro
 
 from restock.cli import output
-from restock.cli.command_line import refuse
+from restock.cli.words import Option, Positional, refuse
 from restock.errors import ConfigError, ExitCode, RestockError, RunError, quoted
 from restock.files import expect_file_place, read_json, write_text
 from restock.ingest.store.location import Location
@@ -56,22 +55,20 @@ class AuditCommand:
     Example: `restock audit store/ runs/a --against store@41 --baseline runs/main`
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store to audit. With --reward, it may also be a run."""
-    second: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL|RUN]")] = (
-        None
-    )
+    second: Annotated[Path | None, Positional("[PANEL|RUN]")] = None
     """Also audit a panel that was made from the store, or the evaluation of a run."""
-    third: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")] = None
+    third: Annotated[Path | None, Positional("[RUN]")] = None
     """And the other of the two, in either order."""
-    against: Annotated[str | None, tyro.conf.arg(metavar="OLD")] = None
+    against: Annotated[str | None, Option("OLD")] = None
     """The earlier store, or an earlier version (store@41): everything it held must still be
     there."""
-    baseline: Annotated[str | None, tyro.conf.arg(metavar="planner|RUN|FILE.onnx")] = None
+    baseline: Annotated[str | None, Option("planner|RUN|FILE.onnx")] = None
     """The run must have passed `restock gate` against this, as it named it."""
-    audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    audits: Annotated[Path | None, Option("DIR")] = None
     """A folder of your own audits (*.sql). An audit with the name of a shipped one replaces it."""
-    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    thresholds: Annotated[Path | None, Option("FILE")] = None
     """A TOML file with thresholds that replace the shipped ones."""
     capacity: bool = False
     """Instead of auditing, show how coverage grows with the number of rows kept, and how many are
@@ -86,7 +83,7 @@ class AuditCommand:
     """Warnings fail, too."""
     json: bool = False
     """Print one JSON document: {"store", "failed", "audits": [{"part", "audit", "status", …}]}."""
-    junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    junit: Annotated[Path | None, Option("FILE")] = None
     """Also write JUnit XML: one suite each for audits, difference and gate."""
 
     def run(self) -> int:

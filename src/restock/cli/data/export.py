@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
-
 from restock.cli import output
-from restock.cli.command_line import refuse
+from restock.cli.words import Option, Positional, refuse
 from restock.errors import RunError, counted
 from restock.replay.export import FORMATS
 
@@ -29,25 +27,25 @@ class ExportCommand:
     becomes a run whose policy acts by the mean of theirs. See docs/train.md.
     """
 
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    source: Annotated[Path, Positional("SOURCE")]
     """A store or a panel; for onnx, a run; for run, a folder of runs."""
-    to: Annotated[str, tyro.conf.arg(constructor=Literal[TO], metavar=f"{{{','.join(TO)}}}")]
+    to: Annotated[str, Option(choices=TO)]
     """The format. minari, lerobot and lerobot-video (frames as MP4) write directories, the others
     files (d3rlpy: .h5)."""
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
+    out: Annotated[Path, Option("OUT")]
     """The file or directory to write, which must not exist yet."""
-    panel: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
+    panel: Annotated[Path | None, Positional("[PANEL]")] = None
     """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata. With
     --alarm: the panel to take episodes from, in place of the run's."""
-    query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
+    query: Annotated[str | None, Option("SQL")] = None
     """An SQL query that selects transitions of a store, with all columns; for lerobot it may add
     a struct "observation.state" of chosen signals. Default: all transitions."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
-    cameras: Annotated[str, tyro.conf.arg(metavar="NAMES")] = "all"
+    cameras: Annotated[str, Option("NAMES")] = "all"
     """From a store to lerobot: the cameras whose frames are exported, comma-separated, or all, or
     none. A step that lacks a frame of one of them is left out and counted."""
-    alarm: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
+    alarm: Annotated[float | None, Option("RATE")] = None
     """For onnx: add an alarm that is on where logged failures, takeovers and bumps began, and
     misses at most this share of them, for example 0.1."""
     json: bool = False

@@ -17,12 +17,11 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import tyro
-
 from restock import native
 from restock.cli import output
 from restock.cli.data.night import info_total
 from restock.cli.failures import GL, NO_GL
+from restock.cli.words import Option, Positional
 from restock.errors import ExitCode, RecordingError, counted, quoted, visible
 from restock.process import cores, install_command, installed
 
@@ -56,9 +55,9 @@ class InfoCommand:
     that every command needs is missing; a missing extra is not an error.
     """
 
-    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")] = ()
+    paths: Annotated[tuple[str, ...], Positional("PATH")] = ()
     """Recordings, folders of recordings, globs, or stores."""
-    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    definitions: Annotated[str | None, Option("DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     salvage: bool = False

@@ -8,10 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
-import tyro
-
 from restock.cli import output
 from restock.cli.data.night import Night
+from restock.cli.words import Option, Positional, Repeated
 from restock.errors import (
     ConfigError,
     ExitCode,
@@ -41,9 +40,9 @@ class IngestCommand:
     failed or messages of the topics used were lost.
     """
 
-    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    paths: Annotated[tuple[str, ...], Positional("PATH")]
     """Recordings, folders of recordings, or globs."""
-    store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
+    store: Annotated[str | None, Option("STORE")] = None
     """The store's folder, or s3://bucket/prefix; created if missing. Required unless
     --dry-run."""
     profile: str = "warehouse_amr"
@@ -59,12 +58,10 @@ class IngestCommand:
     of it, a copy, a drive recorded again): keep it and say so (the audit `repeated_steps` then
     fails), refuse it, or replace: what is a part of it leaves the store, and it is refused if the
     store holds as much or more of it."""
-    tag: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
-    ] = ()
+    tag: Annotated[tuple[str, ...], Repeated("KEY=VALUE")] = ()
     """A tag for the recordings: robot, site, firmware, map, shift, or any other name. It overrides
     tags from the recording or its path; KEY= removes a tag. May be given several times."""
-    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    definitions: Annotated[str | None, Option("DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     verbose: bool = False

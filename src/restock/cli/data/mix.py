@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-import tyro
 
 from restock.cli import output
+from restock.cli.words import Option, Positional
 from restock.errors import MixtureError, counted, figure
 
 if TYPE_CHECKING:
@@ -38,11 +38,11 @@ class MixCommand:
     version, mixture, task and rows.
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store to take transitions from, or a Parquet file of any task's (docs/panel.md)."""
-    mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
+    mixture: Annotated[str, Option("NAME|FILE")] = "coverage"
     """A TOML file, or one of coverage and uniform. See docs/mixture.md."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
+    out: Annotated[Path | None, Option("PANEL")] = None
     """The new panel's directory. It must not exist yet."""
     dry_run: bool = False
     """Only show the plan; write nothing."""

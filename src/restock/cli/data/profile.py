@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Option, Positional
 from restock.errors import ConfigError, ExitCode, RecordingError, counted, visible
 from restock.files import expect_file_place, write_text
 
@@ -50,18 +49,18 @@ class ProfileCommand:
     recording was lost, or a recording could not be read; the output says what.
     """
 
-    action: Annotated[Literal["new", "check"], tyro.conf.Positional]
+    action: Annotated[Literal["new", "check"], Positional()]
     """new RECORDING…, or check PROFILE RECORDING."""
-    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    paths: Annotated[tuple[str, ...], Positional("PATH")]
     """For `new`: one or more recordings of one kind of robot. For `check`: the profile (a file or a
     shipped name), then the recording."""
-    footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
+    footprint: Annotated[str | None, Option("LxW")] = None
     """For `new`: the robot's length and width in metres, for example 0.6x0.5. Default: from the
     recording's /robot_description, else a guess."""
-    urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    urdf: Annotated[Path | None, Option("FILE")] = None
     """For `new`: the robot's URDF, for outline, wheels, mass and lidar. It replaces the recording's
     /robot_description. Convert xacro to URDF first; meshes are not read. See docs/robot.md."""
-    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    robot: Annotated[str | None, Option("NAME")] = None
     """For `new`: which robot the profile is for, if the recordings are of several: its namespace,
     for example /robot2. Default: the one with most topics. The proposal lists all of them."""
     odometry_as_command: bool = False
@@ -72,7 +71,7 @@ class ProfileCommand:
     mostly stood. Rows without a goal are then left out. See docs/task.md."""
     out: Path | None = None
     """Where `new` writes the profile. An existing file is not overwritten."""
-    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    definitions: Annotated[str | None, Option("DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     salvage: bool = False

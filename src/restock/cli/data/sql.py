@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Option, Positional
 from restock.errors import ExitCode, QueryError, StoreError
 from restock.process import went_on_after_interrupt
 
@@ -42,20 +41,20 @@ class SqlCommand:
     a query. Without a query, a prompt opens. The exit code is 3 if recordings have lost messages.
     """
 
-    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    path: Annotated[str, Positional("PATH")]
     """A store, a run directory, a panel, a recording, or a folder of recordings."""
-    second: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PANEL]")] = None
+    second: Annotated[str | None, Positional("[PANEL]")] = None
     """Beside a store: a panel or a run whose tables the query can also use, as panel.rows,
     run.audit, …"""
-    third: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")] = None
+    third: Annotated[str | None, Positional("[RUN]")] = None
     """And the other of the two, in either order."""
-    query: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUERY]")] = None
+    query: Annotated[str | None, Positional("[QUERY]")] = None
     """The query, or - to read it from stdin. Default: open a prompt."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
     """Print CSV with a header."""
-    export: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    export: Annotated[Path | None, Option("FILE")] = None
     """Write the rows of the query to a .parquet, .csv or .json file. Without a query, write a
     store's views for use in any DuckDB: an init file (.sql) or a database (.duckdb)."""
 

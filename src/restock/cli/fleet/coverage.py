@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from restock.cli import output
-from restock.cli.command_line import refuse
 from restock.cli.fleet.diff import section
+from restock.cli.words import Option, Positional, refuse
 from restock.errors import (
     ConfigError,
     ExitCode,
@@ -46,11 +44,11 @@ class CoverageCommand:
     `restock coverage gaps`, `drift` and `diff` have their own options and --help.
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    out: Annotated[Path | None, Option("FILE")] = None
     """Write an HTML page that opens without a network. Replaces an existing file."""
-    mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
+    mixture: Annotated[str, Option("NAME|FILE")] = "coverage"
     """The mixture whose planned draws say how much is needed of each stratum. See
     docs/mixture.md."""
     json: bool = False
@@ -147,20 +145,20 @@ class GapsCommand:
     file for `restock twin record --missions`, and for training (env.missions).
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store."""
-    mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
+    mixture: Annotated[str, Option("NAME|FILE")] = "coverage"
     """The mixture whose planned draws say how much is needed of each stratum. See
     docs/mixture.md."""
-    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE|none")] = None
+    thresholds: Annotated[Path | None, Option("FILE|none")] = None
     """A TOML file with thresholds of audits that replace the shipped ones, as for `restock
     audit`; `none`: use only the needs of the mixture, not those of the audits."""
-    min_rows: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    min_rows: Annotated[int, Option("N")] = 0
     """Also ask for at least this many rows of every cell."""
     unit: Literal["missions", "hours"] | None = None
     """Count in missions or in hours of driving. Default: missions if a simulator made the
     recordings, hours if robots did."""
-    missions_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    missions_out: Annotated[Path | None, Option("FILE")] = None
     """Write the plan as a missions file, which must not exist yet."""
     json: bool = False
     """Print one JSON document."""
@@ -275,7 +273,7 @@ class DriftCommand:
         restock sql store/ "FROM drift WHERE robot = 'amr-2'"       # every comparison
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store."""
     every: str = "week"
     """The length of a period: day, week, month, year or decade."""

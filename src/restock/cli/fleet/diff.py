@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 from restock.errors import ExitCode, RestockError
 
 
@@ -30,9 +29,9 @@ class DiffCommand:
     have different meanings. The command only reads.
     """
 
-    first: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
+    first: Annotated[str, Positional("A")]
     """The first (earlier) store, store@VERSION, panel or run."""
-    second: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
+    second: Annotated[str, Positional("B")]
     """The second (later) one, of the same kind."""
     exit_code: bool = False
     """Exit 1 if they differ."""

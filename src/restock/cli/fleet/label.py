@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 from restock.errors import ConfigError, ExitCode, counted
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ class LabelCommand:
     Verdicts of people on labels (`restock review`) stay: they override the rules.
     """
 
-    store: Annotated[Path, tyro.conf.Positional]
+    store: Annotated[Path, Positional()]
     """The store's folder."""
     profile: str | None = None
     """Use the conditions of this profile, a shipped one or a TOML file, for the recordings that

@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 from restock.errors import ConfigError, ExitCode, LabelError, quoted
 
 if TYPE_CHECKING:
@@ -35,11 +34,9 @@ class ReviewCommand:
     docs/ingest.md.
     """
 
-    store: Annotated[Path, tyro.conf.Positional]
+    store: Annotated[Path, Positional()]
     """The store's folder."""
-    file: Annotated[
-        str | None, tyro.conf.Positional, tyro.conf.arg(name="FILE|none", metavar="[FILE|none]")
-    ] = None
+    file: Annotated[str | None, Positional("[FILE|none]", name="FILE|none")] = None
     """Write the verdicts of this file into the store: verdicts.json of a page, or a .csv file;
     `none` removes all corrections."""
     out: Path | None = None

@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 from restock.errors import ConfigError, ExitCode, counted, quoted
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ class CompactCommand:
     joined), 3 --drop-damaged lost rows or manifests.
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store: a folder, or s3://bucket/prefix."""
     dry_run: bool = False
     """Print what would be done; write nothing."""
@@ -133,11 +132,9 @@ class RemoveCommand:
     Exit codes: 0 done, 2 nothing was removed.
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store: a folder, or s3://bucket/prefix."""
-    recordings: Annotated[
-        tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")
-    ] = ()
+    recordings: Annotated[tuple[str, ...], Positional("RECORDING")] = ()
     """What to remove: ids, or paths."""
     dry_run: bool = False
     """Print what would be removed; remove nothing."""
@@ -220,7 +217,7 @@ class VerifyCommand:
     Exit codes: 0 all are whole, 1 a file is damaged or missing (of a panel: 2).
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store: a folder, or s3://bucket/prefix. Or a panel."""
     json: bool = False
     """Print one JSON document: {"files", "damaged": [{"file", "remedy"}]}."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-
 from restock.cli.output import plain, print_json, print_sections, say
+from restock.cli.words import Positional
 from restock.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ class CompareCommand:
     Example: `restock compare runs/uniform runs/quotas --treatment mixture`
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    runs: Annotated[tuple[Path, ...], Positional("RUN")]
     """Two runs; or, with --against, all runs (seeds) of the first method."""
     against: tuple[Path, ...] = ()
     """The runs of the second method."""

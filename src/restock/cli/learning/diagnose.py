@@ -6,10 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
-from restock.cli.command_line import refuse
 from restock.cli.output import print_json, print_parted, print_text, say
+from restock.cli.words import Positional, refuse
 from restock.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -37,9 +35,7 @@ class DiagnoseCommand:
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """
 
-    places: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")
-    ]
+    places: Annotated[tuple[Path, ...], Positional("RUN|PANEL|STORE")]
     """Runs of one method (seeds); or one panel or store, whose rows are diagnosed, and the floors
     that the twin drives on, as for env.layouts (FLOOR.toml, map.yaml, generated:train)."""
     profile: str | None = None

@@ -6,9 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
-from restock.cli.command_line import refuse
 from restock.cli.output import (
     names_in,
     print_json,
@@ -18,6 +15,7 @@ from restock.cli.output import (
     reported,
     say,
 )
+from restock.cli.words import Option, Positional, refuse
 from restock.errors import ExitCode, counted, policy_words
 
 if TYPE_CHECKING:
@@ -49,9 +47,9 @@ class EvalCommand:
     Example: `restock eval runs/a --perturbations none,friction,latency`
     """
 
-    run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_path: Annotated[Path, Positional("RUN")]
     """The run directory."""
-    episodes: Annotated[str, tyro.conf.arg(metavar="N|KIND=N,...")] = "20"
+    episodes: Annotated[str, Option("N|KIND=N,...")] = "20"
     """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision). Or a number for each
     kind, as nominal=1000,wheel_slip=300: other kinds are not driven. 0: drive nothing, and show the
     newest evaluation in RUN/eval/episodes.parquet."""
@@ -73,7 +71,7 @@ class EvalCommand:
     layouts: str | None = None
     """Floors to drive on, e.g. generated:test. Default: the run's own floors; for a run trained on
     generated:train, the test floors."""
-    limiter: Annotated[str | None, tyro.conf.arg(metavar="profile|FILE.toml")] = None
+    limiter: Annotated[str | None, Option("profile|FILE.toml")] = None
     """Also drive each policy with a limiter after it, as limited:NAME. The limiter is the profile's
     [limiter], or that of a file (docs/deploy.md)."""
     missions: str = "drawn"

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from restock.cli.output import names_in, print_json, print_sections, progress, say
+from restock.cli.words import Option, Positional, Repeated
 from restock.errors import ConfigError, ExitCode
 
 
@@ -28,11 +27,11 @@ class GateCommand:
     Example: `restock gate runs/a --baseline planner --margins success=0.05,bumps_per_km=1`
     """
 
-    run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_path: Annotated[Path, Positional("RUN")]
     """The run directory."""
-    baseline: Annotated[str, tyro.conf.arg(metavar="planner|RUN|FILE.onnx")]
+    baseline: Annotated[str, Option("planner|RUN|FILE.onnx")]
     """What drives today: planner, operator, random, cloned, another run, or an exported policy."""
-    margins: Annotated[str, tyro.conf.arg(metavar="NAME=X,...")] = "success=0.05"
+    margins: Annotated[str, Option("NAME=X,...")] = "success=0.05"
     """By how much the policy may be worse, for each measure that is asked: success (a share),
     bumps_per_km, closest_person_m, stopped_s (with --limiter) and time_lost_s."""
     conditions: str = ""
@@ -40,10 +39,10 @@ class GateCommand:
     perturbations: str = "none"
     """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml. Each is
     judged by itself."""
-    layouts: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    layouts: Annotated[tuple[str, ...], Repeated()] = ()
     """Floors to drive on, e.g. generated:test. May be given several times: each is judged by
     itself. Default: the run's own floors."""
-    limiter: Annotated[str | None, tyro.conf.arg(metavar="profile|FILE.toml")] = None
+    limiter: Annotated[str | None, Option("profile|FILE.toml")] = None
     """Drive both with a limiter after them: the profile's, or that of a file (docs/deploy.md)."""
     budget: int = 1000
     """Pairs of episodes of each condition, at most."""

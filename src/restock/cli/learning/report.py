@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from restock.cli.output import print_json, progress
+from restock.cli.words import Positional
 from restock.errors import ConfigError
 
 
@@ -33,7 +32,7 @@ class ReportCommand:
     Example: `restock report runs/a`
     """
 
-    run_directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_directory: Annotated[Path, Positional("RUN")]
     """The directory that `restock train --out` wrote; a folder of runs and stores, for a page about
     all of them; or a store, for a page about its gap only."""
     out: Path | None = None

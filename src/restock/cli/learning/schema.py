@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Option, Positional
 from restock.errors import ConfigError
 
 # name -> the files that it is of
@@ -36,9 +35,9 @@ class SchemaCommand:
     by the VS Code extension Even Better TOML). --out writes all schemas into a folder.
     """
 
-    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
+    name: Annotated[str | None, Positional("[NAME]")] = None
     """The name of the config."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    out: Annotated[Path | None, Option("DIR")] = None
     """Write NAME.schema.json into this folder; without NAME, all schemas."""
     json: bool = False
     """Print the list as JSON (a schema is always JSON)."""

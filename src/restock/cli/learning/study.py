@@ -10,9 +10,8 @@ from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
-
 from restock.cli.output import plain, print_json, print_table, say
+from restock.cli.words import Positional
 from restock.errors import ConfigError, ExitCode, RestockError
 
 if TYPE_CHECKING:
@@ -50,7 +49,7 @@ class StudyCommand:
     Example: `restock train mixtures.toml --out studies/mixtures --workers 2`
     """
 
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
+    study: Annotated[Path, Positional("STUDY.toml")]
     """The study."""
     out: Path
     """The folder for panels, runs and logs."""

@@ -7,10 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from restock.cli import output
-from restock.cli.command_line import refuse
+from restock.cli.words import Option, Positional, refuse
 from restock.errors import ConfigError, quoted
 
 if TYPE_CHECKING:
@@ -44,17 +42,17 @@ class TraceCommand:
     every topic of it.
     """
 
-    place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
+    place: Annotated[str, Positional("RUN|PANEL|STORE")]
     """The run, panel or store that holds the row."""
-    row: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[ROW]")] = None
+    row: Annotated[str | None, Positional("[ROW]")] = None
     """STEP/ROW of a run (for example 1200/17), a row number of a panel, or a transition id of a
     store."""
-    recording: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    recording: Annotated[Path | None, Option("PATH")] = None
     """The recording of the row: also show the messages from which the row was made."""
-    view: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    view: Annotated[Path | None, Option("FILE")] = None
     """Also write the seconds around the row for Foxglove and Rerun: FILE.mcap, and a layout
     beside it."""
-    critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
+    critic: Annotated[str | None, Option("RUN|none")] = None
     """The run whose critic --view shows, or none. Default for a row of a RUN: that run."""
     json: bool = False
     """Print one JSON document (without ROW: a list)."""

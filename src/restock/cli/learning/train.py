@@ -11,9 +11,8 @@ from threading import Thread
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from restock.cli.output import print_json, print_table, progress, say
+from restock.cli.words import Repeated
 from restock.errors import RestockError, quoted
 from restock.process import went_on_after_interrupt
 
@@ -50,7 +49,7 @@ class TrainCommand:
     """A panel from `restock mix`. Without one, training is online only."""
     config: Path | None = None
     """A TOML file with any of the config's keys (docs/train.md)."""
-    set: Annotated[list[str], tyro.conf.UseAppendAction] = field(default_factory=list)
+    set: Annotated[list[str], Repeated()] = field(default_factory=list)
     """Set one key of the config, e.g. --set optimizer.learning_rate=1e-4. May be repeated."""
     resume: Path | None = None
     """Continue this run from its latest checkpoint."""

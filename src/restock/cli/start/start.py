@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from restock.cli.output import print_json, stderr, stdout
 from restock.cli.start import decisions, stages
 from restock.cli.start.decisions import NO_ROOM, Stop
 from restock.cli.start.outcomes import Document
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Ended, Work, escape, speaker
+from restock.cli.words import Option, Positional, Repeated
 from restock.errors import ConfigError, ExitCode, RecordingError, counted, quoted
 
 HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
@@ -298,7 +297,7 @@ class StartCommand:
     Example: `restock start bags/ --out mine`
     """
 
-    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="BAG")]
+    paths: Annotated[tuple[str, ...], Positional("BAG")]
     """Recordings of one kind of robot: files, bag folders, or folders of them."""
     out: Path
     """The output folder: profile.toml, store, panel, run, and run/report.html."""
@@ -310,11 +309,9 @@ class StartCommand:
     """The map.yaml in which the robot was localised, if the recordings do not contain the map."""
     salvage: bool = False
     """Also read what is intact in damaged or truncated recordings."""
-    tag: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
-    ] = ()
+    tag: Annotated[tuple[str, ...], Repeated("KEY=VALUE")] = ()
     """A tag for the recordings: robot, site, or any other name. May be given several times."""
-    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    definitions: Annotated[str | None, Option("DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     mixture: str = "coverage"

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 from restock.errors import ConfigError, ExitCode, counted
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ class FitCommand:
     Example: `restock twin fit store/ --out fitted.toml`
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store."""
     out: Path | None = None
     """The TOML file to write: a perturbation, or a schedule over the robots if each recording is

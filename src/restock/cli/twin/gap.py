@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 from restock.errors import ExitCode
 
 
@@ -27,7 +26,7 @@ class GapCommand:
     Example: `restock twin gap store/ --perturbation fitted.toml --out store/gap`
     """
 
-    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, Positional("STORE")]
     """The store."""
     perturbation: Path | None = None
     """A perturbation that calibrates the twin, e.g. written by `restock twin fit`."""

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from restock.cli import output
 from restock.cli.output import cell
+from restock.cli.words import Option, Positional, Repeated
 from restock.errors import ConfigError, RestockError
 
 if TYPE_CHECKING:
@@ -33,9 +32,9 @@ class LayoutCommand:
         restock twin layout --from drive.mcap --out floor.toml --out floor.png
     """
 
-    floor: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[FLOOR]")] = None
+    floor: Annotated[str | None, Positional("[FLOOR]")] = None
     """The floor."""
-    source: Annotated[str | None, tyro.conf.arg(name="from", metavar="STORE|BAG")] = None
+    source: Annotated[str | None, Option("STORE|BAG", name="from")] = None
     """Make the floor from this recording or store."""
     recording: str | None = None
     """With --from STORE: the recording to make the floor from, by its path, the end of its path, or
@@ -50,12 +49,12 @@ class LayoutCommand:
     profile: str | None = None
     """With --from: the profile of the robot, a name or a TOML file. It gives the topics of pose and
     scan, and the robot's size. Default: that of the store, else a proposal from the topics."""
-    footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
+    footprint: Annotated[str | None, Option("LxW")] = None
     """With --from: the robot's length and width in metres. It overrides all other sources."""
-    definitions: Annotated[str | None, tyro.conf.arg(metavar="DISTRO|PATH")] = None
+    definitions: Annotated[str | None, Option("DISTRO|PATH")] = None
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
-    out: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = ()
+    out: Annotated[tuple[Path, ...], Repeated("FILE")] = ()
     """Write the floor to this file: FILE.toml, or map.yaml (and map.pgm beside it), or draw it from
     above: FILE.png. May be given several times. Existing files are not overwritten."""
     zones: Path | None = None

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Option, Repeated
 from restock.errors import ConfigError, RecordingError, RestockError
 
 if TYPE_CHECKING:
@@ -42,15 +41,13 @@ class RecordCommand:
     sqlite3)."""
     minutes: float | None = None
     """Stop after the mission in which this much driving is recorded (default 5)."""
-    missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
+    missions: Annotated[str | None, Option("N|FILE")] = None
     """Stop after this number of missions instead. Or drive the missions of a file by `restock
     coverage gaps`, until the ordered number of missions has met each condition."""
-    tag: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
-    ] = ()
+    tag: Annotated[tuple[str, ...], Repeated("KEY=VALUE")] = ()
     """A tag of the recording, such as robot=amr-07. It is stored as a metadata record of the MCAP
     file, or as custom_data of the rosbag2 folder. May be given several times."""
-    start: Annotated[str | None, tyro.conf.arg(metavar="TIME")] = None
+    start: Annotated[str | None, Option("TIME")] = None
     """Start time of the first mission, in UTC. Default: 2026-03-02T08:00."""
     seed: int = 0
     """Seed of missions, floor, traffic, noise and delays."""

@@ -6,9 +6,8 @@ import sys
 from dataclasses import dataclass
 from typing import Annotated
 
-import tyro
-
 from restock.cli import output
+from restock.cli.words import Positional
 
 FRICTION = 0.8  # of the floor
 
@@ -23,7 +22,7 @@ class RobotCommand:
     Example: `restock twin robot my_robot.toml`
     """
 
-    profile: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROFILE")]
+    profile: Annotated[str, Positional("PROFILE")]
     """A profile: a TOML file, or the name of a shipped profile."""
     json: bool = False
     """Print JSON: {"robot": {drive, wheel_radius_m, …}, "driven": [{action, friction,
