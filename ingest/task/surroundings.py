@@ -127,7 +127,7 @@ class MovedMap:
 
 def returned(ranges_m: F64, range_min_m: float, range_max_m: float) -> Bools:
     """Return which ranges mean that something is there: False for NaN and inf, True for -inf."""
-    inside = (ranges_m >= range_min_m) | np.isneginf(ranges_m)
+    inside = (ranges_m >= range_min_m) | (ranges_m == -np.inf)
     return np.asarray(inside & (ranges_m <= range_max_m), np.bool_)
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -22,7 +23,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints, stacked
 from restock.toml import Checked
 
 Signals = dict[str, NDArray[Any]]  # by name; the leading axis is the step, or the environment
@@ -283,7 +284,7 @@ class Task(Checked, frozen=True):
     @property
     def scaled_actions(self) -> NDArray[np.float64]:
         """Return the actions (A, 2) divided by the fastest on each axis, as in observations."""
-        return np.asarray(self.actions, np.float64) / _fastest(self)
+        return np.asarray(self.actions, np.float64) / _fastest(self.actions)
 
     @property
     def action_names(self) -> list[str]:
@@ -381,22 +382,19 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
     routed = 1.0 if task.goal == "route" else 0.0  # without a goal these entries are all zero
     clearance = _nearness(now["sector_clearance_m"], task.range_max_m)
     closing = clearance - _nearness(before["sector_clearance_m"], task.range_max_m)
-    scalars = np.stack(
-        [
-            np.sin(near) * routed,
-            np.cos(near) * routed,
-            np.sin(far) * routed,
-            np.cos(far) * routed,
-            np.clip(now["route_remaining_m"], 0.0, 10.0) / 10.0 * routed,
-            now["wheel_speed_mps"],
-            now["gyro_yaw_rate_radps"],
-            now["localised_speed_mps"],
-            now["wheel_speed_mps"] - now["localised_speed_mps"],
-            now["wheel_yaw_rate_radps"] - now["gyro_yaw_rate_radps"],
-            now["localised_lateral_mps"],
-            np.clip(now["accel_x_mps2"], -10.0, 10.0) / 5.0,
-        ],
-        axis=-1,
+    scalars = stacked(
+        np.sin(near) * routed,
+        np.cos(near) * routed,
+        np.sin(far) * routed,
+        np.cos(far) * routed,
+        now["route_remaining_m"].clip(0.0, 10.0) / 10.0 * routed,
+        now["wheel_speed_mps"],
+        now["gyro_yaw_rate_radps"],
+        now["localised_speed_mps"],
+        now["wheel_speed_mps"] - now["localised_speed_mps"],
+        now["wheel_yaw_rate_radps"] - now["gyro_yaw_rate_radps"],
+        now["localised_lateral_mps"],
+        now["accel_x_mps2"].clip(-10.0, 10.0) / 5.0,
     )
     one_hot = np.eye(len(task.actions))[previous_action]
     proposed = _proposed(task, now)
@@ -415,7 +413,7 @@ def nearest_action(
 
     Distance is measured in units of the fastest action on each axis. Ties go to the first action.
     """
-    command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / _fastest(task)
+    command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / _fastest(task.actions)
     distance = np.linalg.norm(command[:, None, :] - task.scaled_actions[None], axis=-1)
     action = np.argmin(distance, axis=1)
     return action.astype(np.int64), distance[np.arange(len(action)), action]
@@ -469,14 +467,14 @@ def reward_parts(
     weight = task.rewards
     harsh = np.abs(after["wheel_speed_mps"] - now["wheel_speed_mps"]) / task.control_period_s
     slip = np.abs(after["wheel_speed_mps"] - after["localised_speed_mps"])
-    progress = weight.progress_per_m * np.clip(progress_m, -1.0, 1.0)
+    progress = weight.progress_per_m * progress_m.clip(-1.0, 1.0)
     return {
         "progress_per_m": progress,
         "step": np.full_like(progress, weight.step),
         "action_change": weight.action_change * (action != previous_action),
         "tight": weight.tight * (after["clearance_m"] < weight.tight_clearance_m),
         "harsh": weight.harsh * (harsh > weight.harsh_mps2),
-        "slip_per_mps": weight.slip_per_mps * np.clip(slip - 0.2, 0.0, 2.0),
+        "slip_per_mps": weight.slip_per_mps * (slip - 0.2).clip(0.0, 2.0),
         "goal": weight.goal * reached_goal(task, after),
         "bump": weight.bump * (after["bumped"] & ~now["bumped"].astype(np.bool_)),
     }
@@ -494,8 +492,8 @@ def clearance_ahead(
     bearing = np.arctan2(waypoint_y_m, waypoint_x_m)
     middle = ((bearing + np.pi) * (task.sectors / (2 * np.pi))).astype(np.int64)
     around = (middle[:, None] + np.array([-1, 0, 1])) % task.sectors
-    nearest: NDArray[np.float64] = np.take_along_axis(sector_clearance_m, around, axis=1).min(1)
-    return nearest
+    nearest = sector_clearance_m[np.arange(len(around))[:, None], around]
+    return np.asarray(np.minimum.reduce(nearest, axis=1), np.float64)
 
 
 def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
@@ -503,9 +501,9 @@ def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
 
     In units of the fastest action on each axis, up to twice that; all 0 where it is not known.
     """
-    command = np.stack([now["nav_speed_mps"], now["nav_yaw_rate_radps"]], axis=-1)
+    command = stacked(now["nav_speed_mps"], now["nav_yaw_rate_radps"])
     known = np.isfinite(command).all(axis=-1, keepdims=True)
-    scaled = np.clip(np.where(known, command, 0.0) / _fastest(task), -2.0, 2.0)
+    scaled = (np.where(known, command, 0.0) / _fastest(task.actions)).clip(-2.0, 2.0)
     return np.concatenate([known, scaled], axis=-1)
 
 
@@ -536,15 +534,17 @@ def proposal_reader(task: Task) -> tuple[F64, F64, F64]:
     return near, -(scaled**2).sum(axis=1), known
 
 
-def _fastest(task: Task) -> NDArray[np.float64]:
+@lru_cache(maxsize=64)
+def _fastest(actions: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
     """Return the largest speed (m/s) and yaw rate (rad/s) among the actions, (2,)."""
-    largest = np.abs(np.asarray(task.actions, np.float64)).max(axis=0)
+    largest = np.abs(np.asarray(actions, np.float64)).max(axis=0)
     return np.asarray(np.maximum(largest, 1e-9), np.float64)
 
 
 def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
     """Scale clearance to [0, 1], with more resolution close by."""
-    return np.sqrt(np.clip(clearance_m / range_max_m, 0.0, 1.0))
+    nearness: NDArray[Any] = np.sqrt((clearance_m / range_max_m).clip(0.0, 1.0))
+    return nearness
 
 
 def nearness_of(task: Task, observation: NDArray[Any]) -> F64:

@@ -37,7 +37,7 @@ def closest(
         traffic.state[0, agent] = WALKING
         traffic.position_m[0, agent], traffic.heading_rad[0, agent] = (x, y), heading
     pose = np.array([robot])
-    traffic.note_closest(pose[:, :2], lambda ids: pose[ids, 2])
+    traffic.note_closest(pose)
     return traffic
 
 
@@ -60,9 +60,9 @@ def test_the_least_distance_is_kept_without_who_is_hidden() -> None:
     traffic = closest((0.0, 0.0, 0.0), {0: (1.6, 0.0, 0.0), 1: (0.0, 2.5, 0.0)})
     assert traffic.closest_m[0] == pytest.approx(1.6 - 0.35 - PERSON_RADIUS_M)
     traffic.position_m[0, 0] = (9.0, 9.0)
-    traffic.note_closest(np.zeros((1, 2)), lambda ids: np.zeros(len(ids)))
+    traffic.note_closest(np.zeros((1, 3)))
     assert traffic.closest_m[0] == pytest.approx(1.0)
     traffic.state[0] = HIDDEN
     traffic.closest_m[0] = np.inf
-    traffic.note_closest(np.zeros((1, 2)), lambda ids: np.zeros(len(ids)))
+    traffic.note_closest(np.zeros((1, 3)))
     assert np.isinf(traffic.closest_m[0])

@@ -56,7 +56,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F64, Bools, Ints, stacked
 from restock.ingest.task.schema import truth_text
 from restock.ingest.task.surroundings import view_route
 from restock.ingest.task.task import Body, Signals, Task, reached_goal
@@ -126,38 +126,33 @@ class BlockFinder(Stateful):
         """
         turned = np.zeros(len(ids), np.bool_) if along_y is None else along_y
         segment, edges = self._segments_ahead(ids, pose, heading, turned)
-        swap = turned[:, None]
-        pose = np.where(swap, pose[:, [1, 0, 2]], pose)
-        heading_x = heading
-        x = np.where(swap, hits_m[..., 1], hits_m[..., 0])
-        y = np.where(swap, hits_m[..., 0], hits_m[..., 1])
-        ahead = (x - pose[:, None, 0]) * heading_x[:, None]
+        x, y, here = hits_m[..., 0], hits_m[..., 1], pose[:, :1]
+        if turned.any():
+            swap = turned[:, None]
+            x, y, here = (
+                np.where(swap, y, x),
+                np.where(swap, x, y),
+                np.where(swap, pose[:, 1:2], here),
+            )
+        ahead = (x - here) * heading[:, None]
+        west, south, east, north = (edges[:, side, None] for side in range(4))
         rack = 0.1  # returns this near to a rack are the rack
-        obstacle = (
-            valid
-            & (segment >= 0)[:, None]
-            & (ahead > 0.1)
-            & (ahead < self.reach_m)
-            & (y > edges[:, 1, None] + rack)
-            & (y < edges[:, 3, None] - rack)
-            & (x > edges[:, 0, None] - 0.1)
-            & (x < edges[:, 2, None] + 0.1)
-        )
-        face = np.where(obstacle, ahead, np.inf).min(axis=1)
+        obstacle = valid & (segment >= 0)[:, None] & (ahead > 0.1) & (ahead < self.reach_m)
+        obstacle &= (y > south + rack) & (y < north - rack) & (x > west - 0.1) & (x < east + 0.1)
+        face = np.minimum.reduce(np.where(obstacle, ahead, np.inf), axis=1)
         obstacle &= ahead < face[:, None] + 0.5
-        across = np.where(obstacle, y, edges[:, 3, None])
-        across = np.concatenate([edges[:, 1, None], across, edges[:, 3, None]], axis=1)
+        across = np.concatenate([south, np.where(obstacle, y, north), north], axis=1)
         across.sort(axis=1)
-        gap = np.diff(across, axis=1).max(axis=1)
+        gap = np.maximum.reduce(across[:, 1:] - across[:, :-1], axis=1)
         shut = obstacle.any(axis=1) & (gap < self.passable_m)
-        middle = pose[:, 0] + heading_x * (np.where(shut, face, 0.0) + 0.3)
+        middle = here[:, 0] + heading * (np.where(shut, face, 0.0) + 0.3)
         step = ((middle - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64)
-        step = np.clip(step, 0, ((edges[:, 2] - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64) - 1)
-        place = np.stack([segment, step], axis=1)
-        same = (place[:, 0] == self.place[ids, 0]) & (np.abs(step - self.place[ids, 1]) <= 1)
-        self.seen[ids] = np.where(shut, np.where(same, self.seen[ids] + 1, 1), 0)
+        step = step.clip(0, ((edges[:, 2] - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64) - 1)
+        place, before, seen = stacked(segment, step), self.place[ids], self.seen[ids]
+        same = (segment == before[:, 0]) & (np.abs(step - before[:, 1]) <= 1)
+        self.seen[ids] = seen = np.where(shut, np.where(same, seen + 1, 1), 0)
         self.place[ids] = np.where(shut[:, None], place, -1)
-        blocked = np.flatnonzero(self.seen[ids] >= self.persistence)
+        (blocked,) = (seen >= self.persistence).nonzero()
         self.seen[ids[blocked]] = 0
         return [(int(ids[k]), (int(place[k, 0]), int(place[k, 1]))) for k in blocked]
 
@@ -175,21 +170,21 @@ class BlockFinder(Stateful):
         """
         segment = np.full(len(ids), -1, np.int64)
         edges = np.zeros((len(ids), 4))
-        x, y = pose[:, 0], pose[:, 1]
-        then_x, then_y = x + 0.8 * heading * ~turned, y + 0.8 * heading * turned
+        x, y = np.array([pose[:, :2], pose[:, :2]]).transpose(2, 0, 1)  # (2, n): then, and now
+        x[0] += 0.8 * heading * ~turned
+        y[0] += 0.8 * heading * turned
         floors = self.floor[ids]
-        for number in np.unique(floors):
+        for number in set(floors.tolist()):
             warehouse = self.floors[number]
-            on = np.flatnonzero(floors == number)
+            (on,) = (floors == number).nonzero()
             if not len(warehouse.segments):
                 continue
-            for at_x, at_y in ((then_x[on], then_y[on]), (x[on], y[on])):
-                inside = warehouse.segment_of(at_x, at_y)
-                fits = (inside >= 0) & (warehouse.segment_along_y[inside] == turned[on])
-                segment[on] = np.where(fits, inside, segment[on])
+            inside = warehouse.segment_of(x[:, on].ravel(), y[:, on].ravel()).reshape(2, -1)
+            fits = (inside >= 0) & (warehouse.segment_along_y[inside] == turned[on])
+            then, now = np.where(fits, inside, -1)
+            segment[on] = np.where(now >= 0, now, then)
             edges[on] = warehouse.segment_edges[segment[on]]
-        edges = np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
-        return segment, edges
+        return segment, np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
 
 
 STRAYED_M = 0.6
@@ -246,7 +241,7 @@ class Navigation(Stateful):
 
         A new plan counts from this step on, so that it never makes progress jump.
         """
-        again = set(np.flatnonzero(offset_m > STRAYED_M).tolist())
+        again = set((offset_m > STRAYED_M).nonzero()[0].tolist())
         again |= self._find_blocks(signals, sensing)
         for env in again:
             self.plans_m[env] = self.planner_of(env).plan(
@@ -286,22 +281,19 @@ class Navigation(Stateful):
             toward = np.where(along_y, toward_y, toward_x)
         else:
             along_y, toward = np.zeros(len(yaw), np.bool_), toward_x
-        ids = np.flatnonzero(near_ahead & (np.abs(toward) > 0.4))
+        (ids,) = (near_ahead & (np.abs(toward) > 0.4)).nonzero()
         if not len(ids):
             return set()
         ranges = sensing.ranges_m[ids]
-        pose = np.stack([signals["pose_x_m"], signals["pose_y_m"], yaw], axis=-1)[ids]
+        pose = stacked(signals["pose_x_m"], signals["pose_y_m"], yaw)[ids]
         sim, turned = sensing.simulation, self.task.body.lidar_yaw_rad
         bearing = pose[:, 2, None] + (sim.bearings_rad + turned)
         valid = (ranges > self.task.range_min_m) & np.isfinite(ranges)
         reach = np.where(valid, ranges, 0.0)
         ahead = sim.lidar_x_m
-        hits = np.stack(
-            [
-                (pose[:, 0] + ahead * np.cos(pose[:, 2]))[:, None] + reach * np.cos(bearing),
-                (pose[:, 1] + ahead * np.sin(pose[:, 2]))[:, None] + reach * np.sin(bearing),
-            ],
-            axis=-1,
+        hits = stacked(
+            (pose[:, 0] + ahead * np.cos(pose[:, 2]))[:, None] + reach * np.cos(bearing),
+            (pose[:, 1] + ahead * np.sin(pose[:, 2]))[:, None] + reach * np.sin(bearing),
         )
         heading = np.sign(toward[ids])
         blocks = self.finder.update(ids, pose, hits, valid, heading, along_y[ids])
@@ -449,8 +441,9 @@ class Truth(Stateful):
         """Note what every robot is exposed to at the start of a step."""
         pose, pallets = simulation.pose(), simulation.pallets
         ahead = np.zeros((len(pose), len(VIEW_M)), np.bool_)
-        gap = np.abs(pallets[:, :, :2] - pose[:, None, :2]).max(axis=-1).min(axis=1)
-        with_pallets = np.flatnonzero(gap < REACH_M)
+        apart = np.abs(pallets[:, :, :2] - pose[:, None, :2])
+        near = np.maximum(apart[..., 0], apart[..., 1]) < REACH_M
+        with_pallets = np.flatnonzero(near.any(axis=1))
         if len(with_pallets):
             ahead[with_pallets] = _blocked(
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets], self._margin_m
@@ -467,7 +460,7 @@ class Truth(Stateful):
 
     def exposure(self) -> NDArray[np.str_]:
         """Return all exposures (N,) of the current step, as one text each."""
-        which = (self.exposed << np.arange(len(EXPOSURES))).sum(axis=1)
+        which = self.exposed @ (1 << np.arange(len(EXPOSURES)))
         texts: NDArray[np.str_] = _EXPOSED[which]
         return texts
 
@@ -476,8 +469,8 @@ class Truth(Stateful):
         near = bumped | (clearance_m < self._near_m)
         now = Situation(self.blocked, near, slipped, clearance_m, self.traffic_gap_m)
         missions = [is_true(now) for is_true in SCORED.values()]
-        held = np.stack([*missions, self.aftermath_s > 0])  # as NAMES
-        which = (held << np.arange(len(NAMES))[:, None]).sum(axis=0)
+        held = np.array([*missions, self.aftermath_s > 0])  # as NAMES
+        which = (1 << np.arange(len(NAMES))) @ held
         left = np.maximum(self.aftermath_s - self._period_s, 0.0)
         left[(clearance_m > 2 * self._near_m) & ~near] = 0.0
         self.aftermath_s = np.where(near, AFTERMATH_S, left)
@@ -521,7 +514,7 @@ def info_after(
     ended: Bools,
 ) -> Info:
     """Return the info of a step that led to the signals `after` under true `condition` (N,)."""
-    sim = env.simulation
+    sim, closest_m = env.simulation, env.simulation.traffic.closest_m
     return info_now(env, after) | {
         "progress_m": progress_m,
         "true_condition": condition,
@@ -530,5 +523,5 @@ def info_after(
         "invalid": sim.diverged.copy(),
         "travelled_m": sim.travelled_m,
         # Not NaN, which Gymnasium's checker takes for two different values.
-        "closest_person_m": np.nan_to_num(sim.traffic.closest_m, nan=np.inf, posinf=np.inf),
+        "closest_person_m": np.where(np.isnan(closest_m), np.inf, closest_m),
     }

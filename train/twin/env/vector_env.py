@@ -486,7 +486,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
 
 
 def _bounded(observation: F32) -> F32:
-    return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    known = np.where(np.isnan(observation), np.float32(0.0), observation)
+    return known.clip(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
 class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F64, Bools, Ints, stacked
 from restock.errors import ConfigError
 from restock.ingest.task.robot import USUAL_STEERING_RAD, Drive, Lidar, Robot
 from restock.ingest.task.task import Body
@@ -54,25 +54,18 @@ class FloorFriction:
         count = len(geom_friction)
         self.patches = np.tile(NO_PATCH, (count, PATCHES, 1)).astype(np.float64)
         self.base = np.full(count, FLOOR_FRICTION)  # of the floor, where no patch lies
-        self.left = np.ones(count)  # times it, under the wheels on the left
-        self._has_patches = np.zeros(count, np.bool_)
-
-    @property
-    def icy(self) -> Ints:
-        """Return the environments that have patches."""
-        return np.flatnonzero(self._has_patches)
+        self.scale = np.ones((count, len(wheels_m)))  # times it, under each wheel
+        self.icy: Ints = np.zeros(0, np.int64)  # the environments that have patches
 
     def lay(self, env: int, patches: F64) -> None:
         """Lay the patches (PATCHES, 5) of an episode."""
         self.patches[env] = patches
-        self._has_patches[env] = (patches[:, 2] > 0).any()
+        self.icy = np.flatnonzero((self.patches[..., 2] > 0).any(axis=1))
 
     def set_floor(self, env: int, friction: float) -> None:
         """Set the floor's friction coefficient outside patches."""
         self.base[env] = friction
-        for wheel, geom in enumerate(self._geoms):
-            left = self.left[env] if wheel % 2 == 0 else 1.0
-            self._written[env, geom, 0] = friction * left
+        self._written[env, self._geoms, 0] = friction * self.scale[env]
 
     def write(self, ids: Ints, pose: F64) -> Bools:
         """Write the friction under the wheels of `ids` at poses (n, 3).
@@ -80,9 +73,7 @@ class FloorFriction:
         Returns which wheels (n, W) stand on a patch.
         """
         friction = self._under(ids, pose)
-        for wheel, geom in enumerate(self._geoms):
-            left = self.left[ids] if wheel % 2 == 0 else 1.0
-            self._written[ids, geom, 0] = friction[:, wheel] * left
+        self._written[ids[:, None], self._geoms, 0] = friction * self.scale[ids]
         return self._slippery(ids, friction)
 
     def on_patch(self, pose: F64) -> Bools:
@@ -104,10 +95,9 @@ class FloorFriction:
     def _wheel_points(self, pose: F64) -> F64:
         """Return where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        ahead, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
         x, y = self._wheels_m[:, 0, None], self._wheels_m[:, 1, None]
-        points: F64 = pose[:, None, :2] + across[:, None] * y
-        return points if len(self._wheels_m) == 2 else points + ahead[:, None] * x
+        points: F64 = pose[:, None, :2] + stacked(-sin, cos)[:, None] * y
+        return points if len(self._wheels_m) == 2 else points + stacked(cos, sin)[:, None] * x
 
 
 def friction_at(points_m: F64, patches: F64, base: F64) -> F64:

@@ -17,13 +17,13 @@ against all; the distances are the same, to the rounding of the last bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from restock import native
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F64, Bools, Ints, stacked
 from restock.state import Stateful
 from restock.train.twin.floors.layout import (
     AGENTS,
@@ -49,6 +49,7 @@ DRIVEN_AT_MPS = 0.15  # closing speed from which on a robot counts as driving at
 WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 _TRUCK_HALF_M = FORKLIFT_HALF_M[:2]
+_EACH = np.arange(AGENTS)
 _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
@@ -88,7 +89,6 @@ class Traffic(Stateful):
         self.state[env] = HIDDEN
         self.closest_m[env] = np.nan
         self.travelled_m[env] = self.waited_s[env] = self.heading_rad[env] = 0.0
-        self.position_m[env] = PARKED_M[0]
         for agent, walk in enumerate(walks):
             if walk is not None:
                 self.state[env, agent] = WAITING
@@ -97,7 +97,7 @@ class Traffic(Stateful):
                 self.speed_mps[env, agent] = walk.speed_mps
                 self.trigger[env, agent] = walk.trigger
                 self.attentive[env, agent] = walk.attentive
-                self._place(np.array([env]))
+        self._place(np.array([env]))
 
     def advance(self, robot: F64, velocity: F64, touched: Bools, elapsed_s: float) -> Ints:
         """Move the agents for `elapsed_s`; return the environments where any are under way.
@@ -105,87 +105,73 @@ class Traffic(Stateful):
         `robot` (N, 3) is x, y, yaw, `velocity` (N, 2) in the map frame; `touched` (N,) says whose
         bumper was pressed in the time before.
         """
-        ids = np.flatnonzero(self.active)
+        (ids,) = self.active.nonzero()
         if not len(ids):
             return ids
-        trigger = self.trigger[ids]
-        near = np.hypot(
-            trigger[..., 0] - robot[ids, None, 0], trigger[..., 1] - robot[ids, None, 1]
-        )
-        starts = (self.state[ids] == WAITING) & (near <= trigger[..., 2])
-        self.state[ids] = np.where(starts, WALKING, self.state[ids])
-        ids = ids[(self.state[ids] >= WALKING).any(axis=1)]
+        trigger, pose, state = self.trigger[ids], robot[ids], self.state[ids]
+        near = np.hypot(trigger[..., 0] - pose[:, :1], trigger[..., 1] - pose[:, 1:2])
+        state[(state == WAITING) & (near <= trigger[..., 2])] = WALKING
+        self.state[ids] = state
+        under_way = (state >= WALKING).any(axis=1)
+        ids, pose, state = ids[under_way], pose[under_way], state[under_way]
         if not len(ids):
             return ids
-        pose, state = robot[ids], self.state[ids]
-        gap, toward = self._gap(ids, pose)
-        careless = np.where(self._driven_at(ids, pose, velocity[ids]), 0.0, STANDING_M)
-        look_out = np.where(self.attentive[ids], YIELD_M, careless)
-        halted = (state == WALKING) & toward & (gap < look_out)
+        delta = self.position_m[ids] - pose[:, None, :2]
+        gap, attentive = self._gap(delta, pose[:, 2:]), self.attentive[ids]
+        heading = self.heading_rad[ids]
+        toward = -(np.cos(heading) * delta[..., 0] + np.sin(heading) * delta[..., 1]) > 0
+        careless = np.where(_driven_at(delta, velocity[ids, None]), 0.0, STANDING_M)
+        look_out = np.where(attentive, YIELD_M, careless)
+        walking = state == WALKING
+        halted = walking & toward & (gap < look_out)
         waited = np.where(halted, self.waited_s[ids] + elapsed_s, 0.0)
-        hit = touched[ids, None] & (gap < 0.2) & ((state == WALKING) | (state == RETREATING))
-        self.attentive[ids] |= hit  # having been touched, one looks out
+        hit = touched[ids, None] & (gap < 0.2) & (walking | (state == RETREATING))
+        self.attentive[ids] = attentive | hit  # having been touched, one looks out
         state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
-        state = np.where(
-            (state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward)), WALKING, state
-        )
-        pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~halted, 1.0, 0.0))
+        state[(state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward))] = WALKING
+        retreating, length_m = state == RETREATING, self.length_m[ids]
+        pace = np.where(retreating, -0.6, np.where((state == WALKING) & ~halted, 1.0, 0.0))
         travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
         # Who is back at the start or at the end of the way leaves the floor, out of sight.
-        left = ((travelled >= self.length_m[ids]) & (gap > 1.0)) | (
-            (travelled <= 0.0) & (state == RETREATING)
-        )
-        self.state[ids] = np.where(left, HIDDEN, state)
+        state[((travelled >= length_m) & (gap > 1.0)) | ((travelled <= 0.0) & retreating)] = HIDDEN
+        self.state[ids] = state
         self.waited_s[ids] = waited
-        self.travelled_m[ids] = np.clip(travelled, 0.0, self.length_m[ids])
+        self.travelled_m[ids] = np.minimum(np.maximum(travelled, 0.0), length_m)
         self._place(ids)
         return ids
 
     def gaps_m(self, pose: F64) -> F64:
         """Return gaps from agents' circles to robots' outlines at `pose` (N, 3); inf if absent."""
         gaps = np.full(self.state.shape, np.inf)
-        ids = np.flatnonzero(self.active)
+        (ids,) = self.active.nonzero()
         if len(ids):
-            shown = self.state[ids] != HIDDEN
-            gaps[ids] = np.where(shown, self._gap(ids, pose[ids])[0], np.inf)
+            near = pose[ids]
+            gap = self._gap(self.position_m[ids] - near[:, None, :2], near[:, 2:])
+            gaps[ids] = np.where(self.state[ids] != HIDDEN, gap, np.inf)
         return gaps
 
     def _place(self, ids: Ints) -> None:
         """Set positions by how far each agent has gone along its way."""
         shown = self.state[ids] != HIDDEN
         share = self.travelled_m[ids] / self.length_m[ids] * (WAY_POINTS - 1)
-        first = np.clip(share.astype(np.int64), 0, WAY_POINTS - 2)
-        way = self.way_m[ids]
-        start = np.take_along_axis(way, first[..., None, None], axis=2)[:, :, 0]
-        end = np.take_along_axis(way, first[..., None, None] + 1, axis=2)[:, :, 0]
-        step = end - start
+        first = share.astype(np.int64).clip(0, WAY_POINTS - 2)
+        start = self.way_m[ids[:, None], _EACH, first]
+        step = self.way_m[ids[:, None], _EACH, first + 1] - start
         point = start + (share - first)[..., None] * step
         self.position_m[ids] = np.where(shown[..., None], point, PARKED_M[0])
         self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
 
-    def _driven_at(self, ids: Ints, pose: F64, velocity: F64) -> Bools:
-        """Return which agents (n, AGENTS) the robot approaches by driving."""
-        delta = self.position_m[ids] - pose[:, None, :2]
-        distance = np.maximum(np.hypot(delta[..., 0], delta[..., 1]), 1e-9)
-        closing = (
-            delta[..., 0] * velocity[:, None, 0] + delta[..., 1] * velocity[:, None, 1]
-        ) / distance
-        return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
-
-    def note_closest(self, place_m: F64, yaw_of: Callable[[Ints], F64]) -> None:
-        """Note the agents' current distance to robots' outlines; (N, 2) are robots' centres.
-
-        `yaw_of` is called only for robots that somebody may be nearer to than ever in the episode.
-        """
-        ids = np.flatnonzero(self.active & ~np.isnan(self.closest_m))
+    def note_closest(self, robot: F64) -> None:
+        """Note the agents' current distance to the outlines of robots at (N, 3): x, y, yaw."""
+        (ids,) = (self.active & ~np.isnan(self.closest_m)).nonzero()
         if not len(ids):
             return
-        delta = self.position_m[ids] - place_m[ids, None]
+        delta = self.position_m[ids] - robot[ids, None, :2]
         at_least = (np.hypot(delta[..., 0], delta[..., 1]) - self._reach_m).min(axis=1)
         nearer = at_least < self.closest_m[ids]
         if nearer.any():
             ids = ids[nearer]
-            gap = self._outline_gap(ids, delta[nearer], yaw_of(ids)[:, None])
+            gap = self._outline_gap(ids, delta[nearer], robot[ids, 2:])
             self.closest_m[ids] = np.minimum(self.closest_m[ids], gap)
 
     def _outline_gap(self, ids: Ints, delta: F64, yaw: F64) -> F64:
@@ -208,20 +194,24 @@ class Traffic(Stateful):
         gap[self.state[ids] == HIDDEN] = np.inf
         return np.asarray(np.maximum(gap.min(axis=1), 0.0), np.float64)
 
-    def _gap(self, ids: Ints, pose: F64) -> tuple[F64, Bools]:
-        """Return gaps from agents' circles to robots' outlines, and who walks toward them."""
-        delta = self.position_m[ids] - pose[:, None, :2]
-        gap = _outside_m(_turned(delta, -pose[:, None, 2]), self.body_half_m) - self.radius_m
-        heading = self.heading_rad[ids]
-        toward = -(np.cos(heading) * delta[..., 0] + np.sin(heading) * delta[..., 1]) > 0
-        return gap, toward
+    def _gap(self, delta: F64, yaw: F64) -> F64:
+        """Return gaps from agents' circles to robots' outlines, as `_outline_gap` takes them."""
+        gap: F64 = _outside_m(_turned(delta, -yaw), self.body_half_m) - self.radius_m
+        return gap
+
+
+def _driven_at(delta: F64, velocity: F64) -> Bools:
+    """Return which agents (n, AGENTS) the robot approaches by driving at (n, 1, 2)."""
+    x, y = delta[..., 0], delta[..., 1]
+    closing = (x * velocity[..., 0] + y * velocity[..., 1]) / np.maximum(np.hypot(x, y), 1e-9)
+    return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
 
 def _turned(vectors: F64, angle_rad: F64) -> F64:
     """Turn vectors (..., 2) to the left by angles that broadcast against (...)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return stacked(cos * x - sin * y, sin * x + cos * y)
 
 
 def _outside_m(points: F64, half_m: F64) -> F64:
@@ -295,13 +285,13 @@ class Scenery(Stateful):
         self.walked = ids
         if not len(ids):
             return
-        begin = self.position_m[ids][:, None].copy()
+        begin = self.position_m[ids][:, None]
         self._show_traffic(ids)
         end = self.position_m[ids][:, None]
-        substeps = self.moves.shape[1]
+        substeps, way = self.moves.shape[1], end - begin
         share = ((np.arange(substeps) + 1) / substeps)[None, :, None, None]
-        jumped = (np.abs(end - begin) > 1.0).any(axis=-1, keepdims=True)
-        path = np.where(jumped, end, begin + share * (end - begin))
+        jumped = (np.abs(way) > 1.0).any(axis=-1, keepdims=True)
+        path = np.where(jumped, end, begin + share * way)
         self.moves[ids] = path.reshape(len(ids), substeps, -1)
 
     def stand_still(self, ids: Ints) -> None:
@@ -323,7 +313,7 @@ def quaternion(yaw_rad: F64) -> F64:
     """Return unit quaternions (..., 4), w first, of headings (...)."""
     half = yaw_rad / 2
     zero = np.zeros_like(half)
-    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+    return stacked(np.cos(half), zero, zero, np.sin(half))
 
 
 def rotated(quat: F64, vector: F64) -> F64:

@@ -120,34 +120,28 @@ class Sensing(Stateful):
             room = true_ranges - self.beams.reach_m
         else:
             room = self._around.room_m(ids)
-        self.true_clearance_m[ids] = np.maximum(room, 0.0).min(axis=1)
+        self.true_clearance_m[ids] = np.maximum(np.minimum.reduce(room, axis=1), 0.0)
         beam = noise[:, _SCALARS:].astype(np.float64)
-        lost = np.abs(beam) > self._dropout_beyond[ids, None]
         ranges = np.maximum(true_ranges + beam * self._range_noise_m[ids, None], 0.0)
-        ranges[lost] = np.inf
+        ranges[np.abs(beam) > self._dropout_beyond[ids, None]] = np.inf
         stale = step % self._scan_every[ids] != 0
         ranges[stale] = self.ranges_m[ids[stale]]
         self.ranges_m[ids] = ranges
         clearance = np.zeros((len(ids), 0))
         if task.lidar:
             clearance = self.beams.clearance(ranges, task.range_min_m, task.range_max_m)
-        pose = sim.pose()[ids]
-        localised = np.column_stack(
-            [
-                pose[:, 0] + scalar[:, 0] + scalar[:, 3],
-                pose[:, 1] + scalar[:, 1] + scalar[:, 4],
-                wrap_angle(pose[:, 2] + scalar[:, 2]),
-            ]
-        )
+        localised = sim.pose(ids) + scalar[:, :3]
+        localised[:, :2] += scalar[:, 3:5]
+        localised[:, 2] = wrap_angle(localised[:, 2])
         bias = self._bias[ids]
-        wheels = sim.wheel_speeds()[ids] + scalar[:, 5:7] + bias[:, :1]
+        wheels = sim.wheel_speeds(ids) + scalar[:, 5:7] + bias[:, :1]
         speed, yaw_rate = sim.robot.body_velocity(wheels[:, 0], wheels[:, 1])
         period_ns = round(task.control_period_s * 1e9)
         stamp = FIRST_STAMP_NS + step * period_ns
         fresh = step % self._pose_every[ids] == 0
-        self.pose[ids[fresh]] = localised[fresh]
-        self.pose_stamp_ns[ids[fresh]] = stamp[fresh]
-        last = self.pose[ids]
+        moved = ids[fresh]
+        self.pose[moved], self.pose_stamp_ns[moved] = localised[fresh], stamp[fresh]
+        last, command = self.pose[ids], sim.controller.commands[ids, 0]
         return {
             "stamp_ns": stamp,
             "pose_x_m": last[:, 0],
@@ -159,10 +153,12 @@ class Sensing(Stateful):
             "gyro_yaw_rate_radps": sim.qvel[ids, 5] + bias[:, 1] + scalar[:, 7],
             "accel_x_mps2": sim.accel[ids, 0] + scalar[:, 8] + bias[:, 2],
             "sector_clearance_m": clearance,
-            "clearance_m": clearance.min(axis=1) if task.lidar else np.full(len(ids), np.nan),
-            "bumped": sim.bumped[ids].copy(),
-            "command_speed_mps": sim.controller.commands[ids, 0, 0].copy(),
-            "command_yaw_rate_radps": sim.controller.commands[ids, 0, 1].copy(),
+            "clearance_m": np.minimum.reduce(clearance, axis=1)
+            if task.lidar
+            else np.full(len(ids), np.nan),
+            "bumped": sim.bumped[ids],
+            "command_speed_mps": command[:, 0],
+            "command_yaw_rate_radps": command[:, 1],
         }
 
     def add_motion(self, ids: Ints, signals: Signals, before: Signals | None = None) -> None:
@@ -209,7 +205,7 @@ class _Around:
 
     def room_m(self, ids: Ints) -> F64:
         """Return distances (n, beams) from outlines (n,) to what is nearest along each bearing."""
-        middle = self._simulation.middle(self._simulation.pose()[ids])
+        middle = self._simulation.middle(self._simulation.pose(ids))
         ranges: F64 = self._lidar.ranges(ids, middle[:, :2], middle[:, 2]) - self._reach_m
         return ranges
 

@@ -21,7 +21,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F64, Bools, Ints, stacked
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
@@ -41,6 +41,9 @@ from restock.train.twin.physics.scenery import Lidar, Scenery, quaternion, rotat
 
 GRAVITY_MPS2 = 9.81
 _HISTORY = 5  # commands kept, or as many more as the longest latency takes
+
+
+Change = tuple[Ints, Ints, tuple[Bools, F64, F64]]  # of the command in force: see `_change`
 
 
 class BaseController(Stateful):
@@ -63,10 +66,12 @@ class BaseController(Stateful):
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
         self.left_gain = np.ones(num_envs)
+        self._changes: dict[float, Change] = {}  # by `since_s`
 
     def reset(self, env: int) -> None:
         """Reset to a standstill, as after a stop command long ago."""
         self.commands[env] = self.set_point[env] = 0.0
+        self._changes.clear()  # its latency may be another
 
     def begin(self, motion: F64) -> None:
         """Begin at steady speeds and yaw rates (N, 2) of the wheels, as commanded long ago."""
@@ -87,44 +92,44 @@ class BaseController(Stateful):
         (N, substeps, actuators), in the model's order: wheel speeds in rad/s. The controller ramps
         toward the command in force.
         """
-        ramp = self._ramp(self.set_point, *self._in_force(since_s))
+        old, new, reach = self._in_force(since_s)
+        ramp = _ramp(self.set_point[:, None], old, new, reach)
         self.set_point = ramp[:, -1].copy()
-        speeds = self._wheels(ramp)
-        return np.tile(speeds, len(self.robot.wheels_m) // 2)
+        return np.tile(self._wheels(ramp), len(self.robot.wheels_m) // 2)
 
-    def _in_force(self, since_s: float) -> tuple[F64, F64, Ints]:
+    def _in_force(self, since_s: float) -> tuple[F64, F64, tuple[Bools, F64, F64]]:
         """Return the commands (N, 1, 2) in force as a block begins and as it ends.
 
-        Also returns the substep (N, 1, 1) of the change: there is at most one within a block.
+        Also returns in which substeps (N, S, 1) the former one is, and how far (N, S, 2) a ramp
+        gets by each toward the one and toward the other.
+        """
+        if since_s not in self._changes:
+            self._changes[since_s] = self._change(since_s)
+        first, last, reach = self._changes[since_s]
+        rows = np.arange(len(first))
+        return self.commands[rows, first][:, None], self.commands[rows, last][:, None], reach
+
+    def _change(self, since_s: float) -> Change:
+        """Return how many periods old (N,) both commands are, and the rest of `_in_force`.
+
+        There is at most one change within a block.
         """
         step = np.arange(self._substeps)
         age_s = since_s + step * self._timestep_s - self.latency_s[:, None] + 1e-9
         age = np.clip(-np.floor(age_s / self._period_s), 0, self.commands.shape[1] - 1)
         age = age.astype(np.int64)  # (N, S) how many periods old the command in force is
         first, last = age[:, 0], age[:, -1]
-        rows = np.arange(len(age))
-        old, new = self.commands[rows, first][:, None], self.commands[rows, last][:, None]
-        switch = (age == first[:, None]).sum(axis=1)[:, None, None]  # substeps under `old`
-        switch = np.where(first[:, None, None] == last[:, None, None], self._substeps, switch)
-        return old, new, switch
-
-    def _ramp(self, begin: F64, old: F64, new: F64, switch: Ints) -> F64:
-        """Ramp from `begin` (N, 2) toward the commands in force, (N, substeps, 2), exactly."""
+        former = (age == first[:, None])[..., None]  # all substeps where nothing changes
+        switch, count = former.sum(axis=1, keepdims=True), (step + 1)[:, None]
         reach = self._accel_limit * self._timestep_s
-        begin = begin[:, None]
-        count = (np.arange(self._substeps) + 1)[None, :, None]
-        under_old = begin + _limit(old - begin, reach * np.minimum(count, switch))
-        turned = begin + _limit(old - begin, reach * switch)
-        under_new = turned + _limit(new - turned, reach * np.maximum(count - switch, 0))
-        ramp: F64 = np.where(count <= switch, under_old, under_new)
-        return ramp
+        to_old, to_new = np.minimum(count, switch), np.maximum(count - switch, 0)
+        return first, last, (former, reach * to_old, reach * to_new)
 
     def _wheels(self, ramp: F64) -> F64:
         """Return both sides' wheel speeds (N, substeps, 2) in rad/s, from speeds and yaw rates."""
         left, right = self.robot.wheel_commands(ramp[..., 0], ramp[..., 1])
-        speeds: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
-        speeds[..., 0] *= self.left_gain[:, None]
-        return speeds
+        gain = self.gain[:, None]
+        return stacked(left * gain * self.left_gain[:, None], right * gain)
 
 
 class SteeringController(BaseController):
@@ -155,12 +160,11 @@ class SteeringController(BaseController):
 
     def controls(self, since_s: float) -> F64:
         """Return speeds of the rear wheels and angles (rad) of the front ones over a block."""
-        old, new, switch = self._in_force(since_s)
-        begin = np.stack([self.set_point[:, 0], self.steering_rad], axis=-1)
-        first = self._steered(old, begin[:, None, 1])
-        reach = self._accel_limit[1] * self._timestep_s * switch[..., 0]
-        turned = begin[:, None, 1] + _limit(first[..., 1] - begin[:, None, 1], reach)
-        ramp = self._ramp(begin, first, self._steered(new, turned), switch)
+        old, new, reach = self._in_force(since_s)
+        begin = stacked(self.set_point[:, 0], self.steering_rad)[:, None]
+        first = self._steered(old, begin[..., 1])
+        turned = begin[..., 1] + _limit(first[..., 1] - begin[..., 1], reach[1][:, -1:, 1])
+        ramp = _ramp(begin, first, self._steered(new, turned), reach)
         speed, steering = ramp[..., 0], ramp[..., 1]
         self.steering_rad = steering[:, -1].copy()
         driven = np.stack([speed, self.robot.yaw_rate(speed, steering)], axis=-1)
@@ -170,7 +174,7 @@ class SteeringController(BaseController):
     def _steered(self, command: F64, held_rad: F64) -> F64:
         """Convert commands (N, 1, 2) to speeds and steering angles."""
         steering = self.robot.steering_for(command, held_rad)
-        return np.stack([command[..., 0], steering], axis=-1)
+        return stacked(command[..., 0], steering)
 
 
 def base_controller(
@@ -179,6 +183,15 @@ def base_controller(
     """Build the controllers for robots of this model."""
     kind = SteeringController if robot.steers else BaseController
     return kind(num_envs, robot, period_s, timestep_s, substeps)
+
+
+def _ramp(begin: F64, old: F64, new: F64, reach: tuple[Bools, F64, F64]) -> F64:
+    """Ramp from `begin` (N, 1, 2) toward the commands in force, (N, substeps, 2), exactly."""
+    former, to_old, to_new = reach
+    under_old = begin + _limit(old - begin, to_old)
+    turned = under_old[:, -1:]
+    ramp: F64 = np.where(former, under_old, turned + _limit(new - turned, to_new))
+    return ramp
 
 
 def _limit(change: F64, most: F64) -> F64:
@@ -382,7 +395,7 @@ class Simulation(Stateful):
 
     def apply(self, env: int, perturbation: Perturbation) -> None:
         """Write a perturbation's physics into one environment."""
-        self.friction.left[env] = perturbation.left_friction_scale
+        self.friction.scale[env, ::2] = perturbation.left_friction_scale
         self.friction.set_floor(env, FLOOR_FRICTION * perturbation.friction_scale)
         self.controller.latency_s[env] = perturbation.latency_s
         self.controller.gain[env] = perturbation.gain
@@ -394,23 +407,21 @@ class Simulation(Stateful):
     def drive(self, command: F64) -> None:
         """Drive one control period under commands (N, 2): forward speed, yaw rate."""
         self.controller.command(command)
-        self.bumped[:] = False
-        self.slipped[:] = False
-        touched = self.bumped.copy()
-        start = self.qpos[:, :2].copy()
+        self.bumped[:] = self.slipped[:] = False
+        touched, icy = self.bumped.copy(), self.friction.icy
+        start = pose = self.pose()
+        middle = self.middle(pose)
         for block in range(self.blocks):
-            pose = self.pose()
-            middle = self.middle(pose)
             self.scenery.walk(self.traffic.advance(middle, self.qvel[:, :2], touched, self.block_s))
-            icy = self.friction.icy
             slippery = self.friction.write(icy, pose[icy])
             touched = self._run(self.controller.controls(block * self.block_s))
             self.bumped |= touched
+            pose = self.pose()
+            middle = self.middle(pose)
             if slippery.any():
-                self.slipped[icy] |= self._slipping(icy, slippery)
-            middles = self.middle(self.pose()) if self.robot.axle_x_m else self.qpos
-            self.traffic.note_closest(middles[:, :2], self._yaw)
-        self.travelled_m = np.hypot(*(self.qpos[:, :2] - start).T)
+                self.slipped[icy] |= self._slipping(icy, pose[icy, 2], slippery)
+            self.traffic.note_closest(middle)
+        self.travelled_m = np.hypot(*(pose - start)[:, :2].T)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.diverged = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
@@ -437,9 +448,7 @@ class Simulation(Stateful):
             touched |= pressed
             self.time_s += (stop - start) * self.timestep_s
             if self._rollers is not None and self.callback is not None:
-                self._rolled += self._turning(np.arange(self.num_envs)) * (
-                    (stop - start) * self.timestep_s
-                )
+                self._rolled += self._turning() * ((stop - start) * self.timestep_s)
             records.append(sensed[:, :, self.handles.accelerometer])
             if self.callback is not None:
                 self.callback(self.body_state(records[-1].mean(axis=1), pressed))
@@ -467,9 +476,10 @@ class Simulation(Stateful):
             set_point=self.controller.set_point.copy(),
         )
 
-    def pose(self) -> F64:
-        """Return the true x, y and heading, (N, 3)."""
-        return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
+    def pose(self, ids: Ints | slice = slice(None)) -> F64:
+        """Return the true x, y and heading, (N, 3), or those of `ids` (n,)."""
+        qpos = self.qpos[ids]
+        return stacked(qpos[:, 0], qpos[:, 1], yaw_of(qpos[:, 3:7]))
 
     def middle(self, pose: F64) -> F64:
         """Return outlines' centres and headings (..., 3) for axles at poses (..., 3)."""
@@ -477,18 +487,19 @@ class Simulation(Stateful):
             return pose
         back = self.robot.axle_x_m
         x, y = np.cos(pose[..., 2]) * back, np.sin(pose[..., 2]) * back
-        return np.stack([pose[..., 0] - x, pose[..., 1] - y, pose[..., 2]], axis=-1)
+        return stacked(pose[..., 0] - x, pose[..., 1] - y, pose[..., 2])
 
-    def wheel_speeds(self) -> F64:
+    def wheel_speeds(self, ids: Ints | slice = slice(None)) -> F64:
         """Return the speeds (N, 2) of the left and right wheels, in rad/s."""
-        return self.robot.by_side(self._turning(np.arange(self.num_envs)))
+        return self.robot.by_side(self._turning(ids))
 
-    def _turning(self, ids: Ints) -> F64:
+    def _turning(self, ids: Ints | slice = slice(None)) -> F64:
         """Return the speeds (n, W) of the wheels, in rad/s."""
+        spin: F64 = self.qvel[ids].take(self._wheel_qvel, axis=1)
         if self._rollers is None:
-            return np.asarray(self.qvel[np.ix_(ids, self._wheel_qvel)])
-        spin = self.qvel[np.ix_(ids, self._wheel_qvel)].reshape(len(ids), -1, 3)
-        about = rotated(self.qpos[np.ix_(ids, self._wheel_qpos)].reshape(len(ids), -1, 4), spin)
+            return spin
+        quat = self.qpos[ids].take(self._wheel_qpos, axis=1).reshape(len(spin), -1, 4)
+        about = rotated(quat, spin.reshape(len(spin), -1, 3))
         return np.asarray((about * self._rollers).sum(axis=-1))
 
     def _wheel_angles(self) -> F64:
@@ -508,12 +519,9 @@ class Simulation(Stateful):
             angles = self.robot.front_angles(self.controller.steering_rad)
             self.qpos[:, self._steering_qpos] = angles
 
-    def _yaw(self, ids: Ints) -> F64:
-        return yaw_of(self.qpos[ids, 3:7])
-
-    def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
+    def _slipping(self, ids: Ints, heading: F64, slippery: Bools) -> Bools:
         """Return where (n,) a wheel on a patch (n, W) slides over the floor above the limit."""
-        velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
+        velocity = self.qvel[ids]
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]
         lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
@@ -524,7 +532,7 @@ class Simulation(Stateful):
             slip = np.abs(ground - self._rollers[:, 0] * aside - rim) / np.sqrt(2)
             return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
         if self.robot.steers:
-            steering = self.qpos[np.ix_(ids, self._steering_qpos)]
+            steering = self.qpos[ids].take(self._steering_qpos, axis=1)
             ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)
             aside[:, :2] -= rim[:, :2] * np.sin(steering)
         slip = np.hypot(rim - ground, aside)
@@ -539,9 +547,10 @@ class Simulation(Stateful):
 
     def cast(self, ids: Ints) -> F64:
         """Return the true lidar ranges (n, beams) in metres; inf if nothing is hit."""
-        heading = yaw_of(self.qpos[ids, 3:7])
-        ahead = self.lidar_x_m * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        return self.lidar.ranges(ids, self.qpos[ids, :2] + ahead, heading)
+        pose = self.pose(ids)
+        heading = pose[:, 2]
+        ahead = self.lidar_x_m * stacked(np.cos(heading), np.sin(heading))
+        return self.lidar.ranges(ids, pose[:, :2] + ahead, heading)
 
     # -- state ----------------------------------------------------------------------------------
 
