@@ -7,7 +7,7 @@
 Records logs of seeds that no rule was set on, on the default floor and on `generated:test` floors
 (`--part development`: the seeds and `generated:train` floors that the rules were set on; `seen`:
 logs that were looked at while they were), ingests them, and prints precision and recall of each
-condition with 95 % intervals, the share of uncertain steps, and the reliability of the
+condition, by events with 95 % intervals, and the reliability of the
 probabilities. `--bound` adds the best that any rule could do: `label_bound.py`. `--fit` prints the
 weights of a condition's `odds` that suit the development
 logs best. `--verdicts` prints what a person's verdicts gain on the longer sample log, by doubt and
@@ -19,6 +19,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +38,10 @@ from restock.ingest.task.schema import signal_columns, true_names
 from restock.ingest.task.task import STORED_SIGNALS
 from restock.replay.review.events import (
     DoubtfulEvent,
-    LabelQuality,
     doubtful_events,
-    label_quality,
-    reliability,
 )
 from restock.replay.store.store import Store
+from restock.stats import wilson
 from restock.train.twin.recording.recorder import RecordingPlan, record
 
 SEEDS = {
@@ -87,11 +86,11 @@ def main() -> int:
     missed: list[str] = []
     for floors, path in stores.items():
         with Store(path) as store:
-            found = [one for one in label_quality(store) if one.score.condition in shipped()]
-            bins = reliability(store).to_pylist()
+            found = [one for one in scores_of(store) if one.condition in shipped()]
+            bins = store.sql("FROM label_reliability").to_arrow_table().to_pylist()
         lines += [f"\n{options.part}, floors {floors}:\n", table(found, bound.get(floors, {}))]
         lines += ["", reliability_table(bins)]
-        figures[floors] = {one.score.condition: vars(one.score) for one in found}
+        figures[floors] = {one.condition: vars(one) for one in found}
         missed += [miss for one in found for miss in misses(floors, one)]
     return finish(options, figures, missed, lines)
 
@@ -125,30 +124,39 @@ def stored(cache: Path, floors: str, seeds: Sequence[int], minutes: float) -> Pa
     return store
 
 
-def table(found: Sequence[LabelQuality], bound: Mapping[str, LabelScore]) -> str:
+def scores_of(store: Store) -> list[LabelScore]:
+    """Return each condition's counts over all recordings of a store."""
+    names = [field.name for field in fields(LabelScore)]
+    counts = ", ".join(f"sum({name})::BIGINT" for name in names[1:])
+    query = f"SELECT condition, {counts} FROM label_scores GROUP BY condition ORDER BY condition"
+    return [LabelScore(*row) for row in store.sql(query).fetchall()]
+
+
+def table(found: Sequence[LabelScore], bound: Mapping[str, LabelScore]) -> str:
     """Return the table as the docs have it."""
     header = ["condition", "true steps", "precision", "recall", "true events", "event precision",
-              "event recall", "uncertain", "bound: steps", "bound: events"]  # fmt: skip
+              "event recall", "bound: steps", "bound: events"]  # fmt: skip
     rows = []
     for one in found:
-        best = bound.get(one.score.condition)
-        shares = [
-            f"{share.value:.2f} ({share.low:.2f} to {share.high:.2f})"
-            for share in (one.precision, one.recall, one.event_precision, one.event_recall)
-        ]
+        best = bound.get(one.condition)
         rows.append(
             [
-                f"`{one.score.condition}`",
-                one.score.support,
-                *shares[:2],
-                one.score.event_support,
-                *shares[2:],
-                f"{one.uncertain or 0:.1%}",
+                f"`{one.condition}`",
+                one.support,
+                *(f"{share or 0:.2f}" for share in (one.precision, one.recall)),
+                one.event_support,
+                _of_events(one.event_right, one.event_labelled),
+                _of_events(one.event_found, one.event_support),
                 _pair(best.precision, best.recall) if best else "",
                 _pair(best.event_precision, best.event_recall) if best else "",
             ]
         )
     return markdown(header, rows)
+
+
+def _of_events(part: int, whole: int) -> str:
+    low, high = wilson(part, whole)
+    return f"{part / whole if whole else 0:.2f} ({low:.2f} to {high:.2f})"
 
 
 def _pair(precision: float | None, recall: float | None) -> str:
@@ -168,14 +176,14 @@ def reliability_table(bins: Sequence[Mapping[str, Any]]) -> str:
                                       for tenth in range(10))], rows)  # fmt: skip
 
 
-def misses(floors: str, one: LabelQuality) -> list[str]:
+def misses(floors: str, one: LabelScore) -> list[str]:
     """Return what of a condition is below its target."""
     shares = {
-        "step": (one.score.precision, one.score.recall),
-        "event": (one.score.event_precision, one.score.event_recall),
+        "step": (one.precision, one.recall),
+        "event": (one.event_precision, one.event_recall),
     }
     return [
-        f"{floors}: {one.score.condition}: {kind} {name} {value or 0:.2f}, target {TARGETS[kind]}"
+        f"{floors}: {one.condition}: {kind} {name} {value or 0:.2f}, target {TARGETS[kind]}"
         for kind, values in shares.items()
         for name, value in zip(("precision", "recall"), values, strict=True)
         if (value or 0) < TARGETS[kind]

@@ -148,6 +148,7 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "mix --verify": "it is `restock store verify PANEL` now",
     "store label --all": "give the profile the name of the recordings' own",
     "store label --review": "`restock review STORE` shows the events on a page; --out review.csv",
+    "store label --score": "query them: FROM pooled_label_scores, FROM label_reliability",
     "store label --out": "write the events with `restock review STORE --out review.csv`",
     "store label --corrections": "give the file to `restock review STORE FILE`",
     "store label --by": "query the scores of each recording: FROM label_scores",

@@ -4,9 +4,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from support.profile_texts import WAREHOUSE
+from support.stores import recording_transitions, write_store
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import parse_profile, profile_toml, read_profile_toml
+from restock.ingest.store.transitions import replaced
 from restock.ingest.task.conditions import (
     Condition,
     label,
@@ -18,6 +20,7 @@ from restock.ingest.task.conditions import (
 )
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Noise
+from restock.replay.store.store import Store
 
 FILE = """-- Fast, for a while.
 -- timing: pre
@@ -133,3 +136,20 @@ def test_a_condition_of_ones_own_may_name_limits_and_write_times() -> None:
     assert carried.labels_version == profile.labels_version
     with pytest.raises(ConfigError, match=r"(?s)tight.*\{1\.6 s\}"):
         parse_profile(WAREHOUSE + OWN.format("1 min"), where="here")
+
+
+def test_probabilities_stand_beside_how_often_they_are_true(tmp_path):
+    table = recording_transitions(1)
+    truth = ["recovery" if row % 3 else "nominal" for row in range(len(table))]
+    path = write_store(tmp_path / "store", [replaced(table, {"true_condition": truth})])
+    rows = [dict(row).get("recovery") for row in table["probabilities"].to_pylist()]
+    want: dict[float, list[bool]] = {}
+    for told, true in zip(rows, truth, strict=True):
+        if told is not None:
+            want.setdefault(min(int(told * 10), 9) / 10, []).append(true == "recovery")
+    with Store(path) as store:
+        found = store.sql("SELECT from_probability, known, true_share FROM label_reliability")
+        for tenth, known, share in found.fetchall():
+            held = want.pop(tenth)
+            assert (known, share) == (len(held), pytest.approx(np.mean(held)))
+    assert not want

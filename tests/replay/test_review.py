@@ -261,7 +261,6 @@ def test_wrong_usage_writes_nothing(reviewed, capsys):
         ([*page, "--out", "y.txt"], "'y.txt' must end in .html or .csv"),
         ([*page, "gone.csv"], "gone.csv: cannot be read: No such file"),
         ([*page, "gone.json"], "gone.json: cannot be read: No such file"),
-        ([*label, "--score", "--profile", "turtlebot3"], "cannot be combined with --profile"),
         ([*label, "--review", "3"], "`restock review STORE` shows the events on a page"),
         ([*label, "--corrections", "x.csv"], "give the file to `restock review STORE FILE`"),
     ):

@@ -1,10 +1,10 @@
-"""`restock store label`: new conditions over stored signals, and how good labels are."""
+"""`restock store label`: new conditions over stored signals."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from restock.ingest.relabel import Relabelled
     from restock.ingest.store.writer import StoreWriter
     from restock.ingest.task.conditions import Condition
-    from restock.replay.review.events import LabelQuality
-    from restock.stats import ConfidenceInterval
 
 
 @dataclass
@@ -40,9 +38,6 @@ class LabelCommand:
     profile: str | None = None
     """Use the conditions of this profile, a shipped one or a TOML file, for the recordings that
     were ingested with a profile of its name."""
-    score: bool = False
-    """Label nothing: compare the labels with the true conditions of simulated recordings, by step
-    and by event, and print how reliable their probabilities are."""
     dry_run: bool = False
     """Do everything except writing, and print what would change."""
     json: bool = False
@@ -52,10 +47,6 @@ class LabelCommand:
         """Label, and say what changed."""
         from restock.ingest.relabel import open_for_relabel, relabel_store
 
-        if self.score:
-            if self.profile is not None:
-                raise ConfigError("--score cannot be combined with --profile")
-            return print_scores(self.store, json=self.json)
         store = open_for_relabel(self.store)
         outcomes, version = relabel_store(
             store,
@@ -138,63 +129,3 @@ def as_json(outcome: Relabelled) -> dict[str, Any]:
         **{name: getattr(outcome, name) for name in names},
         "label_scores": score_rows(outcome.scores),
     }
-
-
-def print_scores(path: Path, *, json: bool) -> int:
-    """Print precision and recall of each condition, and how reliable the probabilities are."""
-    from restock.replay.review.events import label_quality, reliability, reliability_rows
-    from restock.replay.store.store import Store
-
-    with Store(path) as store:
-        found = label_quality(store)
-        bins = reliability(store).to_pylist()
-    if json:
-        rows = [quality_json(one) for one in found]
-        output.print_json({"scores": rows, "reliability": bins})
-        return ExitCode.OK
-    if not found:
-        output.print_text(
-            "no recording in the store contains the true conditions: nothing to score"
-        )
-        return ExitCode.OK
-    output.print_table(score_rows(found))
-    reported = [row for row in bins if row["known"]]
-    if reported:
-        output.print_text(
-            "\nA probability is reliable if, among steps with probability p, a share p is true:"
-        )
-        output.print_table(reliability_rows(reported))
-    return ExitCode.OK
-
-
-def score_rows(found: Sequence[LabelQuality]) -> list[dict[str, Any]]:
-    """Return a table row for each condition."""
-    return [
-        {
-            "condition": one.score.condition,
-            "true steps": one.score.support,
-            "precision": _interval(one.precision),
-            "recall": _interval(one.recall),
-            "true events": one.score.event_support,
-            "event precision": _interval(one.event_precision),
-            "event recall": _interval(one.event_recall),
-            "uncertain": one.uncertain,
-        }
-        for one in found
-    ]
-
-
-def quality_json(one: LabelQuality) -> dict[str, Any]:
-    """Return counts, and shares with 95 % intervals, as `--json` prints them."""
-    shares = ("precision", "recall", "event_precision", "event_recall")
-    return {
-        **asdict(one.score),
-        "uncertain": one.uncertain,
-        **{name: asdict(getattr(one, name)) for name in shares},
-    }
-
-
-def _interval(share: ConfidenceInterval) -> str:
-    if share.value != share.value:
-        return "-"
-    return f"{share.value:.2f} ({share.low:.2f} to {share.high:.2f})"

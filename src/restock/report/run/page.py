@@ -10,7 +10,6 @@ from markupsafe import Markup
 
 from restock.errors import RestockError, counted, policy_words
 from restock.files import read_json
-from restock.replay.review.events import reliability_rows
 from restock.report.look import blocks, charts, floor_map
 from restock.report.look.blocks import (
     Drawing,
@@ -321,7 +320,7 @@ def labels_section(facts: Facts) -> Section | None:
     if not facts.labels:
         return None
     rows = [_score(row) for row in facts.labels]
-    reliability = reliability_rows(facts.reliability)
+    reliability = _reliability_rows(facts.reliability)
     tables = [Table(rows)]
     if reliability:
         title = "Steps with probability p: the share that is true should be p"
@@ -563,3 +562,13 @@ def _box(plan: FloorMap, pose: list[float], size_m: tuple[float, float], colour:
         f' height="{breadth:.1f}" rx="4" fill="{colour}" stroke="#ffffff" stroke-width="2"'
         f' transform="translate({x:.1f} {y:.1f}) rotate({-math.degrees(pose[2]):.1f})"/>'
     )
+
+
+def _reliability_rows(bins: Rows) -> Rows:
+    """Return a row for each condition: the true share of steps by tenths of probability."""
+    rows: dict[str, dict[str, Any]] = {}
+    for one in bins:
+        row = rows.setdefault(one["condition"], {"condition": one["condition"]})
+        row |= {f"{tenth / 10:g}+": row.get(f"{tenth / 10:g}+", "") for tenth in range(10)}
+        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
+    return list(rows.values())
