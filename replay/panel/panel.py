@@ -35,7 +35,7 @@ from restock.replay.plan.weights import RatioFit
 from restock.replay.sampling.packed_rows import PACKING_VERSION, row_columns, row_width
 
 if TYPE_CHECKING:
-    from restock.replay.panel.logged_sampler import LoggedSampler
+    pass
 
 
 AGAIN = "make it again with `restock mix`"
@@ -401,12 +401,6 @@ class Panel:
         """Return the row numbers of each stratum, in order of `strata`."""
         code = self.stratum_code
         return [np.flatnonzero(code == index) for index in range(len(self.strata))]
-
-    def sampler(self, batch_size: int, *, seed: int) -> LoggedSampler:
-        """Return a sampler that follows the mixture, see `sampler_for`."""
-        from restock.replay.panel.logged_sampler import sampler_for
-
-        return sampler_for(self, batch_size, seed=seed)
 
     def tensor(self) -> Any:
         """Return the packed rows as a memory-mapped torch tensor (n, W), for `gather_rows`."""

@@ -137,7 +137,6 @@ def by_library(reported: bool) -> Way:
 
 WAYS: dict[str, Way] = {
     "sampler_for": by_sampler(lambda panel: sampler_for(panel, BATCH, seed=0)),
-    "Panel.sampler": by_sampler(lambda panel: panel.sampler(BATCH, seed=0)),
     "PanelDataset": by_dataset(0),
     "PanelDataset, 2 workers": by_dataset(2),
     "training": by_batches,
@@ -264,13 +263,3 @@ def test_draws_of_a_panel_go_on_where_they_were_saved(panels):
         some(one, 7)
         other.load_state_dict(one.state_dict())
         assert some(one, 20) == some(other, 20)
-
-
-@pytest.mark.parametrize("name", sorted(FOLLOW_TD))
-def test_signed_errors_and_those_of_other_rows_are_refused(panels, name):
-    sampler = sampler_for(panels(name), BATCH, seed=0)
-    batch = sampler.draw()
-    with pytest.raises(MixtureError, match="are negative, the least -1\n  give their absolute"):
-        sampler.update(batch.rows, batch.strata, -np.ones(BATCH))
-    with pytest.raises(MixtureError, match=r"TD errors of shape \(3,\) for rows of shape"):
-        sampler.update(batch.rows, batch.strata, np.ones(3))

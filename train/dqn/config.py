@@ -191,7 +191,7 @@ class EnvConfig(Checked, frozen=True):
 class PracticeConfig(Checked, frozen=True):
     """Which missions the twin gives next: see `restock.train.feed.practice`."""
 
-    rule: Literal["natural", "even", "missions", "success"] = "natural"
+    rule: Literal["natural", "even", "success"] = "natural"
     # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
     by: tuple[str, ...] = ("block",)
     floor: Share | None = None  # least share of an arm; None: FLOOR if shares move, else 0

@@ -4,7 +4,6 @@ An arm is a kind of missions (`restock.train.twin.env.episode_queue`). The rules
 
 - natural: as `env.conditions`, `env.missions` and the floors say;
 - even: every arm alike;
-- missions: the ordered missions alone, each at its part;
 - success: an arm's weight is its rate of failures, while the agent explores. The failures and
   successes of an arm fade by a half-life; an arm with too few episodes goes by its kind's rate, and
   a kind with too few counts as if all failed.
@@ -240,16 +239,7 @@ class Practice(Stateful):
             return self.natural
         if rule == "even":
             return np.ones(len(self.arms))
-        if rule == "success":
-            return None
-        weights = np.where([arm.order >= 0 for arm in self.arms], self.natural, 0.0)
-        if not weights.any():
-            raise ConfigError(
-                'the rule "missions" practises the missions of a file, but none is given',
-                where=f"{WHERE}.rule",
-                remedy="give env.missions a file of `restock coverage gaps --missions-out`",
-            )
-        return weights
+        return None
 
     def _resolved_floor(self) -> float:
         config, count = self.config, len(self.arms)

@@ -261,7 +261,7 @@ def practice_section(facts: Facts) -> Section | None:
     )
 
 
-FIXED = ("natural", "even", "shares", "logs", "missions")
+FIXED = ("natural", "even")
 
 
 def by_arm(facts: Facts) -> Rows:
