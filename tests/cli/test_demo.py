@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 
 from restock import cli
 from restock.cli.start import demo, outcomes
@@ -126,16 +125,3 @@ def test_a_demo_that_cannot_begin_writes_nothing(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     assert cli.main(["demo", "--out", str(tmp_path)]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_demo_ends_with_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    assert (
-        cli.main(["demo", "--out", str(out), "--seconds", "20", "--episodes", "2", "--json"]) == 0
-    )
-    said = capsys.readouterr().out
-    parts = json.loads(said[said.rindex("{") :])
-    page = Path(parts["report"]).read_text(encoding="utf-8")
-    assert page.count("<svg") >= 10  # each figure at the widths of a phone and of a desk

@@ -95,7 +95,7 @@ MAY_IMPORT = {
     ),
     "report/look": "train/twin/missions",
     "report/run": (
-        "look replay/panel replay/plan replay/review replay/sampling replay/store train/evaluation"
+        "look replay/panel replay/plan replay/sampling replay/store train/evaluation"
         " train/judge train/run train/twin/calibration train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/review replay/store ingest/store",

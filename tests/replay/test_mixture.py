@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from support.panels import EVERY, NO_SPLIT, planned
 from support.paths import ROOT
-from support.stores import CONDITIONS, EXPOSURES
 
 from restock import cli
 from restock.errors import ConfigError, MixtureError
@@ -25,28 +24,16 @@ from restock.replay.mixture.mixture import (
     Safety,
     SourceShares,
     StratumRule,
-    load_mixture,
     parse_mixture,
-    shipped_mixtures,
 )
 from restock.replay.mixture.shares import plan_shares, wanted_shares
-from restock.replay.panel.build import open_source
-from restock.replay.plan.plan import PanelPlan, plan_panel
+from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import ResolvedStratum, assign, resolve_strata
 from restock.replay.plan.weights import effective_count, effective_shares, importance_weights
 
 
 def shares(plan: PanelPlan) -> dict[str, float]:
     return {line.name: line.share for line in plan.strata}
-
-
-@pytest.mark.parametrize("name", shipped_mixtures())
-def test_the_shipped_mixtures_load_and_fill(name, transitions):
-    mixture = load_mixture(name)
-    assert mixture.doc
-    with open_source(transitions, conditions=[*CONDITIONS, *EXPOSURES]) as source:
-        plan = plan_panel(source.connection, mixture, source.conditions)
-    assert sum(line.share for line in plan.strata) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(

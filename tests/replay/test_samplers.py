@@ -1,7 +1,6 @@
 """Every sampler meets exact quotas over time and draws the same after a restart."""
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -192,33 +191,6 @@ def test_every_batch_is_full_and_every_share_is_met_over_time(parts, batch_size,
         total += quota
         # However long it runs, no stratum is ever two rows away from its share.
         assert np.abs(total - index * batch_size * shares).max() < 2.0
-
-
-def test_a_share_too_small_for_one_batch_is_met_over_time():
-    quotas = Quotas([0.997, 0.003], 128)
-    assert sum(int(quotas.next()[1]) for _ in range(1000)) == 384  # 0.003 * 128 * 1000
-
-
-@settings(max_examples=60)
-@given(
-    sizes=st.lists(st.integers(1, 30), min_size=1, max_size=5),
-    batch_size=st.integers(1, 90),
-    seed=st.integers(0, 2**32),
-)
-def test_without_replacement_rows_have_their_turns(sizes, batch_size, seed):
-    starts = np.cumsum([0, *sizes])
-    rows = [np.arange(a, b) for a, b in pairwise(starts)]
-    shares = np.full(len(sizes), 1 / len(sizes))
-    sampler = QuotaSampler(
-        rows, shares, batch_size, np.random.default_rng(seed), within="without_replacement"
-    )
-    counts = np.zeros(int(starts[-1]))
-    for _ in range(12):
-        drawn, stratum = sampler.draw()
-        assert len(drawn) == batch_size
-        assert all(row in rows[code] for row, code in zip(drawn, stratum, strict=True))
-        np.add.at(counts, drawn, 1)
-        assert all(np.ptp(counts[members]) <= 1 for members in rows)
 
 
 @settings(max_examples=60)

@@ -1,6 +1,5 @@
 """What the twin gave goes into a store like a robot's log: once, whole, with its labels."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import pytest
 from support.paths import ROOT
 
 import restock
-from restock.cli import main
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.store.manifest import definitions
@@ -304,22 +302,3 @@ def test_a_step_that_blew_up_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
         "SELECT step_index, terminated FROM transitions WHERE truncated OR terminated"
     )
     assert {"step_index": 9, "terminated": False} in rows.to_arrow_table().to_pylist()
-
-
-@pytest.mark.slow
-def test_flushing_to_a_store_twice_changes_nothing(tmp_path, capsys):
-    small = ["env.num_envs=4", "evaluation.episodes=1", "network.hidden=[16]"]
-    keys = [word for key in (*small, "record.trackers=[]") for word in ("--set", key)]
-    run, store = str(tmp_path / "a"), str(tmp_path / "store")
-    new = ["train", "--out", run, "--env-steps", "1000", *keys]
-    assert main([*new, "--flush-fresh", store, "--json"]) == 0
-    flushed = json.loads(capsys.readouterr().out)["flushed"]
-    assert (flushed["status"], flushed["version"]) == ("written", 1)
-    assert flushed["episodes"] >= 4
-    assert main(["train", "--resume", run, "--flush-fresh", store, "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)["flushed"]
-    assert again == flushed | {"status": "unchanged", "version": None}
-    query = "SELECT format, count(*) AS rows FROM transitions JOIN recordings USING (recording_id)"
-    assert main(["sql", store, f"{query} GROUP BY ALL", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found == [{"format": "twin", "rows": flushed["transitions"]}]
