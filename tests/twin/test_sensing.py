@@ -18,6 +18,7 @@ def test_localisation_drifts_as_an_autoregressive_walk() -> None:
     walks = []
     for env in range(4):
         sensing.reset(env, np.random.SeedSequence(env), Perturbation())
+        sensing._draw(env, TASK.time_limit_steps)
         walk = sensing._noise[env, :, 3:5]
         drawn = np.random.Generator(np.random.SFC64(np.random.SeedSequence(env))).standard_normal(
             dtype=np.float32, size=sensing._noise[env].shape

@@ -438,8 +438,8 @@ class Truth(Stateful):
         self.exposed[ids] = False
 
     def note_situation(self, simulation: Simulation, plans_m: F64) -> None:
-        """Note what every robot is exposed to at the start of a step."""
-        pose, pallets = simulation.pose(), simulation.pallets
+        """Note what every robot was exposed to at the start of the step that was driven."""
+        pose, pallets = simulation.start, simulation.pallets
         ahead = np.zeros((len(pose), len(VIEW_M)), np.bool_)
         apart = np.abs(pallets[:, :, :2] - pose[:, None, :2])
         near = np.maximum(apart[..., 0], apart[..., 1]) < REACH_M
@@ -449,13 +449,13 @@ class Truth(Stateful):
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets], self._margin_m
             )
         self.blocked[:] = ahead[:, :BLOCK_AHEAD].any(axis=1)
-        gaps_m = simulation.traffic.gaps_m(simulation.middle(pose))
+        gaps_m = simulation.traffic_gap_m
         with np.errstate(invalid="ignore"):  # who was not there, or is not, is at infinity
             came_m = self.traffic_gap_m - gaps_m
         came = np.isfinite(came_m) & (came_m > CLOSING_MPS * self._period_s)
         self.exposed[:, 0] = (came & (gaps_m < CLOSING_WITHIN_M)).any(axis=1)
         self.exposed[:, 1] = ahead.any(axis=1)
-        self.exposed[:, 2] = simulation.friction.on_patch(pose)
+        self.exposed[:, 2] = simulation.on_patch
         self.traffic_gap_m = gaps_m
 
     def exposure(self) -> NDArray[np.str_]:

@@ -390,8 +390,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
             chosen = behind_limiter(self.limits, task, now, chosen)
         action, command, reported = chosen
         everyone = np.arange(self.num_envs)
-        self.truth.note_situation(sim, self.navigation.plans_m)
         sim.drive(command)
+        self.truth.note_situation(sim, self.navigation.plans_m)
         self.steps += 1
 
         after = self.sensing.sense(everyone, self.steps)

@@ -9,6 +9,7 @@ and twin share.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -251,14 +252,14 @@ class Warehouse:
         names = np.array([*self.zones, ELSEWHERE], object)
         boxes = np.array([area.edges for area in self.zones.values()])
         inside = np.ones((len(x_m), len(names)), np.bool_)
-        inside[:, :-1] = _inside(boxes.reshape(-1, 4), x_m, y_m)
+        inside[:, :-1] = within(boxes.reshape(-1, 4), x_m, y_m)
         return [str(name) for name in names[inside.argmax(axis=1)]]
 
     def segment_of(self, x_m: F64, y_m: F64) -> Ints:
         """Return the index of the aisle segment each point lies in, (N,); -1 for none."""
         if not self.segments:
             return np.full(np.shape(x_m), -1, np.int64)
-        inside = _inside(self.segment_edges, x_m, y_m)
+        inside = within(self.segment_edges, x_m, y_m)
         return np.where(inside.any(axis=1), inside.argmax(axis=1), -1).astype(np.int64)
 
     @cached_property
@@ -269,7 +270,7 @@ class Warehouse:
     @cached_property
     def segment_edges(self) -> F64:
         """Return x_min, y_min, x_max, y_max of each aisle segment, (S, 4)."""
-        return np.array([segment.area.edges for segment in self.segments]).reshape(-1, 4)
+        return edges_of(segment.area for segment in self.segments)
 
     @cached_property
     def segment_along_y(self) -> Bools:
@@ -286,12 +287,16 @@ class Warehouse:
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
 
 
-def _inside(edges: F64, x_m: F64, y_m: F64) -> Bools:
-    """Return which boxes (B, 4) hold each point, (N, B)."""
+def edges_of(areas: Iterable[Rect]) -> F64:
+    """Return x_min, y_min, x_max, y_max of rectangles, (B, 4)."""
+    return np.array([area.edges for area in areas]).reshape(-1, 4)
+
+
+def within(edges: F64, x_m: F64, y_m: F64, margin_m: float = 0.0) -> Bools:
+    """Return which boxes (B, 4) hold each point, (N, B), at least `margin_m` from every side."""
     x, y = np.asarray(x_m)[:, None], np.asarray(y_m)[:, None]
-    inside: Bools = (
-        (edges[:, 0] <= x) & (x <= edges[:, 2]) & (edges[:, 1] <= y) & (y <= edges[:, 3])
-    )
+    low, high = edges[:, :2] + margin_m, edges[:, 2:] - margin_m
+    inside: Bools = (low[:, 0] <= x) & (x <= high[:, 0]) & (low[:, 1] <= y) & (y <= high[:, 1])
     return inside
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F64, Bools, Ints, stacked
 from restock.train.twin.floors.layout import HEADINGS, ROOM_M, Warehouse
 
 CELL_M = 0.1
@@ -135,7 +135,7 @@ class Planner:
         cells, following = [start], before.data  # whose items are Python's own numbers
         while (cell := following[cells[-1]]) >= 0:
             cells.append(cell)
-        way = np.stack(np.unravel_index(np.array(cells), self.shape), axis=-1) * CELL_M + CELL_M / 2
+        way = stacked(*np.divmod(np.array(cells), self.shape[1])) * CELL_M + CELL_M / 2
         way[-1] = goal
         return smooth_plan(way)
 
@@ -293,11 +293,10 @@ def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
     """Average a way's cells over a moving window, which rounds the grid's corners."""
     if len(way) < 3:
         return way
-    padded = np.concatenate(
-        [np.repeat(way[:1], half_window, 0), way, np.repeat(way[-1:], half_window, 0)]
-    )
-    total = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
-    width = 2 * half_window + 1
+    padded = np.zeros((len(way) + 2 * half_window + 1, 2))  # after a row of zeros
+    padded[1 : half_window + 1], padded[-half_window:] = way[0], way[-1]
+    padded[half_window + 1 : -half_window] = way
+    total, width = np.cumsum(padded, axis=0), 2 * half_window + 1
     smooth: F64 = (total[width:] - total[:-width]) / width
     smooth[0], smooth[-1] = way[0], way[-1]
     return smooth
@@ -305,7 +304,7 @@ def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
 
 def _resample(way: F64) -> F64:
     """Return PLAN_POINTS points at equal distances along a polyline."""
-    length = np.hypot(*np.diff(way, axis=0).T)
-    arc = np.concatenate([[0.0], np.cumsum(length)])
+    arc = np.zeros(len(way))
+    np.cumsum(np.hypot(*(way[1:] - way[:-1]).T), out=arc[1:])
     at = np.linspace(0.0, arc[-1], PLAN_POINTS)
-    return np.stack([np.interp(at, arc, way[:, 0]), np.interp(at, arc, way[:, 1])], axis=-1)
+    return stacked(np.interp(at, arc, way[:, 0]), np.interp(at, arc, way[:, 1]))

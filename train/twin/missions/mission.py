@@ -57,13 +57,12 @@ class Mission:
 
 def length_m(plan: F64) -> float:
     """Return the length of a polyline (P, 2)."""
-    return float(np.hypot(*np.diff(plan, axis=0).T).sum())
+    return float(np.hypot(*(plan[1:] - plan[:-1]).T).sum())
 
 
 def point_along(plan: F64, at_m: float) -> F64:
     """Return the point `at_m` along an evenly spaced polyline (P, 2), clipped to its ends."""
-    total = length_m(plan)
-    place = np.clip(at_m / max(total, 1e-9), 0.0, 1.0) * (len(plan) - 1)
+    place = min(max(at_m / max(length_m(plan), 1e-9), 0.0), 1.0) * (len(plan) - 1)
     first = min(int(place), len(plan) - 2)
     point: F64 = plan[first] + (place - first) * (plan[first + 1] - plan[first])
     return point

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from restock.arrays import F64
-from restock.train.twin.floors.layout import AGENTS, PEOPLE, WAY_POINTS, Walk, Warehouse
+from restock.train.twin.floors.layout import (
+    AGENTS,
+    PEOPLE,
+    WAY_POINTS,
+    Walk,
+    Warehouse,
+    edges_of,
+    within,
+)
 from restock.train.twin.missions.mission import Mission, Staged
 
 PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin
@@ -40,11 +48,9 @@ def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
     """Return points of the plan inside a crossing, at least 1.5 m from its ends."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     margin = int(1.5 / max(spacing, 1e-6)) + 1
-    return [
-        index
-        for index in range(margin, len(plan) - margin)
-        if any(c.contains(plan[index, 0], plan[index, 1], 0.3) for c in warehouse.crossings)
-    ]
+    x, y = plan[margin : len(plan) - margin].T
+    inside = within(edges_of(warehouse.crossings), x, y, 0.3).any(axis=1)
+    return [margin + int(index) for index in np.flatnonzero(inside)]
 
 
 def _crossing(
@@ -97,15 +103,11 @@ def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
 
 def _free_m(warehouse: Warehouse, place: F64, direction: F64, half_width_m: float) -> float:
     """Return how far one can go from a place in a direction before a rack or wall is too near."""
-    for step in range(1, 60):
-        x, y = place + direction * (0.1 * step)
-        on_floor = (
-            half_width_m <= x <= warehouse.width_m - half_width_m
-            and half_width_m <= y <= warehouse.depth_m - half_width_m
-        )
-        if not on_floor or any(rack.contains(x, y, -half_width_m) for rack in warehouse.racks):
-            return 0.1 * (step - 1)
-    return 6.0
+    x, y = (place + direction * (0.1 * np.arange(1, 60))[:, None]).T
+    floor = np.array([[0.0, 0.0, warehouse.width_m, warehouse.depth_m]])
+    free = within(floor, x, y, half_width_m)[:, 0]
+    free &= ~within(edges_of(warehouse.racks), x, y, -half_width_m).any(axis=1)
+    return 6.0 if free.all() else 0.1 * int(free.argmin())
 
 
 MISSION = Mission(

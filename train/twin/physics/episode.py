@@ -99,7 +99,7 @@ def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode
     moved to the aisle's middle. A start without room for any of these is kept, and so is one that
     was requested.
     """
-    if episode.spec.way is not None:
+    if episode.spec.way is not None or _has_room(warehouse, outline_m, episode.start):
         return episode
     x, y, yaw = episode.start
     along = point_along(episode.plan_m, 1.0) - episode.plan_m[0]
@@ -113,12 +113,17 @@ def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode
         places.append((x, middle[1]) if aisle.along == "x" else (middle[0], y))
     for place in places:
         for heading in (yaw, ahead, *square.tolist()):
-            cos, sin = np.cos(heading), np.sin(heading)
-            points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + place
-            corners = points[None, :, 0], points[None, :, 1]
-            if near_gap(warehouse, np.empty((1, 0, 4)), *corners, AISLE_ROOM_M).min() > 0:
+            if _has_room(warehouse, outline_m, (*place, heading)):
                 return replace(episode, start=(*place, heading))
     return episode
+
+
+def _has_room(warehouse: Warehouse, outline_m: F64, pose: tuple[float, float, float]) -> bool:
+    """Return whether an outline (K, 2) at a pose stands in no rack or wall."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
+    corners = points[None, :, 0], points[None, :, 1]
+    return bool(near_gap(warehouse, _NO_BOXES, *corners, AISLE_ROOM_M).min() > 0)
 
 
 def _draw_way(
@@ -152,6 +157,7 @@ def _draw_way(
     )
 
 
+_NO_BOXES: F64 = np.empty((1, 0, 4))
 AISLE_ROOM_M = 0.1  # beside a robot in an aisle: a cell of the planner's
 
 

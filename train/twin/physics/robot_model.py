@@ -72,25 +72,10 @@ class FloorFriction:
 
         Returns which wheels (n, W) stand on a patch.
         """
-        friction = self._under(ids, pose)
+        base = self.base[ids]
+        friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
         self._written[ids[:, None], self._geoms, 0] = friction * self.scale[ids]
-        return self._slippery(ids, friction)
-
-    def on_patch(self, pose: F64) -> Bools:
-        """Return whose wheel stands on a slippery patch, (N,), at poses (N, 3)."""
-        stands = np.zeros(len(pose), np.bool_)
-        icy = self.icy
-        if len(icy):
-            stands[icy] = self._slippery(icy, self._under(icy, pose[icy])).any(axis=1)
-        return stands
-
-    def _under(self, ids: Ints, pose: F64) -> F64:
-        return friction_at(self._wheel_points(pose), self.patches[ids], self.base[ids])
-
-    def _slippery(self, ids: Ints, friction: F64) -> Bools:
-        """Return which wheels (n, W) stand on a patch, by their friction and the floor's."""
-        least = np.minimum(SLIPPERY_BELOW, self.base[ids, None] - 1e-9)
-        return np.asarray(friction < least, np.bool_)
+        return np.asarray(friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9), np.bool_)
 
     def _wheel_points(self, pose: F64) -> F64:
         """Return where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""

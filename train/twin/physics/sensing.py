@@ -2,7 +2,7 @@
 
 The functions that turn ranges into clearances and plans into waypoints are ingest's own; here are
 only the sensors: lidar, localisation, encoders, gyroscope, accelerometer and bumper, with the
-noise of a perturbation. All noise of an episode is drawn when it begins, from its own seed.
+noise of a perturbation. All noise of an episode is drawn from its own seed, some steps at a time.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from restock.train.twin.physics.simulation import Simulation
 FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
 DRIFT_TIME_S = 3.0
 WIDEST_GAP_RAD = np.radians(20)  # between two beams that pass nothing by
+DRAWN = 60  # steps of an episode whose noise is drawn together
 _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 
 
@@ -62,6 +63,9 @@ class Sensing(Stateful):
         self._around = None if _sees_everything(simulation) else _Around(simulation)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
+        self._drawn = np.full(num, steps)  # how many have their noise: all, until a reset
+        self._generators = [np.random.default_rng(0)] * num
+        self._drift = np.zeros((num, 2))  # of the localised x and y, at the last of these
         self._scale = np.zeros((num, _SCALARS))
         self._bias = np.zeros((num, 3))  # of a wheel's speed, the gyroscope, the accelerometer
         self._scan_every = np.ones(num, np.int64)  # steps
@@ -81,9 +85,9 @@ class Sensing(Stateful):
         ]
 
     def reset(self, env: int, seeds: np.random.SeedSequence, perturbation: Perturbation) -> None:
-        """Draw an episode's noise."""
-        rng = np.random.Generator(np.random.SFC64(seeds))
-        rng.standard_normal(dtype=np.float32, out=self._noise[env])
+        """Begin to draw an episode's noise."""
+        self._generators[env] = np.random.Generator(np.random.SFC64(seeds))
+        self._drawn[env] = self._drift[env] = 0
         p = perturbation
         self._scale[env] = (
             *(p.localisation_noise_m, p.localisation_noise_m, p.localisation_yaw_noise_rad),
@@ -100,19 +104,30 @@ class Sensing(Stateful):
         self._dropout_beyond[env] = (
             NormalDist().inv_cdf(1 - p.lidar_dropout / 2) if p.lidar_dropout else np.inf
         )
-        self._wander(env)
 
-    def _wander(self, env: int) -> None:
-        """Turn an episode's localisation drift into an autoregressive walk of unit variance."""
+    def _draw(self, env: int, step: int) -> None:
+        """Draw the noise of an episode up to a step and some more.
+
+        Localisation drift becomes an autoregressive walk of unit variance.
+        """
         keep = float(np.exp(-self.task.control_period_s / DRIFT_TIME_S))
-        drift = self._noise[env, :, 3:5]
-        drift[1:] *= np.sqrt(1 - keep**2)
-        for axis in drift.T:  # scipy.signal.lfilter does the same, and takes 0.6 s to import
-            axis[:] = list(accumulate(axis.tolist(), lambda before, new: new + keep * before))
+        while (begin := int(self._drawn[env])) <= step:
+            noise = self._noise[env, begin : begin + DRAWN]
+            self._generators[env].standard_normal(dtype=np.float32, out=noise)
+            self._drawn[env] += len(noise)
+            drift = noise[:, 3:5]
+            drift[int(begin == 0) :] *= np.sqrt(1 - keep**2)
+            for axis, new in enumerate(drift.T.tolist()):  # scipy.signal takes 0.6 s to import
+                last = float(self._drift[env, axis])
+                walk = list(accumulate(new, lambda was, new: new + keep * was, initial=last))
+                drift[:, axis], self._drift[env, axis] = walk[1:], walk[-1]
 
     def sense(self, ids: Ints, step: Ints) -> Signals:
         """Sense all but the route and localised speeds, for `ids` (n,) at their steps (n,)."""
         sim, task = self.simulation, self.task
+        late = step >= self._drawn[ids]
+        for env, at in zip(ids[late].tolist(), step[late].tolist(), strict=True):
+            self._draw(env, at)
         noise = self._noise[ids, step]
         scalar = noise[:, :_SCALARS] * self._scale[ids]
         true_ranges = sim.cast(ids)

@@ -25,7 +25,7 @@ from restock.arrays import F64, Bools, Ints, stacked
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
-from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.layout import AGENTS, Warehouse
 from restock.train.twin.floors.state_lattice import rectangle
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import Handles, build_model, yaw_of
@@ -360,6 +360,9 @@ class Simulation(Stateful):
         self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
         self.travelled_m = np.zeros(num_envs)  # in the last control period, over ground
         self.diverged = np.zeros(num_envs, np.bool_)
+        # As the last control period began: poses, gaps to traffic, and who stood on a patch.
+        self.start, self.traffic_gap_m = np.zeros((num_envs, 3)), np.zeros((num_envs, AGENTS))
+        self.on_patch = np.zeros(num_envs, np.bool_)
 
         self.bearings_rad = np.array(robot.bearings_rad)  # (beams,) in the lidar's own frame
         ahead = self.bearings_rad + task.body.lidar_yaw_rad
@@ -407,28 +410,32 @@ class Simulation(Stateful):
     def drive(self, command: F64) -> None:
         """Drive one control period under commands (N, 2): forward speed, yaw rate."""
         self.controller.command(command)
-        self.bumped[:] = self.slipped[:] = False
+        self.bumped[:] = self.slipped[:] = self.on_patch[:] = False
         touched, icy = self.bumped.copy(), self.friction.icy
-        start = pose = self.pose()
+        self.start = pose = self.pose()
         middle = self.middle(pose)
+        self.traffic_gap_m = self.traffic.gaps_m(middle)
         for block in range(self.blocks):
             self.scenery.walk(self.traffic.advance(middle, self.qvel[:, :2], touched, self.block_s))
             slippery = self.friction.write(icy, pose[icy])
-            touched = self._run(self.controller.controls(block * self.block_s))
+            if block == 0:
+                self.on_patch[icy] = slippery.any(axis=1)
+            touched, accel = self._run(self.controller.controls(block * self.block_s))
             self.bumped |= touched
             pose = self.pose()
             middle = self.middle(pose)
             if slippery.any():
                 self.slipped[icy] |= self._slipping(icy, pose[icy, 2], slippery)
             self.traffic.note_closest(middle)
-        self.travelled_m = np.hypot(*(pose - start)[:, :2].T)
+        self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
+        self.travelled_m = np.hypot(*(pose - self.start)[:, :2].T)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.diverged = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
-    def _run(self, actuators: F64) -> Bools:
+    def _run(self, actuators: F64) -> tuple[Bools, F64]:
         """Run one block of substeps under controls (N, S, actuators).
 
-        Returns whose bumper was pressed, (N,).
+        Returns whose bumper was pressed, (N,), and the accelerations at each substep (N, S, 3).
         """
         control = self._control
         control[:, :, self.handles.actuators] = actuators
@@ -452,9 +459,7 @@ class Simulation(Stateful):
             records.append(sensed[:, :, self.handles.accelerometer])
             if self.callback is not None:
                 self.callback(self.body_state(records[-1].mean(axis=1), pressed))
-        accel = records[0] if len(records) == 1 else np.concatenate(records, axis=1)
-        self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
-        return touched
+        return touched, records[0] if len(records) == 1 else np.concatenate(records, axis=1)
 
     def body_state(self, accel: F64, pressed: Bools) -> BodyState:
         """Return the true state now."""
