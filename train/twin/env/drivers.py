@@ -254,7 +254,8 @@ def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> t
         x = x + velocity[..., 0] * np.cos(middle) * period
         y = y + velocity[..., 0] * np.sin(middle) * period
         yaw = yaw + velocity[..., 1] * period
-        ends[:, :, step] = np.stack([x, y, yaw], axis=-1)
+        for axis, place in enumerate((x, y, yaw)):
+            ends[:, :, step, axis] = place
         speed[:, :, step] = velocity[..., 0]
     return ends, speed
 
@@ -279,7 +280,7 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     on, pallets = env.layout[ids], env.simulation.pallets[ids]
     boxes = np.concatenate([pallets[..., :2], pallet_half_m(pallets[..., 2])], axis=-1)
     boxes[pallets[..., 0] <= 0, :2] = np.inf  # not placed
-    for index in np.unique(on):
+    for index in set(on.tolist()):
         rows = np.flatnonzero(on == index)
         floor, pose = env.floors[index], ends[rows]
         close = near_gap(floor, boxes[rows], pose[..., 0], pose[..., 1], beyond_m) < beyond_m

@@ -9,7 +9,7 @@ planner's cells, both in one Dijkstra tree from the goal.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -99,11 +99,16 @@ class Window:
 
     def covers(self, x_m: float, y_m: float) -> bool:
         """Return whether a place is in the window and off its border."""
+        (west, south), (east, north) = self._inner
+        return west < x_m < east and south < y_m < north
+
+    @cached_property
+    def _inner(self) -> tuple[list[float], list[float]]:
+        """Return the least and largest x and y of what lies off the border."""
         margin = (BORDER_CELLS + 1) * CELL_M
-        place = np.array([x_m, y_m])
-        inside = (self.low == 0) | (place > self.low * CELL_M + margin)
-        inside &= (self.high == self.floor) | (place < self.high * CELL_M - margin)
-        return bool(inside.all())
+        low = np.where(self.low == 0, -np.inf, self.low * CELL_M + margin)
+        high = np.where(self.high == self.floor, np.inf, self.high * CELL_M - margin)
+        return low.tolist(), high.tolist()
 
 
 @dataclass(frozen=True)
@@ -117,18 +122,16 @@ class StateLattice:
 
     def time_s(self, poses: F64) -> F64:
         """Return times (...) from poses (..., 3): x, y, heading, interpolated between states."""
-        corner, share = [], []
+        total, corner, shares = np.zeros(poses.shape[:-1]), 0, []
         for value, count in zip(self._place(poses), self.times_s.shape, strict=True):
-            value = np.clip(value, 0.0, count - 1.001)
-            corner.append(value.astype(np.int64))
-            share.append(value - corner[-1])
-        total = np.zeros(poses.shape[:-1])
+            value = value.clip(0.0, count - 1.001)
+            first = value.astype(np.int64)
+            corner, share = corner * count + first, value - first
+            shares.append((1.0 - share, share))
         for bits in np.ndindex(2, 2, 2):
-            weight = np.ones_like(total)
-            for part, bit in zip(share, bits, strict=True):
-                weight *= part if bit else 1.0 - part
-            i, j, k = (first + bit for first, bit in zip(corner, bits, strict=True))
-            total += weight * self.times_s[i, j, k]
+            x, y, yaw = (both[bit] for both, bit in zip(shares, bits, strict=True))
+            beside = np.ravel_multi_index(bits, self.times_s.shape)
+            total += x * y * yaw * self.times_s.take(corner + beside)
         return total
 
     def plan(self, x_m: float, y_m: float, yaw_rad: float) -> F64 | None:
