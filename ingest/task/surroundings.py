@@ -40,7 +40,7 @@ class SectorMap:
     """
 
     sectors: int
-    order: NDArray[np.intp]  # (B,) beams sorted by sector
+    order: NDArray[np.intp] | slice  # (B,) beams sorted by sector; a slice: they are
     starts: NDArray[np.intp]  # (filled,) first position of each non-empty sector in `order`
     filled: NDArray[np.intp]  # (filled,) the sectors that have beams
     reach_m: NDArray[np.float64]  # (B,) from the lidar to the outline along the beam
@@ -53,7 +53,8 @@ class SectorMap:
         order = np.argsort(sector, kind="stable")
         filled, starts = np.unique(sector[order], return_index=True)
         reach = outline_reach(bearing - np.pi, body)
-        return cls(sectors, order, starts, filled, reach)
+        in_order = bool((np.diff(order) > 0).all())
+        return cls(sectors, slice(None) if in_order else order, starts, filled, reach)
 
     def clearance(
         self, ranges_m: NDArray[Any], range_min_m: float, range_max_m: float
@@ -71,9 +72,7 @@ class SectorMap:
         np.copyto(near, range_max_m, where=~valid)
         clearance = np.full((len(ranges), self.sectors), float(range_max_m))
         if len(self.filled):
-            if (self.order[1:] < self.order[:-1]).any():
-                near = near[:, self.order]
-            nearest = np.minimum.reduceat(near, self.starts, axis=1)
+            nearest = np.minimum.reduceat(near[:, self.order], self.starts, axis=1)
             clearance[:, self.filled] = np.maximum(nearest, 0.0)
         return clearance
 

@@ -57,7 +57,7 @@ class BaseController(Stateful):
     def __init__(
         self, num_envs: int, robot: RobotModel, period_s: float, timestep_s: float, substeps: int
     ) -> None:
-        self.robot = robot
+        self.robot, self._axles = robot, len(robot.wheels_m) // 2
         self._accel_limit, self._speed_limit = map(np.array, (robot.accel_limit, robot.speed_limit))
         self._period_s, self._timestep_s, self._substeps = period_s, timestep_s, substeps
         history = max(_HISTORY, math.ceil(RANGES["latency_s"][1] / period_s - 1e-9) + 1)
@@ -95,7 +95,8 @@ class BaseController(Stateful):
         old, new, reach = self._in_force(since_s)
         ramp = _ramp(self.set_point[:, None], old, new, reach)
         self.set_point = ramp[:, -1].copy()
-        return np.tile(self._wheels(ramp), len(self.robot.wheels_m) // 2)
+        speeds = self._wheels(ramp)
+        return speeds if self._axles == 1 else np.tile(speeds, self._axles)
 
     def _in_force(self, since_s: float) -> tuple[F64, F64, tuple[Bools, F64, F64]]:
         """Return the commands (N, 1, 2) in force as a block begins and as it ends.
