@@ -33,7 +33,8 @@ from restock.errors import (
     quoted,
     visible,
 )
-from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.mcap_file import metadata_of
+from restock.ingest.containers.open_recording import identify, open_recording, state_of
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
@@ -161,10 +162,25 @@ def preparing(
     `settle(recording_id)` is called before the recording is looked up in the store, which does not
     show recordings that wait for their commit.
     """
+    file = None
+    if store is not None and not force:
+        file = identify(path, definitions=definitions, watch=watch)
+    if store is not None and file is not None:
+        settle(file.recording_id)
+        before = store.manifest(file.recording_id)
+        if before is not None and _unchanged(before, profile):
+            said, stored = metadata_of(file.path), before.get("tags") or {}
+            if said is not None and not _other_robot(before, profile):
+                reported = resolve_tags(profile.tags, file.path, said, tags, stored)
+                if reported.tags == stored:
+                    return Prepared(IngestResult(str(path), "unchanged", before))
     with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
         renamed = renamed_inputs(profile, recording.topics)
         profile = as_recorded(profile, recording.topics)
-        settle(recording.recording_id)
+        if file is not None and file.state == state_of(file.path):
+            recording.recording_id = file.recording_id
+        else:
+            settle(recording.recording_id)
         before = store.manifest(recording.recording_id) if store is not None else None
         tagged = (before or {}).get("tags") or {}
         reported = resolve_tags(profile.tags, Path(path), recording.metadata, tags, tagged)

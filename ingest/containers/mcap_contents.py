@@ -13,7 +13,7 @@ must agree. Its CRC is checked when it is read, as always.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -93,8 +93,8 @@ class Contents:
         self.chunks = [replace(c, index={}) if c.index else c for c in self.chunks]
 
 
-def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
-    """Walk the file's top-level records; `watch` is told how far that is."""
+def survey(file: FileBytes, watch: Watch = unwatched, *, only: Collection[int] = ()) -> Contents:
+    """Walk the file's top-level records, `only` of some kinds; `watch` is told how far that is."""
     contents = Contents()
     end = len(file)
     finished = False
@@ -111,7 +111,8 @@ def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
                 contents.damaged += check_summary(contents, file, at, stop)
                 break
             try:
-                take_record(contents, file, opcode, at, stop)
+                if not only or opcode in only:
+                    take_record(contents, file, opcode, at, stop)
             except Malformed as bad:
                 if len(contents.damaged) < MAX_DAMAGED:
                     contents.damaged.append(f"record at byte {at - PREFIX:,}: {bad.what}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.containers import mcap_records
-from restock.ingest.containers.mcap_contents import ROSBAG2, resume, survey
+from restock.ingest.containers.mcap_contents import ROSBAG2, Contents, resume, survey
 from restock.ingest.containers.mcap_records import (
     LATEST_NS,
     MAGIC,
@@ -27,6 +27,7 @@ from restock.ingest.containers.mcap_records import (
     FileBytes,
     Indexed,
     Messages,
+    Op,
     Positions,
 )
 from restock.ingest.containers.storage import (
@@ -310,7 +311,7 @@ class McapFile:
             self._checks.damaged(what, {})
         self._refuse_cut(salvage)
         self.extras = self._contents.extras
-        self.metadata = self._metadata()
+        self.metadata = _metadata(self._contents, path, self.notes)
         if self._contents.unnamed:
             self.notes.append(f"{self._contents.unnamed:,} more attachments and metadata records")
         self._chunks = ChunkReader(self._file, self._checks, self._contents.cut_chunk)
@@ -333,18 +334,6 @@ class McapFile:
             self._checks.damaged(lost, {})
         if self._contents.cut_chunk:
             self._contents.chunks.append(self._contents.cut_chunk)
-
-    def _metadata(self) -> list[Metadata]:
-        """Return the entries of its metadata records, rosbag2's own included."""
-        kept, left_out = self._contents.metadata, self._contents.left_out
-        try:
-            custom, more = custom_data(self._contents.rosbag2, self.path.name, kept)
-            kept, left_out = [*kept, custom], left_out + more
-        except ValueError as problem:
-            self.notes.append(f"its metadata record {ROSBAG2!r}: {problem}")
-        if left_out:
-            self.notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
-        return kept
 
     # -- contents ---------------------------------------------------------------------
 
@@ -526,6 +515,29 @@ class McapFile:
         """Close the file; the arrays that were read from it stay valid."""
         self._contents.loose.clear()
         self._file.close()
+
+
+def metadata_of(path: Path) -> list[Metadata] | None:
+    """Return the metadata of an MCAP file, read without the rest of it; None if it is cut short."""
+    file = FileBytes(path)
+    try:
+        contents = survey(file, only=(Op.METADATA,))
+    finally:
+        file.close()
+    return None if contents.cut else _metadata(contents, path, [])
+
+
+def _metadata(contents: Contents, path: Path, notes: list[str]) -> list[Metadata]:
+    """Return the entries of its metadata records, rosbag2's own included; say what is not."""
+    kept, left_out = contents.metadata, contents.left_out
+    try:
+        custom, more = custom_data(contents.rosbag2, path.name, kept)
+        kept, left_out = [*kept, custom], left_out + more
+    except ValueError as problem:
+        notes.append(f"its metadata record {ROSBAG2!r}: {problem}")
+    if left_out:
+        notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
+    return kept
 
 
 def _record_end(file: FileBytes, at: int) -> int:

@@ -19,11 +19,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import mcap_file, ros1_file, sqlite_file
-from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.recording import Recording, content_id
 from restock.ingest.containers.storage import (
     HEAD_BYTES,
     LEROBOT_DATA,
@@ -379,6 +379,42 @@ def container_of(path: Path) -> Container | None:
         where=where,
         remedy=_NAMES,
     )
+
+
+class IdentifiedFile(NamedTuple):
+    """An MCAP file, its recording id, and its state when that was computed."""
+
+    path: Path
+    recording_id: str
+    state: tuple[int, ...]
+
+
+def identify(
+    path: Path | str, *, definitions: str | None = None, watch: Watch | None = None
+) -> IdentifiedFile | None:
+    """Return the id of a recording that is one MCAP file; None of others, which must be opened.
+
+    Raises:
+        RecordingError: there are no such `definitions`.
+    """
+    choose_definitions(definitions)
+    path = Path(path)
+    try:
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            if not mcap_file.CONTAINER.claims(file.read(HEAD_BYTES)):
+                return None
+        state = state_of(path)
+        return IdentifiedFile(path, content_id([path], watch or unwatched), state)
+    except OSError:  # opening it says why
+        return None
+
+
+def state_of(path: Path) -> tuple[int, ...]:
+    """Return what changes if a file does."""
+    state = path.stat()
+    return state.st_ino, state.st_size, state.st_mtime_ns
 
 
 def open_recording(

@@ -76,6 +76,20 @@ class _Stream:
                 yield from plain.payloads()
 
 
+def content_id(files: Sequence[Path], watch: Watch = unwatched) -> str:
+    """Return 16 hex digits of BLAKE3 of files' content, in order, wherever they lie."""
+    digest = blake3()  # of a bag with images, blake2b was a third of an ingest
+    done, whole = 0, sum(file.stat().st_size for file in files)
+    for file in files:
+        digest.update(str(file.stat().st_size).encode())
+        with file.open("rb") as content:
+            while block := content.read(1 << 20):
+                digest.update(block)
+                done += len(block)
+                watch("checking content, bytes", done, whole)
+    return digest.hexdigest(8)
+
+
 class Recording:
     """An open recording: an MCAP file, or a bag with all its files.
 
@@ -117,17 +131,8 @@ class Recording:
 
     @cached_property
     def recording_id(self) -> str:
-        """Return 16 hex digits of BLAKE3 of its files' content, in order, wherever it lies."""
-        digest = blake3()  # of a bag with images, blake2b was a third of an ingest
-        done, whole = 0, self.size_bytes
-        for file in self.files:
-            digest.update(str(file.stat().st_size).encode())
-            with file.open("rb") as content:
-                while block := content.read(1 << 20):
-                    digest.update(block)
-                    done += len(block)
-                    self.watch("checking content, bytes", done, whole)
-        return digest.hexdigest(8)
+        """Return the `content_id` of its files."""
+        return content_id(self.files, self.watch)
 
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:

@@ -15,10 +15,13 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
+from restock.ingest.containers.mcap_file import metadata_of
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.storage import MAX_ENTRIES, custom_data
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tag_rules import MAX_TAGS, TagRules, path_pattern, resolve_tags
+from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
 
@@ -48,6 +51,8 @@ def bag(path: Path, plugin: StoragePlugin, data: dict[str, str]) -> Path:
 
 def said(path: Path) -> tuple[list[tuple[str, str, dict[str, str]]], list[str]]:
     with open_recording(path) as recording:
+        if path.suffix == ".mcap":
+            assert [one for one in metadata_of(path) or [] if one.entries] == recording.metadata
         return [(*item[:2], dict(item.entries)) for item in recording.metadata], recording.notes
 
 
@@ -248,6 +253,18 @@ def test_an_ingest_by_the_path_writes_all_or_nothing(driven, tmp_path, capsys, m
     with Store(tmp_path / "store") as store:
         found = store.sql("SELECT DISTINCT robot, site FROM episodes").fetchall()
     assert found == [("amr-07", "oslo")]
+
+
+def test_a_known_file_is_not_opened_but_its_tags_are_compared(tmp_path, monkeypatch):
+    (file,) = write_bag(Drive(), tmp_path / "bag", storage="mcap").glob("*.mcap")
+    profile, store = parse_profile(WAREHOUSE, where="a"), StoreWriter(tmp_path / "store")
+    assert ingest(file, profile, store=store).status == "written"
+    assert ingest(file, profile, store=store, tags={"robot": "a"}).status == "tagged"
+    monkeypatch.setattr("restock.ingest.pipeline.open_recording", lambda *_, **__: 1 / 0)
+    assert ingest(file, profile, store=store).manifest["tags"] == {"robot": "a"}
+    for how in ({"tags": {"robot": "b"}}, {"force": True}):
+        with pytest.raises(ZeroDivisionError):
+            ingest(file, profile, store=store, **how)
 
 
 def test_tag_rules_are_no_part_of_what_rows_depend_on():
