@@ -21,6 +21,8 @@ def test_double_dqn_selects_online_and_evaluates_with_target() -> None:
     slow = tensor([[2.0, 4.0]])  # values it 2, though its own best is worth 4
     reward, discount = tensor([1.0]), tensor([0.5])
     assert td_target(reward, discount, slow, online).tolist() == [2.0]  # 1 + 0.5 * 2
+    assert td_target(reward, discount, slow, online, lower=True).tolist() == [2.0]
+    assert td_target(reward, discount, slow, online / 9, lower=True).tolist() == [1.5]
     assert td_target(reward, discount, slow).tolist() == [3.0]  # 1 + 0.5 * 4
 
 

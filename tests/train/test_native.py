@@ -184,9 +184,10 @@ def test_passes_that_another_one_followed_are_differentiated() -> None:
 
 
 @compiled
+@pytest.mark.parametrize("source", ["operator", "none"])
 @pytest.mark.parametrize("double", [True, False])
-def test_an_update_without_autograd_has_its_bits(double, monkeypatch):
-    settings = {"teacher": {"source": "operator"}, "loss": {"double": double, "huber_delta": 0.5}}
+def test_an_update_without_autograd_has_its_bits(source, double, monkeypatch):
+    settings = {"teacher": {"source": source}, "loss": {"double": double, "huber_delta": 0.5}}
     ours, theirs = (Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2))
     theirs._has_kernels = False
     for seed, weight in ((1, None), (2, normal(37, seed=5).abs()), (3, None)):

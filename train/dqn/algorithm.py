@@ -1,11 +1,16 @@
 """The seam for value-based algorithms, and DQN, written once as PyTorch.
 
-    y_i     = r_i + d_i * Q_target(s'_i, argmax_a Q(s'_i, a))        Double DQN, arXiv:1509.06461
+    y_i     = r_i + d_i * Q_target(s'_i, a_i')                       Double DQN, arXiv:1509.06461
+    a_i'    = argmax_a Q(s'_i, a)
     delta_i = Q(s_i, a_i) - y_i
     L       = mean_i w_i * huber(delta_i)
 
 `d_i` is the discount of row i: gamma**n for an n-step row that bootstraps, 0 for one that
 terminated. A truncated episode bootstraps: its d is not 0.
+
+Where no filter keeps a_i' to what somebody does, min(Q, Q_target) takes the place of Q_target
+(clipped double Q-learning, arXiv:1802.09477): the best action of a logged row is often one that
+nobody has tried, and nothing corrects its value.
 
 `loss.algorithm` of a run's config names an entry of `ALGORITHMS`, or your own as `module:name`.
 """
@@ -47,6 +52,7 @@ class TrainingBatch:
     weight: Tensor | None = None  # (B,) importance weights; None: ones
     # (B, A) float32, added to Q(s', a) where the next action is chosen; None: nothing.
     preference: Tensor | None = None
+    lower: bool = False  # the lower of both networks' values of the next action counts
     logged: int = 0  # L, how many of the first rows are from logs
     conservative: float | Tensor = 0.0  # weight of the CQL term, or that of each logged row (L,)
     expert: Tensor | None = None  # (L,) bool, rows with the margin term; None: none
@@ -125,6 +131,7 @@ class DQN:
                 target(batch.next_observation),
                 next_online_q,
                 batch.preference,
+                lower=batch.lower,
             )
         q = network(batch.observation)
         delta = self.settings.huber_delta
@@ -220,6 +227,8 @@ def td_target(
     next_target_q: Tensor,
     next_online_q: Tensor | None = None,
     preference: Tensor | None = None,
+    *,
+    lower: bool = False,
 ) -> Tensor:
     """Return the TD target of Q(s, a), (B,).
 
@@ -231,12 +240,16 @@ def td_target(
             network evaluates (Double DQN). None lets the target network do both (DQN).
         preference: (B, A), added where the next action is selected, and not to its value: -inf
             for what may not be selected (discrete BCQ, arXiv:1910.01708). None: nothing.
+        lower: the lower of both networks' values counts.
     """
     chooses = next_target_q if next_online_q is None else next_online_q
     if preference is not None:
         chooses = chooses + preference
     best = chooses.argmax(dim=1, keepdim=True)
-    return reward + discount * next_target_q.gather(1, best).squeeze(1)
+    value = next_target_q.gather(1, best)
+    if lower and next_online_q is not None:
+        value = torch.minimum(value, next_online_q.gather(1, best))
+    return reward + discount * value.squeeze(1)
 
 
 def dqn_loss(

@@ -211,16 +211,21 @@ class Learner(Stateful):
         online, target, algorithm = cast("tuple[Kernel, Kernel, DQN]", parts)
         packed, count, size = rows.numpy(), len(rows), self.network.observation_size
         now, after = packed[:, :size], packed[:, size : 2 * size]
-        slow = chooses = target.values(after)
+        slow = fast = target.values(after)
         q = online.values(now, after) if algorithm.settings.double else online.values(now)
         if algorithm.settings.double:
-            q, chooses = q[:count], q[count:]
+            q, fast = q[:count], q[count:]
         if self.behaviour is not None:
-            chooses = np.where(self.behaviour.plausible(after), chooses, -np.inf)
+            chooses = np.where(self.behaviour.plausible(after), fast, -np.inf)
         elif self._preference is not None:
-            chooses = chooses + self._preference(torch.from_numpy(after)).numpy()
+            chooses = fast + self._preference(torch.from_numpy(after)).numpy()
+        else:
+            chooses = fast
         weight = None if terms.weight is None else terms.weight.numpy()
-        next_value = slow[np.arange(count), chooses.argmax(axis=1)]
+        best = np.arange(count), chooses.argmax(axis=1)
+        next_value = slow[best]
+        if self.behaviour is None:
+            next_value = np.minimum(next_value, fast[best])
         loss, gradient = algorithm.gradient(q, packed[:, 2 * size :], next_value, weight)
         online.descend(gradient)
         return loss
@@ -231,6 +236,7 @@ class Learner(Stateful):
             *parts,
             weight=terms.weight,
             preference=None if self._preference is None else self._preference(parts[1]),
+            lower=self.behaviour is None,
             logged=terms.logged,
             conservative=terms.conservative,
             expert=terms.expert,
