@@ -32,6 +32,7 @@ FEW = dict.fromkeys(("wheel_slip", "near_collision", "recovery"), 30)  # rows he
 
 def make_run(
     path: Path, *, windows: int = 4, gap: float | Mapping[str, float] = 1.2, lag: float = 0.05,
+    driven: float = 200.0,  # return of an episode
     clock: float = 1.0, q_abs_max: float = 10.0, shares: Mapping[str, float] | None = None,
     quota_met: float = 1.0, agreement: Mapping[str, float] | None = None,
     unexplained: Mapping[str, float] | None = None,
@@ -78,6 +79,7 @@ def make_run(
         ends = {"target_q_lag": lag if ill else 0.05, "q_abs_max": q_abs_max if ill else 10.0}
         append(run, "progress", clocks, updates=500, **ends)
     append(run, "audit", {}, reward=-1.5)
+    append(run, "episodes", {}, steps=240, **{"return": -driven})
     run.flush()
     return run
 
@@ -124,7 +126,10 @@ def action_rows(
         ({"strata": False, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
         ({"clock": 8.0}, "TARGET"),
         ({"gap": 7.0}, "TARGET"),
-        ({"q_abs_max": 400.0}, "DIVERGENCE"),
+        ({"q_abs_max": 149.0}, "HEALTHY"),
+        ({"q_abs_max": 151.0}, "DIVERGENCE"),  # 1.5 / (1 - .99)
+        ({"q_abs_max": 32.0, "driven": 11.0}, "HEALTHY"),
+        ({"q_abs_max": 34.0, "driven": 11.0}, "DIVERGENCE"),  # three times what an episode gave
         ({"explained": 0.01}, "DIVERGENCE"),
         # Robots that stand give targets that hardly vary, and a share of any size below 0.
         ({"explained": {"nominal": 0.7, "blocked_aisle": -9.0}, "held_out": FEW}, "HEALTHY"),

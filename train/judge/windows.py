@@ -100,6 +100,7 @@ class DiagnosisLimits:
     lag: float = 0.25  # L: the target is far behind
     no_lag: float = 0.002  # L below this: there is effectively no target network
     clock: float = 2.0  # S
+    returns: float = 3.0  # |Q| over the largest return of an episode: the sum cancels in parts
     explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
     supply: float = 0.1  # a condition's share of replay over its share of what driving meets
     agreement: float = 0.1  # of a condition's logged rows that look like it
@@ -351,9 +352,19 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
 
 
 def _value_bound(run: Run) -> float:
-    """Return r_max / (1 - gamma), with the largest reward in the audited batches."""
+    """Return the largest |Q| that rewards and returns seen allow.
+
+    Rewards: r_max / (1 - gamma), with the largest in the audited batches. Returns: `LIMITS.returns`
+    times the largest of an episode driven, as if one shorter than 1 / (1 - gamma) steps went on.
+    """
     rewards = run.table("audit")["reward"].to_numpy()
     largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
     known = (run.document.get("panel") or {}) | run.document["config"].get("loss", {})
     discount = known["discount"]
-    return largest / (1 - discount) if largest > 0 else float("inf")
+    bound = largest / (1 - discount) if largest > 0 else float("inf")
+    driven = run.table("episodes").select(["return", "steps"]).drop_null()
+    if not len(driven):
+        return bound
+    returned = float(np.abs(driven["return"].to_numpy()).max())
+    goes_on = 1 / (1 - discount) / float(driven["steps"].to_numpy().max())
+    return float(min(bound, LIMITS.returns * returned * max(goes_on, 1.0)))
