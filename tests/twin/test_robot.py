@@ -22,7 +22,7 @@ from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Warehouse, default_warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.floors.state_lattice import floor_gap, rectangle
+from restock.train.twin.floors.state_lattice import near_gap, rectangle
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode, with_room
 from restock.train.twin.physics.model import build_model, robot_model
 from restock.train.twin.physics.perturbation import Perturbation
@@ -250,4 +250,5 @@ def room_m(episode: Episode, floor: Warehouse, outline_m: NDArray[np.float64]) -
         x + ahead * np.cos(yaw) - aside * np.sin(yaw),
         y + ahead * np.sin(yaw) + aside * np.cos(yaw),
     )
-    return float(floor_gap(floor, *points).min())
+    own = np.empty((1, 0, 4))
+    return float(near_gap(floor, own, *(place[None] for place in points), np.inf).min())

@@ -12,7 +12,6 @@ from restock.train.twin.floors.state_lattice import (
     StateLattice,
     Window,
     box_gap,
-    floor_gap,
     lattice_around,
     near_gap,
     rectangle,
@@ -114,7 +113,9 @@ def test_the_clearance_of_near_points_is_exact(layouts, way, monkeypatch):
     own = np.concatenate([middle + 0.5, np.full((200, 2), 0.2)], axis=1)
     own[100:, :2] = np.inf  # not there
     of_own = box_gap(x, y, own[:, :2].T[..., None], own[:, 2:].T[..., None])
-    exact = np.minimum(floor_gap(floor, x, y), of_own)
+    racks = floor.rack_boxes.T
+    of_racks = box_gap(x[..., None], y[..., None], racks[:2], racks[2:]).min(axis=-1, initial=9.0)
+    exact = np.minimum.reduce([x, floor.width_m - x, y, floor.depth_m - y, of_racks, of_own])
     near = near_gap(floor, own[:, None], x, y, 0.3)
     close = exact < 0.3
     assert 0.2 < close.mean() < 1.0

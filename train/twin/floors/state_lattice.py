@@ -291,9 +291,8 @@ def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: 
         np.arange((window.low[a] + 0.5) * CELL_M - pad, window.high[a] * CELL_M + pad, _FIELD_M)
         for a in range(2)
     )
-    gap = floor_gap(floor, x[:, None], y[None, :])
-    for middle, half in zip(boxes, half_m, strict=True):
-        gap = np.minimum(gap, box_gap(x[:, None], y[None, :], tuple(middle), tuple(half)))
+    at_x, at_y = (place[None] for place in np.meshgrid(x, y, indexing="ij"))
+    (gap,) = near_gap(floor, np.hstack([boxes, half_m])[None], at_x, at_y, np.inf)
     count = window.shape
     per_cell = round(CELL_M / _FIELD_M)
     room = np.empty((*count, len(STEPS)))
@@ -318,25 +317,15 @@ def _filled(times: F64) -> F64:
     return filled
 
 
-def floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
-    """Return the distance from points to the nearest rack or wall; negative inside."""
-    room = _wall_gap(floor, x, y)
-    for rack in floor.racks:
-        room = np.minimum(room, box_gap(x, y, rack.center, rack.half_size))
-    return room
-
-
-def _wall_gap(floor: Warehouse, x: F64, y: F64) -> F64:
-    return np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
-
-
 def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64:
-    """Return `floor_gap` of points (n, …) of n robots, or that to their `own` boxes if smaller.
+    """Return the distance from points (n, …) of n robots to the nearest rack, wall or `own` box.
 
-    Exact if it is below `within_m`: boxes farther from all points of a robot are left out, as a
-    floor made of scans has hundreds. `own` (n, K, 4) are middles and half sizes.
+    It is negative inside, and exact if it is below `within_m`: boxes farther from all points of a
+    robot are left out, as a floor made of scans has hundreds. `own` (n, K, 4) are middles and half
+    sizes.
     """
-    room = np.ascontiguousarray(_wall_gap(floor, x, y))
+    room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
+    room = np.ascontiguousarray(room)
     racks = floor.rack_boxes
     if native.is_used():
         boxes = racks.ravel(), own.ravel(), room.ravel()
@@ -354,12 +343,7 @@ def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64
     return room
 
 
-def box_gap(
-    x: F64,
-    y: F64,
-    center: tuple[float | F64, float | F64] | F64,
-    half: tuple[float | F64, float | F64] | F64,
-) -> F64:
+def box_gap(x: F64, y: F64, center: F64, half: F64) -> F64:
     """Return the distance from points to an axis-aligned box; negative inside."""
     dx, dy = np.abs(x - center[0]) - half[0], np.abs(y - center[1]) - half[1]
     outside = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0))
