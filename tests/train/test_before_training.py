@@ -304,6 +304,73 @@ def test_a_fault_of_one_robot_is_named_and_nothing_else(logs, twin, fault):
     assert [said in text for text in texts] == [True] * (fault is not None)
 
 
+def _in_time(rows: FedRows, name: str, change: Callable[..., Any]) -> FedRows:
+    """Return rows with an entry changed row by row: next observations keep to the rows after."""
+    at = rows.task.observation_names.index(name)
+    observation, after = rows.observation.copy(), rows.next_observation.copy()
+    observation[:, at] = change(observation[:, at])
+    following, known = rows.before(-1)
+    after[known, at] = observation[following[known], at]
+    return replace(rows, observation=observation, next_observation=after)
+
+
+def _at_ends(rows: FedRows) -> FedRows:
+    ends, begins = np.flatnonzero(rows.last), np.flatnonzero(np.append(True, rows.last[:-1]))
+    after = rows.next_observation.copy()
+    after[ends[::2]] = rows.observation[np.roll(begins, -1)[::2]]
+    return replace(rows, next_observation=after)
+
+
+def _split(rows: FedRows) -> FedRows:
+    half = np.bincount(rows.episode)[rows.episode] // 2
+    second = rows.step >= half
+    return replace(rows, episode=2 * rows.episode + second, step=rows.step - second * half)
+
+
+PART_OF: dict[str | None, tuple[Plant, str]] = {
+    None: (lambda rows: rows, ""),
+    "saturated": (lambda r: _in_time(r, "wheel_speed", lambda one: one.clip(-0.5, 0.5)),
+                  "wheels (speed) is never beyond 0.5"),
+    "rounded": (lambda r: _in_time(r, "wheel_speed", lambda one: np.round(one, 1)),
+                "wheels (speed) has few different values"),
+    "zeros": (lambda r: _in_time(r, "wheel_speed", lambda one: one * (np.arange(len(r)) % 9 > 0)),
+              "wheels (speed) reads 0 in 11%"),
+    "held": (lambda r: _in_time(r, "wheel_speed",
+                                lambda one: one[np.arange(len(r)) - np.arange(len(r)) % 4]),
+             "wheels (speed) keeps its value in 7"),
+    "late": (lambda r: _in_time(r, "wheel_speed",
+                                lambda one: np.where(r.episode % 8 < 4, np.roll(one, 5), one)),
+             "there it is 1 s (5 steps) late"),
+    "jumps": (lambda r: _in_time(r, "localised_speed",
+                                 lambda one: one + 2.5 * (r.step % 20 == 9)),
+              "logs' pose does not follow the other signals: there it has single values"),
+    "rewards": (lambda r: replace(r, reward=np.where(r.step % 3, r.reward, np.roll(r.reward, 1))),
+                "are not exactly the task's rewards"),
+    "ends": (_at_ends, "the last next observation does not follow from its row"),
+    "split": (_split, "stop where another episode begins"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", PART_OF)
+def test_what_lasts_for_a_part_is_named_beside_other_robots(logs, twin, fault, monkeypatch):
+    monkeypatch.setattr(before_training, "MIN_ROWS", 300)
+    plant, said = PART_OF[fault]
+    robot = np.array([f"r{one}" for one in logs.episode % 4])
+    fleet = replace(logs, recording=robot, robot=robot)
+    faulty = plant(fleet)
+    parts = [(faulty if name == "r1" else fleet).take(robot == name) for name in np.unique(robot)]
+    together = replace(parts[0], **{
+        name: np.concatenate([getattr(one, name) for one in parts])
+        for name, value in vars(parts[0]).items()
+        if isinstance(value, np.ndarray) and name in type(parts[0]).__dataclass_fields__
+    })  # fmt: skip
+    together.episode[:] += 1000 * np.unique(together.robot, return_inverse=True)[1]
+    found = diagnose_rows(together, twin)
+    texts = [one.text for one in found.findings]
+    assert [text for text in texts if not text.startswith("in 1 of 4 robots (robot r1)")] == []
+    assert any(said in text for text in texts) == (fault is not None)
+
+
 def test_a_check_in_many_parts_is_corrected_for_their_number():
     interval = ConfidenceInterval(1.2, 1.09, 1.31)
     row = judged("gain: x", "", "ratio", interval, logs=1.2, twin=1.0, most=1.08, logs_rows=9)

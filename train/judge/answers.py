@@ -8,7 +8,7 @@ comes to when held: which of the twin's actions is that?
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -23,8 +23,6 @@ RESAMPLES = 200
 _ANSWERS = 0.4  # of what should follow; less is none
 _SURELY = 10.0  # times the noise: what moves in a mission, for its answer to be known
 MIN_CLUSTERS = 5
-MIN_BESIDE = 4  # robots or recordings, for one to be the odd one out
-_ALIKE = 0.75  # of the others, for what they agree on to be the measure
 _RIDGE = 1e-4  # of the mean diagonal: lags that the rows do not tell apart
 
 
@@ -155,7 +153,6 @@ _FAR = 0.97  # of the lidar's range: nothing was seen
 SlipLeftOut = Literal["episodes", "rows", "none"]
 GAIN = 1.2  # of logs over the twin's, or its inverse: robots answer differently
 ALIKE = 1.05  # of two sensors that measure one motion
-BESIDE = 1.02  # the same beside the other robots' or recordings'
 BIAS_RADPS, TURN_RADPS = 0.02, 0.06  # of a turn by one sensor where another, or an action, has none
 SIDEWAYS = 0.06  # of the way forward, about 3 degrees
 STRAYED = 0.05  # of the missions
@@ -255,7 +252,7 @@ def _on_ice(rows: FedRows, moves: F64) -> Bools:
     return np.asarray((slipped & ice[recording])[episode], np.bool_)
 
 
-def _wheel_turn(rows: FedRows) -> F64:
+def wheel_turn(rows: FedRows) -> F64:
     return rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
 
 
@@ -329,12 +326,12 @@ RELATIONS = (
     Relation("yaw rate of the gyroscope to the action", ACTION_TURN, GYROSCOPE, COMMANDS,
              lambda rows: (rows.command()[:, 1], rows.after("gyro_yaw_rate")), offset=TURN_RADPS),
     Relation("yaw rate of the wheels to the action", ACTION_TURN, WHEEL_TURN, COMMANDS,
-             lambda rows: (rows.command()[:, 1], _wheel_turn(rows)), offset=TURN_RADPS),
+             lambda rows: (rows.command()[:, 1], wheel_turn(rows)), offset=TURN_RADPS),
     Relation("speed of the pose to the wheels", WHEEL_SPEED, POSE, SENSORS,
              lambda rows: (rows.after("wheel_speed"), rows.after("localised_speed")),
              most=ALIKE),
     Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
-             lambda rows: (rows.after("gyro_yaw_rate"), _wheel_turn(rows)),
+             lambda rows: (rows.after("gyro_yaw_rate"), wheel_turn(rows)),
              most=ALIKE, offset=BIAS_RADPS),
     Relation("yaw rate of the pose to the gyroscope", GYROSCOPE, POSE, SENSORS,
              lambda rows: (rows.after("gyro_yaw_rate"), _pose_turn(rows)), offset=BIAS_RADPS),
@@ -349,7 +346,7 @@ RELATIONS = (
     Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
              lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), None),
     Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, NOW,
-             lambda rows: _scan_flow(rows, _wheel_turn(rows)), None),
+             lambda rows: _scan_flow(rows, wheel_turn(rows)), None),
 )  # fmt: skip
 
 
@@ -374,6 +371,9 @@ class Answer:
     comparisons: tuple[Comparison, ...]
     gain: float  # logs over twin; NaN: not known
     delay: float  # logs less twin, steps
+    rows: FedRows | None = None  # of the logs, if these can be compared with other robots'
+    found: Response | None = None
+    shape: tuple[str, float] | None = None  # what happens in some stretches only, and by how much
 
     @property
     def off(self) -> bool:
@@ -419,9 +419,10 @@ def _answer(
         return Answer(relation, (row,), 1.0, 0.0)
     if found is None or (twin is not None and expected is None):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")
-        return Answer(relation, (not_run(f"gain: {name}", what, reason),), float("nan"), 0.0)
+        row = not_run(f"gain: {name}", what, reason)
+        return Answer(relation, (row,), float("nan"), 0.0, rows=logs)
     if expected is None:
-        return _by_definition(relation, found, what)
+        return _by_definition(relation, found, what, logs)
     most, most_left = (
         (relation.most, UNEXPLAINED)
         if relation.gain is not None
@@ -463,39 +464,11 @@ def _answer(
             found.strayed(expected.kernel), expected.strayed(expected.kernel), -1.0, STRAYED,
         )
     )  # fmt: skip
-    return Answer(relation, tuple(made), gain.value, delay.value if timed else 0.0)
+    by = delay.value if timed else 0.0
+    return Answer(relation, tuple(made), gain.value, by, logs, found)
 
 
-def beside_others(answers: Sequence[Answer]) -> list[Answer]:
-    """Compare one relation of two sensors in several robots: each with the middle of the others.
-
-    Robots of a fleet differ less from each other than from the twin.
-    """
-    gains = [next((row for row in one.comparisons if row.check.startswith("gain")), None)
-             for one in answers]  # fmt: skip
-    known = [row for row in gains if row is not None and row.effect is not None]
-    if answers[0].relation.most != ALIKE or len(known) < MIN_BESIDE:
-        return list(answers)
-    made = []
-    for one, row in zip(answers, gains, strict=True):
-        others = [other.effect for other in known if other is not row]
-        middle = float(np.median(np.array(others, np.float64)))
-        alike = np.mean(
-            [1 / BESIDE <= (other or 0.0) / (middle or 1.0) <= BESIDE for other in others]
-        )
-        if alike < _ALIKE or row is None or None in (row.effect, row.low, row.high):
-            made.append(one)  # the others do not agree: it may be they
-            continue
-        at = [(value or 0.0) / middle for value in (row.effect, row.low, row.high)]
-        beside = judged(
-            f"gain beside others: {one.relation.name}", row.what, "ratio", ConfidenceInterval(*at),
-            logs=row.effect, twin=middle, least=1 / BESIDE, most=BESIDE, logs_rows=row.logs_rows,
-        )  # fmt: skip
-        made.append(replace(one, comparisons=(*one.comparisons, beside), gain=at[0]))
-    return made
-
-
-def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
+def _by_definition(relation: Relation, found: Response, what: str, logs: FedRows) -> Answer:
     """Judge without a twin: a speed equals a speed, and commands precede what they cause."""
     name = relation.name
     if relation.gain is None:
@@ -514,7 +487,7 @@ def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
                    least=-DELAY_STEPS, most=LATEST_STEPS, logs_rows=found.rows)
         )  # fmt: skip
     over = min(max(found.delay, 0.0), LATEST_STEPS)
-    return Answer(relation, tuple(made), gain.value, found.delay - over)
+    return Answer(relation, tuple(made), gain.value, found.delay - over, logs, found)
 
 
 def held_motion(rows: FedRows) -> list[F64]:
@@ -523,7 +496,7 @@ def held_motion(rows: FedRows) -> list[F64]:
     for lag in range(1, HELD):
         place, known = rows.before(lag)
         held &= known & (rows.action[place] == rows.action)
-    motion = np.stack([rows.after("wheel_speed"), _wheel_turn(rows)], axis=1)
+    motion = np.stack([rows.after("wheel_speed"), wheel_turn(rows)], axis=1)
     return [motion[held & (rows.action == action)] for action in range(len(rows.task.actions))]
 
 

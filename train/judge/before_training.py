@@ -29,13 +29,8 @@ from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
 from restock.train.evaluation.ope import EssGate
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.judge.answers import (
-    Answer,
-    TwinFits,
-    answers,
-    beside_others,
-    permuted_actions,
-)
+from restock.train.judge.answers import Answer, TwinFits, answers, permuted_actions
+from restock.train.judge.beside import beside_others, signals_beside
 from restock.train.judge.causes import Finding, findings
 from restock.train.judge.fed_rows import (
     Comparison,
@@ -188,13 +183,15 @@ def _of_parts(
     """Return each finding once: those of some robots or recordings, and those of all rows."""
     found = list(each[0])
     kinds = {one.kind: sum(other.kind == one.kind for other in parts) for one in parts[1:]}
-    by_cause: dict[tuple[str, str], list[tuple[Part, Finding]]] = {}
+    by_cause: dict[tuple[str, str, int], list[tuple[Part, Finding]]] = {}
     for part, of_part in zip(parts[1:], each[1:], strict=True):
-        for one in of_part:
-            by_cause.setdefault((one.cause, part.kind), []).append((part, one))
+        for place, one in enumerate(of_part):
+            again = sum(one.cause == other.cause for other in of_part[:place])
+            by_cause.setdefault((one.cause, part.kind, again), []).append((part, one))
     of_some: list[Finding] = []
-    for (cause, kind), some in by_cause.items():
-        if any(cause == one.cause for one in of_some):
+    said: dict[str, str] = {}
+    for (cause, kind, _), some in by_cause.items():
+        if said.setdefault(cause, kind) != kind:
             continue  # said of the robot already
         if len(some) > _SOME * kinds[kind]:
             if not any(cause == one.cause for one in found):
@@ -506,6 +503,9 @@ def diagnose_rows(
         beside = zip(*(checked[place].answers for place in inside), strict=True)
         for place, own in zip(inside, zip(*map(beside_others, beside), strict=True), strict=True):
             checked[place] = replace(checked[place], answers=list(own))
+        of_signals = signals_beside([parts[place].rows for place in inside])
+        for place, more_of_it in zip(inside, of_signals, strict=True):
+            checked[place].others.extend(more_of_it)
     checked = [
         one.corrected(comparisons)
         for one, comparisons in zip(

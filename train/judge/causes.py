@@ -8,6 +8,7 @@ share is at fault.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,12 +23,14 @@ from restock.train.judge.answers import (
     ACTION_TURN,
     DELAY_STEPS,
     GAIN,
+    LIDAR,
     PLAN,
     POSE,
     WHEEL_SPEED,
     WHEEL_TURN,
     Answer,
 )
+from restock.train.judge.beside import COARSE, HELD, LIMIT, ZEROS
 from restock.train.judge.fed_rows import Comparison
 from restock.train.judge.mission_checks import CHOSEN
 
@@ -36,6 +39,8 @@ GOALS = "GOALS_OF_OTHERS"
 _FIRST = (  # nothing can be told of rows before these
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
+OF_SIGNALS = (LIMIT, ZEROS, COARSE, HELD)  # what one value shows, first what explains the others
+_OPPOSITE, _NONE = -0.6, 0.3  # of what is expected, at most
 _MOST = 0.8  # of the missions: a signal that is wrong in nearly all of them is wrong alike in all
 CHANGED = "ACTIONS_CHANGED"  # then nothing that actions show is the profile's fault
 COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever else is right
@@ -65,29 +70,64 @@ def findings(
     task: Task,
 ) -> list[Finding]:
     """Return the faults, the least understood last."""
-    of_rows = _of_rows([row for row in others if row.off])
+    of_signals: dict[str, Comparison] = {}  # by the kind of check, and the signal
+    rest = []
+    for row in others:
+        if row.off and row.check.startswith(OF_SIGNALS):
+            of_signals[row.check] = row
+        elif row.off:
+            rest.append(row)
+    of_rows = _of_rows(rest)
     first = [one for one in of_rows if one.cause in _FIRST]
     if first:  # what rows are made of, and all that is compared with their next, follows from it
         return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
-    ends = odd_ends(answers)
+    found, shown = _of_signals(of_signals, of_rows, answers)
+    ends = odd_ends([one for one in answers if not _has(one, shown)])
     moved = [(row, place, other) for place, (row, other) in enumerate(permuted) if other != place]
     one_to_one = len({other for _, _, other in moved}) == len(moved)
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
     # Actions that are late or early are found in place of others, too.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
-    found = [one for one in of_rows if one.cause == CHANGED]
-    if not found and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
-        found = [_permuted(moved, task)]
-    if found:
+    changed = [one for one in of_rows if one.cause == CHANGED]
+    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # then motion shows nothing
+    if not changed and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
+        changed = [_permuted(moved, task)]
+    if changed:
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
         ends.pop(PLAN, None)  # of another goal, not of another scale
-    follow = {check for end in ends for check in TABLES.follow.get(end, ())}
-    of_rows = [one for one in of_rows if one not in found and not set(one.evidence) <= follow]
-    found += [_of_end(end, off, task) for end, off in ends.items()]
+    if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT") for one in of_rows):
+        ends.pop(LIDAR, None)  # known better than by its scale
+    follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
+    of_rows = [one for one in of_rows if one not in changed and not set(one.evidence) <= follow]
+    found += changed + [_of_end(end, off, task) for end, off in ends.items()]
     if any(one.cause == COARSE for one in of_rows):
         found = [one for one in found if one.cause not in ("ACTIONS_MIXED", "COMMAND_SCALED")]
     return found + of_rows
+
+
+def _of_signals(
+    off: dict[str, Comparison], of_rows: Sequence[Finding], answers: Sequence[Answer]
+) -> tuple[list[Finding], tuple[str, ...]]:
+    """Return the findings of signals' own values, and which signals (ends) these explain."""
+    if any(one.cause == "EPISODES_REPEATED" for one in of_rows):
+        return [], ()  # every value comes again
+    by_end: dict[str, list[tuple[str, Comparison]]] = {}
+    for check, row in off.items():
+        kind = next(one for one in OF_SIGNALS if check.startswith(one))
+        by_end.setdefault(check.removeprefix(kind), []).append((kind, row))
+    if POSE in by_end:
+        by_end.pop(PLAN, None)  # seen from the pose
+    shown, found = tuple(by_end), []
+    if by_end.keys() >= set(GROUPS["wheels"]):
+        by_end["wheels"] = by_end.pop(WHEEL_SPEED) + by_end.pop(WHEEL_TURN)
+    for end, rows in by_end.items():
+        kind, row = min(rows, key=lambda one: OF_SIGNALS.index(one[0]))
+        ends = GROUPS.get(end, (end,))
+        explained = (row for one in answers if _has(one, ends) for row in one.comparisons)
+        evidence = (*(each.check for _, each in rows), *(row.check for row in explained if row.off))
+        found.append(TABLES.ends[kind].finding(evidence, end=end, row=row, key=TABLES.keys[end]))
+    return found, shown
 
 
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
@@ -147,13 +187,17 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
             if low <= by <= high]  # fmt: skip
     degrees = math.degrees(math.atan(turn.effect or 0.0)) if turn else 0.0
     bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
+    part = _in_part(end, off)
+    mixed = some is not None and (some.logs or 0.0) < _MOST
+    if part and not surely and not (mixed and part[0] in ("opposite", "still", "unlike")):
+        return _part_of(end, part, rows, task)
     if is_action and gain < 1 / GAIN:
         kind = "opposite" if surely and gain < -1 / GAIN else "weak"
     elif scale < 0 and surely:
         kind = "reversed"
     elif _is_shift(scale, delay):
         kind = "early" if is_action and delay < 0 else "shifted"
-    elif some and (some.logs or 0.0) < _MOST:
+    elif mixed:
         kind = "mixed"
     elif scale > 0 and scale != 1:
         kind = "scaled"
@@ -167,6 +211,43 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         others=min(1 - gain, 1.0), steps=abs(delay), late="late" if delay > 0 else "early",
         seconds=abs(delay) * task.control_period_s, degrees=abs(degrees),
         side="left" if degrees > 0 else "right", bias=abs(bias),
+    )  # fmt: skip
+
+
+def _in_part(end: str, off: Sequence[Answer]) -> tuple[str, float] | None:
+    """Return what most of the relations show that an end does in some stretches only."""
+    ends, shapes = GROUPS.get(end, (end,)), []
+    for one in sorted(off, key=lambda one: one.relation.y not in ends):
+        if one.shape is not None:
+            shape, by = one.shape
+            if one.relation.y not in ends:
+                if any(shape != "unlike" for shape, _ in shapes):
+                    break  # it shows less: what is wrong is expected
+                by = 1 / by if shape == "scaled" and by else -by
+            if shape == "scaled" and by < _NONE:
+                shape = "opposite" if by < _OPPOSITE else "still"
+            shapes.append((shape, by))
+    counts = Counter(shape for shape, _ in shapes if shape != "unlike")
+    if not counts:
+        return shapes[0] if shapes and not any(one.is_off("gain") for one in off) else None
+    best = counts.most_common(1)[0][0]
+    return best, median(by for shape, by in shapes if shape == best)
+
+
+def _part_of(end: str, part: tuple[str, float], rows: Sequence[Comparison], task: Task) -> Finding:
+    shape, by = part
+    some = next(row for row in rows if row.check.startswith("stretches"))
+    action = end in (ACTION_SPEED, ACTION_TURN, "actions")
+    what = "ACTIONS" if action else "SENSOR"
+    names = {"shifted": f"{what}_SHIFTED", "spikes": f"{what}_SPIKES", "biased": f"{what}_BIASED",
+             "scaled": "COMMAND_SCALED" if action else "SENSOR_SCALED"}  # fmt: skip
+    how = TABLES.shapes[shape].format(
+        by=by, steps=abs(by), seconds=abs(by) * task.control_period_s,
+        late="late" if by > 0 else "early",
+    )  # fmt: skip
+    return TABLES.ends["part"].finding(
+        tuple(row.check for row in rows), end=end, key=TABLES.keys[end], some=some, how=how,
+        name=names.get(shape, f"{what}_MIXED"),
     )  # fmt: skip
 
 
@@ -236,6 +317,7 @@ class _Tables:
     ways: dict[str, str]
     follow: dict[str, tuple[str, ...]]
     ends: dict[str, Kind]
+    shapes: dict[str, str]
     labels: dict[str, Kind]
     kinds: tuple[Kind, ...]
 

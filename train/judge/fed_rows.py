@@ -143,8 +143,9 @@ def share_judged(
 
 
 def shares_compared(
-    check: str, what: str, logs: tuple[int, int], twin: tuple[int, int], least: float, most: float
-) -> Comparison:
+    check: str, what: str, logs: tuple[int, int], twin: tuple[int, int], least: float, most: float,
+    note: str = "",
+) -> Comparison:  # fmt: skip
     """Judge the difference of two shares, each (found, of), by Newcombe's interval."""
     if not logs[1] or not twin[1]:
         return not_run(check, what, "no such rows in the logs" if twin[1] else "nor in the twin")
@@ -157,7 +158,7 @@ def shares_compared(
     )
     return judged(
         check, what, "difference", interval, logs=p, twin=q, least=least, most=most,
-        logs_rows=logs[1], twin_rows=twin[1],
+        logs_rows=logs[1], twin_rows=twin[1], note=note,
     )  # fmt: skip
 
 

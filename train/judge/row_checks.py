@@ -55,17 +55,33 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     closing = rows.observation[:, first : first + rows.task.sectors]
     moving = np.abs(rows.now("wheel_speed")) > 0.1
     same = ~_differ(rows.observation, rows.next_observation)
+    after = rows.sectors(after=True) - rows.sectors()
+    nearer = rows.next_observation[:, first : first + rows.task.sectors]
+    own = rows.previous_action(after=True) != rows.action
+    strange = own | (np.abs(after - nearer) > 10 * _EQUAL).any(axis=1)
+    late = np.diff(rows.logged_ns, prepend=0) > 1.5e9 * rows.task.control_period_s
+    together = np.bincount(rows.episode, apart & late & joined) > 0
+    begins = np.append(True, rows.last[:-1])[: len(rows)]
+    begun = set(zip(rows.recording[begins], map(bytes, rows.observation[begins]), strict=True))
+    goes_on = zip(rows.recording, rows.next_observation, rows.last, strict=True)
+    cut = np.array([last and (name, bytes(after)) in begun for name, after, last in goes_on], bool)
     for check, what, off, of in (
         ("chain", "next observation is not the observation of the next row", apart, joined),
         ("previous action", "observation does not hold the action of the row before",
          held != previous, joined),
         ("own action", "next observation does not hold the row's own action",
-         rows.previous_action(after=True) != rows.action, np.ones(len(rows), np.bool_)),
+         own, np.ones(len(rows), np.bool_)),
         ("foresight", "observation contains the action that is only taken afterwards",
          held == rows.action, joined & (rows.action != previous)),
         ("closing", "clearances did not change as in the observation",
          (np.abs(change - closing) > 10 * _EQUAL).any(axis=1), joined),
         ("unchanged", "next observation is the observation, though the robot moves", same, moving),
+        ("last next", "last next observation of an episode does not follow from its row", strange,
+         rows.last),
+        ("split episodes", "episode stops where another begins, and has no end", cut,
+         rows.last & ~rows.terminated & ~rows.truncated),
+        ("joined episodes", "episode leaves out time, and goes on elsewhere",
+         together[rows.episode], rows.last),
     ):  # fmt: skip
         yield share_judged(check, what, int((off & of).sum()), int(of.sum()), MOST)
     yield _repeated(rows)
