@@ -40,7 +40,7 @@ def beside_others(answers: Sequence[Answer]) -> list[Answer]:
         known = np.array([(row.effect, row.low, row.high) if row is not None else (None,) * 3
                           for row in rows], np.float64)  # fmt: skip
         for place, row in enumerate(rows):
-            others = np.delete(known[:, 0], place)
+            others: F64 = np.delete(known[:, 0], place)
             others = others[np.isfinite(others)]
             if row is None or len(others) < MIN_BESIDE - 1 or not np.isfinite(known[place]).all():
                 continue
@@ -147,11 +147,11 @@ class _Pieces:
 
         def left(other: F64, rows: Bools) -> float:
             rows = rows & np.isfinite(other)
-            return float(((y - other)[rows] ** 2).sum() / max(square[rows].sum(), 1e-12))
+            return float(((y - other)[rows] ** 2).sum()) / max(float(square[rows].sum()), 1e-12)
 
         far = square > _SPIKE * np.median(square[inside])
         few = far[inside].mean() < _FEW
-        gain = float(p[inside] @ y[inside] / max(p[inside] @ p[inside], 1e-12))
+        gain = float(p[inside] @ y[inside]) / max(float(p[inside] @ p[inside]), 1e-12)
         bias = float((y - p)[inside].mean())
         made = {("scaled", gain): p * gain, ("biased", bias): p + bias}
         for steps in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
@@ -268,7 +268,7 @@ def signals_beside(parts: Sequence[FedRows]) -> list[list[Comparison]]:
             others = [x for other, x in enumerate(own) if x is not None and other != place]
             if one is None or len(others) < MIN_BESIDE - 1:
                 continue
-            if kind in (LIMIT, FAR) and one.note > _LESS * min(x.note for x in others):
+            if kind in (LIMIT, FAR) and one.note > _LESS * np.median([x.note for x in others]):
                 continue
             most = max(others, key=lambda x: x.found / x.of)
             row = shares_compared(

@@ -216,7 +216,8 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
 
 def _in_part(end: str, off: Sequence[Answer]) -> tuple[str, float] | None:
     """Return what most of the relations show that an end does in some stretches only."""
-    ends, shapes = GROUPS.get(end, (end,)), []
+    ends = GROUPS.get(end, (end,))
+    shapes: list[tuple[str, float]] = []
     for one in sorted(off, key=lambda one: one.relation.y not in ends):
         if one.shape is not None:
             shape, by = one.shape
