@@ -9,7 +9,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-from restock.errors import ConfigError, counted, expect
+from restock.errors import ConfigError, counted
 from restock.process import interrupts_raised
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
@@ -88,7 +88,6 @@ def measure_drift(
     Raises:
         ConfigError: no such period, or a number below its least.
     """
-    expect("store", store, Store, 'open it as Store("store")')
     if every not in PERIODS:
         raise ConfigError(
             f"no period {every!r}", where="drift", remedy=f"give one of {', '.join(PERIODS)}"

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from restock.arrays import F64, Bools, Ints
-from restock.errors import ConfigError, expect
+from restock.errors import ConfigError
 from restock.ingest.task.conditions import NOMINAL, Condition, shipped
 from restock.process import interrupts_raised
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
@@ -173,8 +173,6 @@ def find_gaps(
         ConfigError, MixtureError, StoreError: as `plan_panel` does; kinds, audits and thresholds
             that there are not, or thresholds of another kind.
     """
-    expect("store", store, Store, 'open it as Store("store")')
-    expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
     _refuse_unknown(kinds, [NOMINAL, *(one.name for one in store.conditions()), *shipped()])
     if thresholds is not None:
         check_thresholds(shipped_audits(), thresholds, others=True)
@@ -199,8 +197,6 @@ def find_gaps(
 
 
 def _refuse_unknown(kinds: Sequence[str], known: Sequence[str]) -> None:
-    if isinstance(kinds, str):
-        expect("kinds", kinds, (list, tuple), f"give [{kinds!r}]")
     for kind in kinds:
         if kind not in known:
             near = get_close_matches(kind, known, n=1)

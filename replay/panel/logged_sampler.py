@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
-from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.share_controller import (
     PlannedDraws,
@@ -251,12 +250,12 @@ def sampler_for(
 
     Raises:
         MixtureError: rows too few for what is planned, where the mixture refuses that; too little
-            memory for a panel that is read in chunks; a seed that is none.
+            memory for a panel that is read in chunks.
     """
     header = panel.header
     mixture, members = header.mixture, panel.stratum_rows()
     controller = controller_for(panel, planned or planned_by(mixture), logs_share, fresh)
-    seeds = _seeds(seed)
+    seeds = [seed] if isinstance(seed, int | np.integer) else seed
     rng = np.random.default_rng([*seeds, 2])
     sampler: Sampler
     if mixture.sampling == "chunked":
@@ -280,13 +279,6 @@ def sampler_for(
         rng=np.random.default_rng([*seeds, 3]),
         needs_td=needs_td(panel),
     )
-
-
-def _seeds(seed: int | Sequence[int]) -> list[int]:
-    given = cast("list[int]", [seed] if np.ndim(seed) == 0 else list(cast("Sequence[int]", seed)))
-    if all(isinstance(one, int | np.integer) and one >= 0 for one in given):
-        return [int(one) for one in given]
-    raise MixtureError(f"seed must be an integer of at least 0, or several, got {seed!r}")
 
 
 def sampler_by_shares(

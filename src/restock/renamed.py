@@ -146,6 +146,7 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "gate --junit": "it is always RUN/gate/junit.xml",
     "ingest --engine": "call restock.ingest.ingest in the cluster's tasks: docs/scale.md",
     "mix --verify": "it is `restock store verify PANEL` now",
+    "profile schema --out": "send each to a file: restock profile schema NAME > FILE",
     "store label --all": "give the profile the name of the recordings' own",
     "store label --review": "`restock review STORE` shows the events on a page; --out review.csv",
     "store label --score": "query them: FROM pooled_label_scores, FROM label_reliability",

@@ -92,27 +92,18 @@ def once(episodes: int) -> F64:
     return np.ones((1, episodes))
 
 
-def log_weights(ratio: F64) -> F64:
-    """Return the log of each episode's product of ratios up to each step, (n, T); -inf for 0."""
-    with np.errstate(divide="ignore"):
-        return np.cumsum(np.log(ratio), axis=1)
-
-
 def relative_weights(ratio: F64) -> F64:
     """Return products of ratios up to each step (n, T), scaled so that each step's largest is 1."""
-    logs = log_weights(ratio)
+    with np.errstate(divide="ignore"):  # -inf for 0
+        logs = np.cumsum(np.log(ratio), axis=1)
     most = logs.max(axis=0, initial=-np.inf)
     return np.exp(logs - np.where(np.isfinite(most), most, 0.0))
 
 
-def per_decision(logged: OpeEpisodes, counts: F64, *, weighted: bool = True) -> F64:
-    """Estimate by per-decision importance sampling; `counts` (B, n) of each episode -> (B,).
-
-    Unweighted it is unbiased, and its variance grows with every step; weighted it is consistent.
-    """
-    weight = relative_weights(logged.ratio) if weighted else np.exp(log_weights(logged.ratio))
-    total = counts @ weight if weighted else counts.sum(axis=1, keepdims=True)
-    means = counts @ (weight * logged.reward) / np.maximum(total, _TINY)  # (B, T)
+def per_decision(logged: OpeEpisodes, counts: F64) -> F64:
+    """Estimate by per-decision weighted importance sampling; `counts` (B, n) -> (B,)."""
+    weight = relative_weights(logged.ratio)
+    means = counts @ (weight * logged.reward) / np.maximum(counts @ weight, _TINY)  # (B, T)
     return np.asarray(means @ logged.discounts, np.float64)
 
 

@@ -6,11 +6,10 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 from restock.cli import output
-from restock.cli.words import Option, Positional
+from restock.cli.words import Positional
 from restock.errors import ConfigError
 
 # name -> the files that it is of
@@ -32,32 +31,22 @@ class SchemaCommand:
 
     Without NAME, it lists the configs. Run `restock profile schema train > train.schema.json`, and
     make this the first line of the TOML file: #:schema ./train.schema.json (read by Taplo, and so
-    by the VS Code extension Even Better TOML). --out writes all schemas into a folder.
+    by the VS Code extension Even Better TOML).
     """
 
     name: Annotated[str | None, Positional("[NAME]")] = None
     """The name of the config."""
-    out: Annotated[Path | None, Option("DIR")] = None
-    """Write NAME.schema.json into this folder; without NAME, all schemas."""
     json: bool = False
     """Print the list as JSON (a schema is always JSON)."""
 
     def run(self) -> None:
-        """Print or write."""
-        from restock.files import expect_file_place, write_text
-
+        """Print the schema, or the list."""
         if self.name is not None and self.name not in CONFIGS:
             raise ConfigError(
                 f"there is no config named {self.name!r}",
                 remedy=f"choose one of {', '.join(CONFIGS)}",
             )
-        if self.out is not None:
-            expect_file_place(self.out / "NAME.schema.json", "--out")
-            for name in [self.name] if self.name else CONFIGS:
-                file = self.out / f"{name}.schema.json"
-                write_text(file, schema_of(name))
-                output.say(f"{file}: #:schema {file} is the first line of {CONFIGS[name]} files")
-        elif self.name is not None:
+        if self.name is not None:
             sys.stdout.write(schema_of(self.name))
         else:
             rows = [{"name": name, "of": of} for name, of in CONFIGS.items()]
