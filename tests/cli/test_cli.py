@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from support.paths import ROOT
@@ -75,6 +76,7 @@ def test_the_version_is_printed() -> None:
 
 PRINTS = """
 import sys
+from pathlib import Path
 from restock import cli
 from restock.cli import output
 cli._dispatch = lambda args: output.print_wrapped("8 checks: 8 pass")
@@ -202,3 +204,14 @@ def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(verb, capsys, t
     said = "".join(capsys.readouterr())
     assert "***:***@bucket/logs" in said
     assert "hu/sh" not in said
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_a_script_has_every_verb(shell: str, tmp_path: Path) -> None:
+    script = tmp_path / "restock"
+    assert cli.main([cli.COMPLETION, shell, str(script)]) == 0
+    text = script.read_text(encoding="utf-8")
+    assert [verb for verb in cli.VERBS if verb not in text] == []
+    assert "--trust-position-m" in text  # of a job
+    if shell == "bash":
+        assert subprocess.run(["bash", "-n", str(script)], capture_output=True).stderr == b""

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from support.stores import one, shown
 
-from restock import cli
 from restock.errors import StoreError
 from restock.ingest.store import commits
 from restock.ingest.store.writer import StoreWriter
@@ -62,14 +61,6 @@ def test_a_damaged_commit_is_named(whole, tmp_path, table, number, how):
     assert len(shown(tmp_path / "s")) == (LAST if table == "recordings" else LAST - 1)
     StoreWriter(tmp_path / "s").write(*one(number, "again"))
     assert len(shown(tmp_path / "s")) == LAST
-
-
-@pytest.mark.parametrize("verb", [["audit"], ["store", "compact"]])
-def test_every_verb_names_it(whole, tmp_path, capsys, verb):
-    file = f"transitions/_delta_log/{LAST:020}.json"
-    damaged(whole, tmp_path / "s", file, "empty")
-    assert cli.main([*verb, str(tmp_path / "s")]) == 2
-    assert f"{file} is empty" in capsys.readouterr().err
 
 
 def test_a_commit_that_is_missing_among_others_is_named(whole, tmp_path):

@@ -95,7 +95,7 @@ def once(episodes: int) -> F64:
 def relative_weights(ratio: F64) -> F64:
     """Return products of ratios up to each step (n, T), scaled so that each step's largest is 1."""
     with np.errstate(divide="ignore"):  # -inf for 0
-        logs = np.cumsum(np.log(ratio), axis=1)
+        logs: F64 = np.cumsum(np.log(ratio), axis=1)
     most = logs.max(axis=0, initial=-np.inf)
     return np.exp(logs - np.where(np.isfinite(most), most, 0.0))
 
