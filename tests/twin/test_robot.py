@@ -245,10 +245,6 @@ def test_a_long_robot_does_not_start_in_a_rack(axle_x_m: float) -> None:
 
 def room_m(episode: Episode, floor: Warehouse, outline_m: NDArray[np.float64]) -> float:
     x, y, yaw = episode.start
-    ahead, aside = outline_m.T
-    points = (
-        x + ahead * np.cos(yaw) - aside * np.sin(yaw),
-        y + ahead * np.sin(yaw) + aside * np.cos(yaw),
-    )
-    own = np.empty((1, 0, 4))
-    return float(near_gap(floor, own, *(place[None] for place in points), np.inf).min())
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    points = (outline_m @ turn + (x, y)).T[:, None]
+    return float(near_gap(floor, np.empty((1, 0, 4)), *points, np.inf).min())

@@ -439,7 +439,7 @@ class Truth(Stateful):
 
     def note_situation(self, simulation: Simulation, plans_m: F64) -> None:
         """Note what every robot was exposed to at the start of the step that was driven."""
-        pose, pallets = simulation.start, simulation.pallets
+        pose, pallets, gaps_m = simulation.start, simulation.pallets, simulation.traffic_gap_m
         ahead = np.zeros((len(pose), len(VIEW_M)), np.bool_)
         apart = np.abs(pallets[:, :, :2] - pose[:, None, :2])
         near = np.maximum(apart[..., 0], apart[..., 1]) < REACH_M
@@ -449,7 +449,6 @@ class Truth(Stateful):
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets], self._margin_m
             )
         self.blocked[:] = ahead[:, :BLOCK_AHEAD].any(axis=1)
-        gaps_m = simulation.traffic_gap_m
         with np.errstate(invalid="ignore"):  # who was not there, or is not, is at infinity
             came_m = self.traffic_gap_m - gaps_m
         came = np.isfinite(came_m) & (came_m > CLOSING_MPS * self._period_s)

@@ -168,9 +168,7 @@ class Sensing(Stateful):
             "gyro_yaw_rate_radps": sim.qvel[ids, 5] + bias[:, 1] + scalar[:, 7],
             "accel_x_mps2": sim.accel[ids, 0] + scalar[:, 8] + bias[:, 2],
             "sector_clearance_m": clearance,
-            "clearance_m": np.minimum.reduce(clearance, axis=1)
-            if task.lidar
-            else np.full(len(ids), np.nan),
+            "clearance_m": clearance.min(axis=1) if task.lidar else np.full(len(ids), np.nan),
             "bumped": sim.bumped[ids],
             "command_speed_mps": command[:, 0],
             "command_yaw_rate_radps": command[:, 1],

@@ -43,9 +43,6 @@ GRAVITY_MPS2 = 9.81
 _HISTORY = 5  # commands kept, or as many more as the longest latency takes
 
 
-Change = tuple[Ints, Ints, tuple[Bools, F64, F64]]  # of the command in force: see `_change`
-
-
 class BaseController(Stateful):
     """The controllers of N robots. A command reaches its controller `latency_s` late.
 
@@ -66,7 +63,8 @@ class BaseController(Stateful):
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
         self.left_gain = np.ones(num_envs)
-        self._changes: dict[float, Change] = {}  # by `since_s`
+        # By `since_s`: what `_change` returns.
+        self._changes: dict[float, tuple[Ints, Ints, tuple[Bools, F64, F64]]] = {}
 
     def reset(self, env: int) -> None:
         """Reset to a standstill, as after a stop command long ago."""
@@ -110,7 +108,7 @@ class BaseController(Stateful):
         rows = np.arange(len(first))
         return self.commands[rows, first][:, None], self.commands[rows, last][:, None], reach
 
-    def _change(self, since_s: float) -> Change:
+    def _change(self, since_s: float) -> tuple[Ints, Ints, tuple[Bools, F64, F64]]:
         """Return how many periods old (N,) both commands are, and the rest of `_in_force`.
 
         There is at most one change within a block.
