@@ -63,6 +63,11 @@ class Audit:
         return self.needs.split(".")[0] if self.needs else None
 
     @property
+    def query(self) -> str:
+        """Return the SQL without its header, whose words name no view."""
+        return re.sub(r"\A(?:--.*\n)*", "", self.sql)
+
+    @property
     def parameters(self) -> set[str]:
         """Return the thresholds that the query uses."""
         return set(re.findall(r"\$([A-Za-z_]\w*)", self.sql))
@@ -160,7 +165,7 @@ def run_audits(
         f"{schema}.{table}" for schema, table in _tables(connection) if schema in available
     }
     findings = []
-    with rows_held(connection, [audit.sql for audit in audits]):
+    with rows_held(connection, [audit.query for audit in audits]):
         for audit in audits:
             finding = Finding(audit, "skipped", 0, [], [], {})
             if audit.needs is None or audit.needs in available:
@@ -227,7 +232,7 @@ def _run(
         )
 
     def run() -> tuple[list[str], list[tuple[Any, ...]]]:
-        install_named(connection, audit.sql)
+        install_named(connection, audit.query)
         return found(connection, audit.sql, dict(thresholds) or None)
 
     try:
