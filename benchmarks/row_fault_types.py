@@ -1,11 +1,11 @@
-"""Types of fault in logs, each in three doses: those that limits are set on, and those left out.
+"""Types of fault in logs that limits are set on, each in three doses.
 
 A fault is planted where its like arises: in the signals, between a recording's messages and the
 observation, so that observations, actions, rewards and labels all agree with it, as with a wrong
 profile or a wrong clock; or in the rows of a store, as by software that rewrites them. One robot
 of the fleet has it, unless it is of all. `right` is a pattern of what a right finding says.
 
-`LEFT_OUT` is for types that are written down when the checks stand, by somebody else.
+`left_out_types.py` has those that no check was made for.
 """
 
 from __future__ import annotations
@@ -680,5 +680,4 @@ DEVELOPED = [
     *(Fault("episodes split in two", f"{s:.0%}", "episode|ROWS_|rows", rows=split(s))
       for s in (0.1, 0.3, 1.0)),
 ]  # fmt: skip
-LEFT_OUT: tuple[Fault, ...] = ()
 DOSES = ("mild", "medium", "strong")
