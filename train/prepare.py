@@ -388,9 +388,11 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
             "forecast": controller.forecast(),
             "planned_draws": asdict(planned),
         }
+    lower = config.loss.double and not config.teacher.filters  # earlier runs had the target's value
     return {
         "created_ns": now_ns(),
         "config": msgspec.to_builtins(config),
+        **({"next_value": "lower of both networks"} if lower else {}),
         "panel": fed,
         "target": describe(config.target),
         "update_path": update_path(config.device, config.threads),

@@ -12,7 +12,7 @@ from support.finished_runs import UPDATES, document, make_run
 from restock.cli import main
 from restock.train.run.run import Run
 
-EXTRA = ("update_path",)
+EXTRA = ("update_path", "next_value")
 
 
 def arm(tmp_path: Path, name: str, seeds: range, **given: Any) -> list[str]:
@@ -35,11 +35,13 @@ def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
     other = {
         "config__network__layer_norm": False,
         "update_path": "autograd",
+        "next_value": "lower of both networks",
     }  # one follows the other
     second = arm(tmp_path, "b", range(3, 6), success=0.7, **other)
     code, found = compared(capsys, first, second)
     assert (code, found["verdict"], found["outcomes_from"]) == (0, "comparable", "training")
-    assert [d["setting"] for d in found["differences"]] == ["config.network.layer_norm"]
+    differ = {d["setting"] for d in found["differences"]}
+    assert differ == {"config.network.layer_norm", "next_value"}
     slip = next(row for row in found["outcomes"] if row["condition"] == "wheel_slip")
     assert (slip["episodes"], slip["runs"]) == (40, [3, 3])
     assert slip["difference"] == pytest.approx(0.5, abs=0.12)

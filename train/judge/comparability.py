@@ -311,6 +311,7 @@ _KINDS: dict[str, Kind] = {
     "task_hash": "task",
     "labels_version": "task",
     "profile": "task",
+    "next_value": "algorithm",
     "versions": "software",
 }
 _NO_SETTING = frozenset(  # or it follows from the config
