@@ -319,7 +319,6 @@ def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path
         (["report", str(own), "--figures", str(store_path / "figures")], f"the store {store}"),
         (["coverage", store, "--out", str(store_path / "page.html")], f"the store {store}"),
         (["audit", store, "--junit", str(store_path / "x.xml")], f"the store {store}"),
-        (["profile", "schema", "--out", store], f"the store {store}"),
         (["profile", "new", "a.mcap", "--out", f"{store}/p.toml"], f"the store {store}"),
         (["review", store, "--out", f"{store}/l.csv"], f"the store {store}"),
         (["sql", store, "--export", f"{store}/views.sql"], f"the store {store}"),
