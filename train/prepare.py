@@ -388,7 +388,8 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
             "forecast": controller.forecast(),
             "planned_draws": asdict(planned),
         }
-    lower = config.loss.double and not config.teacher.filters  # earlier runs had the target's value
+    # Earlier runs had the target's value; an algorithm of one's own has what it takes.
+    lower = config.loss.algorithm == "dqn" and config.loss.double and not config.teacher.filters
     return {
         "created_ns": now_ns(),
         "config": msgspec.to_builtins(config),
