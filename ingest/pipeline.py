@@ -162,7 +162,7 @@ def preparing(
     `settle(recording_id)` is called before the recording is looked up in the store, which does not
     show recordings that wait for their commit.
     """
-    file = None
+    file = before = None
     if store is not None and not force:
         file = identify(path, definitions=definitions, watch=watch)
     if store is not None and file is not None:
@@ -181,7 +181,7 @@ def preparing(
             recording.recording_id = file.recording_id
         else:
             settle(recording.recording_id)
-        before = store.manifest(recording.recording_id) if store is not None else None
+            before = store.manifest(recording.recording_id) if store is not None else None
         tagged = (before or {}).get("tags") or {}
         reported = resolve_tags(profile.tags, Path(path), recording.metadata, tags, tagged)
         if store is not None and before is not None and not force and _unchanged(before, profile):
