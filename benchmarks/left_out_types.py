@@ -25,6 +25,7 @@ from row_fault_types import (
     missions,
     number,
     scale,
+    second_halves,
     with_columns,
 )
 
@@ -293,17 +294,14 @@ def pieces_again(share: float) -> Rowed:
     """Second halves of episodes, stored once more as episodes of their own."""
 
     def plant(rows: pa.Table, rng: Draws) -> pa.Table:
-        episode, inside = inside_of(rows, share, rng)
-        step = rows["step_index"].to_numpy()
-        half = np.bincount(episode)[episode] // 2
-        again = rows.filter(pa.array(inside & (step >= half)))
-        chosen = np.flatnonzero(inside & (step >= half))
+        episode, half, second = second_halves(rows, share, rng)
+        step, again = rows["step_index"].to_numpy(), rows.filter(pa.array(second))
         again = with_columns(
             again,
             transition_id=again["transition_id"].to_numpy() ^ (1 << 55),
             episode_id=[f"{one}-again" for one in again["episode_id"].to_pylist()],
-            episode_index=episode[chosen] + 2000,
-            step_index=(step - half)[chosen],
+            episode_index=episode[second] + 2000,
+            step_index=(step - half)[second],
         )
         return pa.concat_tables([rows, again])
 

@@ -543,14 +543,19 @@ def labels_of_others(share: float) -> Rowed:
     return plant
 
 
+def second_halves(rows: pa.Table, share: float, rng: Draws) -> tuple[np.ndarray, ...]:
+    """Return rows' episode, half of its length, and whether it is the second half, (N,) each."""
+    episode, inside = inside_of(rows, share, rng)
+    half = np.bincount(episode)[episode] // 2
+    return episode, half, inside & (rows["step_index"].to_numpy() >= half)
+
+
 def split(share: float) -> Rowed:
     """Episodes whose second half is stored as an episode of its own, without an end between."""
 
     def plant(rows: pa.Table, rng: Draws) -> pa.Table:
-        episode, inside = inside_of(rows, share, rng)
+        episode, half, second = second_halves(rows, share, rng)
         step = rows["step_index"].to_numpy()
-        half = np.bincount(episode)[episode] // 2
-        second = inside & (step >= half)
         ids = np.array(rows["episode_id"].to_pylist(), object)
         return with_columns(
             rows,

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -33,10 +33,6 @@ from restock.replay.plan.plan import PinnedStore
 from restock.replay.plan.strata import Stratum
 from restock.replay.plan.weights import RatioFit
 from restock.replay.sampling.packed_rows import PACKING_VERSION, row_columns, row_width
-
-if TYPE_CHECKING:
-    pass
-
 
 AGAIN = "make it again with `restock mix`"
 SAMPLED_BLOCKS, BLOCK_BYTES = 16, 4096

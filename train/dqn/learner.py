@@ -215,12 +215,11 @@ class Learner(Stateful):
         q = online.values(now, after) if algorithm.settings.double else online.values(now)
         if algorithm.settings.double:
             q, fast = q[:count], q[count:]
+        chooses = fast
         if self.behaviour is not None:
             chooses = np.where(self.behaviour.plausible(after), fast, -np.inf)
         elif self._preference is not None:
             chooses = fast + self._preference(torch.from_numpy(after)).numpy()
-        else:
-            chooses = fast
         weight = None if terms.weight is None else terms.weight.numpy()
         best = np.arange(count), chooses.argmax(axis=1)
         next_value = slow[best]

@@ -165,14 +165,14 @@ class _Pieces:
         return None if left(made[best], ~inside) < _EXPLAINED_TOO else best
 
 
-HELD, ZEROS, LIMIT, COARSE = "held: ", "zeros: ", "limit: ", "coarse: "
+HELD, ZEROS, LIMIT, ROUNDED = "held: ", "zeros: ", "limit: ", "coarse: "
 FAR, FLICKER, REWARDS = "lidar far", "lidar flicker", "reward values"
-_MORE = {HELD: 0.05, ZEROS: 0.02, LIMIT: 0.04, COARSE: 0.3, FAR: 0.1, FLICKER: 0.02, REWARDS: 0.02}
+_MORE = {HELD: 0.05, ZEROS: 0.02, LIMIT: 0.04, ROUNDED: 0.3, FAR: 0.1, FLICKER: 0.02, REWARDS: 0.02}
 _WHAT = {
     HELD: "row in which the robot moves and the value of the row before stays",
     ZEROS: "row in which the robot moves and the value is 0",
     LIMIT: "row in which the value is its largest, which is less than others'",
-    COARSE: "value that comes again elsewhere, as of rounding",
+    ROUNDED: "value that comes again elsewhere, as of rounding",
     FAR: "sector that sees nothing",
     FLICKER: "sector that sees something else for one row",
     REWARDS: "row's reward is not exactly the task's own",
@@ -248,7 +248,7 @@ def _repeats(
     yield Tally(HELD, name, int(held.sum()), of, (1 + held.sum() / max(times, 1)) * period_s)
     yield Tally(ZEROS, name, int((known & zero).sum()), of)
     yield Tally(LIMIT, name, int((known & limit).sum()), of, largest)
-    yield Tally(COARSE, name, int((runs & (comes > 1)).sum()), int(runs.sum()))
+    yield Tally(ROUNDED, name, int((runs & (comes > 1)).sum()), int(runs.sum()))
 
 
 def signals_beside(parts: Sequence[FedRows]) -> list[list[Comparison]]:

@@ -30,7 +30,7 @@ from restock.train.judge.answers import (
     WHEEL_TURN,
     Answer,
 )
-from restock.train.judge.beside import COARSE, HELD, LIMIT, ZEROS
+from restock.train.judge.beside import HELD, LIMIT, ROUNDED, ZEROS
 from restock.train.judge.fed_rows import Comparison
 from restock.train.judge.mission_checks import CHOSEN
 
@@ -39,7 +39,7 @@ GOALS = "GOALS_OF_OTHERS"
 _FIRST = (  # nothing can be told of rows before these
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
-OF_SIGNALS = (LIMIT, ZEROS, COARSE, HELD)  # what one value shows, first what explains the others
+OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, HELD)  # what one value shows, first what explains the others
 _OPPOSITE, _NONE = -0.6, 0.3  # of what is expected, at most
 _MOST = 0.8  # of the missions: a signal that is wrong in nearly all of them is wrong alike in all
 CHANGED = "ACTIONS_CHANGED"  # then nothing that actions show is the profile's fault
