@@ -101,17 +101,6 @@ DRIVES = {
             *((-0.4, 0.0), (-0.4, 0.5), (-0.4, -0.5)),
         ),
     ),
-    "omnidirectional": Driven(
-        Robot(
-            drive="omnidirectional",
-            wheel_radius_m=0.075,
-            track_m=0.4,
-            wheelbase_m=0.4,
-            mass_kg=40.0,
-        ),
-        Body(0.6, 0.5),
-        (*_TURNING, (-0.4, 0.0)),
-    ),
 }
 UNDER = {
     "nominal": Perturbation(),

@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.profile.description import mjcf_text
 from restock.ingest.profile.tables import (
     COMMAND_FALLBACK,
     COMMAND_SOURCES,
@@ -277,9 +276,6 @@ def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profi
 
 def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
     document = with_files(document, folder, where)
-    if isinstance(robot := document.get("robot"), dict) and isinstance(robot.get("mjcf"), str):
-        robot = robot | {"mjcf": mjcf_text(robot["mjcf"], folder, where)}
-        document = document | {"robot": robot}
     signals = document.get("signals")
     # Each by itself first: msgspec's paths leave out the keys of a table of tables.
     for name, table in signals.items() if isinstance(signals, dict) else ():

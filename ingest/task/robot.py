@@ -89,8 +89,6 @@ class Robot(Checked, frozen=True):
     # How far the driven wheels are apart for the controller and its odometry, by the track: a skid-
     # steer robot turns less than its wheels say. None: what the twin's own robot does.
     track_ratio: Annotated[float, Meta(ge=0.5, le=10)] | None = None
-    # A model of one's own in the built one's place: a file beside the profile; its text, once read.
-    mjcf: str | None = None
     lidar: Lidar = Lidar()
     origin: dict[str, Origin] = msgspec.field(default_factory=dict)
 

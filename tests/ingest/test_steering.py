@@ -10,7 +10,7 @@ import pytest
 from support.driven_robot import columns, write_topics
 from support.long import one_in
 from support.paths import SHARED
-from twin.test_robot_drives import CAR, MECANUM, OUTLINE
+from twin.test_robot_drives import CAR, OUTLINE
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
@@ -30,7 +30,6 @@ ROBOTS = {
         Robot(drive="skid_steer", wheel_radius_m=0.1, track_m=0.4, wheelbase_m=0.4, mass_kg=40.0),
         Body(0.7, 0.5),
     ),
-    "mecanum": (MECANUM, Body(0.6, 0.5)),
     "ackermann": (CAR, OUTLINE),
 }
 

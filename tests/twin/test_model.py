@@ -257,3 +257,13 @@ def test_the_slipperiest_patch_of_a_place_counts() -> None:
     patches = np.array([[[1.0, 1.0, 0.5, 0.5, 0.1], [1.2, 1.0, 0.5, 0.5, 0.05]]])
     points = np.array([[[0.6, 1.0], [1.0, 1.0], [3.0, 3.0]]])
     np.testing.assert_allclose(friction_at(points, patches, np.array([0.8])), [[0.1, 0.05, 0.8]])
+
+
+def test_a_warning_of_mujoco_writes_no_log_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    parent, child = mujoco.MjSpec(), mujoco.MjSpec()
+    child.option.gravity = [0, 0, 0]
+    child.worldbody.add_body(name="body").add_geom(size=[0.1, 0, 0])
+    parent.attach(child, frame=parent.worldbody.add_frame(), prefix="x")
+    parent.compile()
+    assert not list(tmp_path.iterdir())

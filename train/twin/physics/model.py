@@ -43,13 +43,7 @@ from restock.train.twin.physics.robot_model import (
     design,
     stand_in,
 )
-from restock.train.twin.physics.robot_parts import (
-    actuator_places,
-    add_robot,
-    grip,
-    own_model,
-    wheels_of,
-)
+from restock.train.twin.physics.robot_parts import add_robot, wheels_of
 
 # Of the mocap bodies (M, 3), in their order; a person is a cylinder.
 MOVING_HALF_M = np.repeat(
@@ -72,7 +66,6 @@ class Handles:
     wheel_qpos: tuple[int, ...]  # the angle of each in qpos, and its speed in qvel
     wheel_qvel: tuple[int, ...]
     steering_qpos: tuple[int, ...]  # of the front wheels that steer, left and right
-    actuators: tuple[int, ...]  # in ctrl, of the wheels that are driven, and what steers
     building: slice  # the geoms of racks and walls
     pallets: slice  # of the mocap bodies
     people: slice
@@ -95,7 +88,6 @@ def build_model(
     add_robot(spec, robot)
     _add_mocap(spec)
     model = spec.compile()
-    grip(model, robot)
     return model, _handles(model, robot)
 
 
@@ -106,9 +98,7 @@ def build_robot_alone(robot: RobotModel, timestep_s: float = 0.01) -> mujoco.MjM
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=FLOOR, **FLOOR_MASK
     )
     add_robot(spec, robot)
-    model = spec.compile()
-    grip(model, robot)
-    return model
+    return spec.compile()
 
 
 def _spec(timestep_s: float) -> Any:
@@ -213,7 +203,6 @@ def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
         wheel_qpos=tuple(int(model.jnt_qposadr[joint]) for joint in wheels.joints),
         wheel_qvel=tuple(int(model.jnt_dofadr[joint]) for joint in wheels.joints),
         steering_qpos=tuple(int(model.jnt_qposadr[joint]) for joint in wheels.steering),
-        actuators=actuator_places(model, robot),
         building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
         pallets=mocap("pallet", PALLETS),
         people=mocap("person", PEOPLE),
@@ -273,15 +262,12 @@ class _Key:
 
 @functools.lru_cache(maxsize=32)
 def _tried(key: _Key) -> RobotModel:
-    built = design(key.robot, key.body)
-    own = key.robot.mjcf is not None
-    robot = _settled(own_model(key.robot, key.body, built) if own else built)
+    robot = _settled(design(key.robot, key.body))
     speed = min(TRY_SPEED, robot.speed_limit[0] / 2)
     ahead, _ = _driven(robot, speed, 0.0)
     # It rolls on the middle of what its wheels sink in.
     radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_m(robot, ahead, speed)
-    if not own:  # whose wheels are what its file says
-        robot = _settled(replace(robot, contact_radius_m=radius))
+    robot = _settled(replace(robot, contact_radius_m=radius))
     if robot.drive == "skid_steer" and key.robot.track_ratio is None:
         turn = min(TRY_TURN, robot.speed_limit[1] / 2)
         for _ in range(3):
@@ -331,12 +317,9 @@ def driven_actions(
 
 def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
     """Return a robot's values in the twin as rows of name, value and source."""
-    own = robot is not None and robot.mjcf is not None
     lidar = Lidar() if robot is None else robot.lidar
-    of_file = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg", "lidar.z_m")
     values: dict[str, Any] = {
         "drive": model.drive,
-        "own_model": own or None,
         "wheel_radius_m": model.wheel_radius_m,
         "track_m": model.track_m,
         "wheelbase_m": model.wheelbase_m or None,
@@ -360,8 +343,6 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
             continue
         if robot is None:
             origin = "the twin's own"
-        elif own and name in of_file:
-            origin = "mjcf"
         elif name == "min_turning_radius_m":
             origin = "wheelbase_m, max_steering_rad"
         elif name.startswith("lidar.angle") and lidar == Lidar(beams=lidar.beams, z_m=lidar.z_m):
@@ -369,7 +350,7 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
         elif name == "track_ratio" and not robot.track_ratio:
             origin = "measured"
         else:
-            origin = "profile" if name == "own_model" else robot.origin_of(name)
+            origin = robot.origin_of(name)
         rows.append((name, round(value, 4) if isinstance(value, float) else value, origin))
     return rows
 
@@ -429,7 +410,7 @@ def _control(
         values = [*sides[0, 0], *robot.front_angles(steering)[0, 0]]
     else:
         values = [*np.tile(sides[0, 0], len(robot.wheels_m) // 2)]
-    data.ctrl[list(actuator_places(model, robot))] = values
+    data.ctrl[:] = values
 
 
 def _motion(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:

@@ -154,11 +154,9 @@ class RobotModel:
     accel_limit: tuple[float, float]  # m/s2 and rad/s2 of the base controller's ramp
     speed_limit: tuple[float, float]  # m/s and rad/s
     rest_z_m: float  # of the chassis frame, standing still
-    own: bool = True  # False: the stand-in
     drive: Drive = "differential"
     max_steering_rad: float = 0.0
     steering_rate_radps: float = 0.0
-    mjcf: str | None = None  # a model of its own, in the place of the built one
 
     @property
     def wheels_m(self) -> F64:
@@ -173,17 +171,6 @@ class RobotModel:
     def steers(self) -> bool:
         """Return whether its front wheels steer, so that only the rear ones are driven."""
         return self.drive == "ackermann"
-
-    @property
-    def roller_axes(self) -> F64 | None:
-        """Return the axes (W, 3) that mecanum wheels drive about, in the robot's frame.
-
-        The rollers roll freely along the other diagonal of the contact. A unit of speed about an
-        axis is one of the wheel's. None for wheels without rollers.
-        """
-        if self.drive != "omnidirectional":
-            return None
-        return np.array([[1.0, 1, 0], [-1, 1, 0], [-1, 1, 0], [1, 1, 0]])
 
     @property
     def min_turning_radius_m(self) -> float:
@@ -269,7 +256,6 @@ def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
         accel_limit=ACCEL_LIMIT,
         speed_limit=(math.inf, math.inf),
         rest_z_m=REST_Z_M,
-        own=False,
     )
 
 
@@ -300,8 +286,7 @@ def design(robot: Robot, body: Body) -> RobotModel:
         wheel_radius_m=radius,
         contact_radius_m=radius,
         track_m=track,
-        turn_track_m=(track + (known.wheelbase_m if robot.drive == "omnidirectional" else 0.0))
-        * (robot.track_ratio or 1.0),
+        turn_track_m=track * (robot.track_ratio or 1.0),
         wheelbase_m=known.wheelbase_m,
         wheel_kg=wheel_kg,
         chassis_kg=mass - wheels * wheel_kg - len(casters) * caster_kg,
@@ -347,7 +332,8 @@ def measures(robot: Robot, body: Body) -> Measures:
     """Return a robot's measures; what its profile omits is estimated from its outline."""
     size = math.sqrt(body.length_m * body.width_m)
     height = robot.height_m or max(0.5 * size, 2.2 * (robot.wheel_radius_m or 0.0))
-    four = robot.drive != "differential"
+    # An action has no sideways speed, so an omnidirectional robot drives as a differential one.
+    four = robot.drive in ("skid_steer", "ackermann")
     casters = robot.casters_m
     if casters is None:
         ahead, x = 0.77 * body.length_m / 2, robot.axle_x_m

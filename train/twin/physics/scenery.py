@@ -316,14 +316,6 @@ def quaternion(yaw_rad: F64) -> F64:
     return stacked(np.cos(half), zero, zero, np.sin(half))
 
 
-def rotated(quat: F64, vector: F64) -> F64:
-    """Rotate vectors (..., 3) by unit quaternions (..., 4), w first."""
-    axis = quat[..., 1:]
-    across = 2 * np.cross(axis, vector)
-    turned: F64 = vector + quat[..., :1] * across + np.cross(axis, across)
-    return turned
-
-
 FAR_AWAY = (1e9, 1e9, 1.0, 0.0, 0.1, 0.1)  # of a shape that the beams pass over or under
 
 

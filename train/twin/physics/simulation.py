@@ -37,7 +37,7 @@ from restock.train.twin.physics.robot_model import (
     RobotModel,
     stand_in,
 )
-from restock.train.twin.physics.scenery import Lidar, Scenery, quaternion, rotated
+from restock.train.twin.physics.scenery import Lidar, Scenery, quaternion
 
 GRAVITY_MPS2 = 9.81
 _HISTORY = 5  # commands kept, or as many more as the longest latency takes
@@ -327,11 +327,6 @@ class Simulation(Stateful):
         self._wheels_m = robot.wheels_m
         self._wheel_qpos = np.array(self.handles.wheel_qpos)
         self._wheel_qvel = np.array(self.handles.wheel_qvel)
-        self._rollers = robot.roller_axes
-        if self._rollers is not None:  # ball joints: quaternions, and three speeds
-            self._wheel_qpos = (self._wheel_qpos[:, None] + np.arange(4)).ravel()
-            self._wheel_qvel = (self._wheel_qvel[:, None] + np.arange(3)).ravel()
-        self._rolled = np.zeros((num_envs, len(robot.wheels_m)))
         self._steering_qpos = np.array(self.handles.steering_qpos, np.int64)
         self._actuators = self.model.nu
         width = self._actuators + 3 * self.model.nmocap
@@ -437,7 +432,7 @@ class Simulation(Stateful):
         Returns whose bumper was pressed, (N,), and the accelerations at each substep (N, S, 3).
         """
         control = self._control
-        control[:, :, self.handles.actuators] = actuators
+        control[:, :, : self._actuators] = actuators
         touched = np.zeros(self.num_envs, np.bool_)
         if self.callback is None:
             parts = [(0, self.substeps)]
@@ -453,8 +448,6 @@ class Simulation(Stateful):
             pressed = (sensed[:, :, self.handles.bumper] > 0).any(axis=1)
             touched |= pressed
             self.time_s += (stop - start) * self.timestep_s
-            if self._rollers is not None and self.callback is not None:
-                self._rolled += self._turning() * ((stop - start) * self.timestep_s)
             records.append(sensed[:, :, self.handles.accelerometer])
             if self.callback is not None:
                 self.callback(self.body_state(records[-1].mean(axis=1), pressed))
@@ -473,7 +466,7 @@ class Simulation(Stateful):
             speed_mps=cos * vx + sin * vy,
             lateral_mps=-sin * vx + cos * vy,
             yaw_rate_radps=self.qvel[:, 5].copy(),
-            wheel_angle_rad=self.robot.by_side(self._wheel_angles()).copy(),
+            wheel_angle_rad=self.robot.by_side(self.qpos[:, self._wheel_qpos]).copy(),
             wheel_speed_radps=self.wheel_speeds().copy(),
             accel_mps2=accel,
             bumped=pressed,
@@ -500,22 +493,13 @@ class Simulation(Stateful):
     def _turning(self, ids: Ints | slice = slice(None)) -> F64:
         """Return the speeds (n, W) of the wheels, in rad/s."""
         spin: F64 = self.qvel[ids].take(self._wheel_qvel, axis=1)
-        if self._rollers is None:
-            return spin
-        quat = self.qpos[ids].take(self._wheel_qpos, axis=1).reshape(len(spin), -1, 4)
-        about = rotated(quat, spin.reshape(len(spin), -1, 3))
-        return np.asarray((about * self._rollers).sum(axis=-1))
-
-    def _wheel_angles(self) -> F64:
-        """Return how far the wheels (N, W) have turned, in rad."""
-        return self._rolled if self._rollers is not None else self.qpos[:, self._wheel_qpos]
+        return spin
 
     def roll(self, speed_mps: F64, yaw_rate_radps: F64) -> None:
         """Set the wheels' speeds to those for speeds (N,) and yaw rates (N,) of their own."""
         left, right = self.robot.wheel_commands(speed_mps, yaw_rate_radps)
         for wheel, dof in enumerate(self.handles.wheel_qvel):
-            # A mecanum wheel that has not turned yet turns about y.
-            self.qvel[:, dof + (self._rollers is not None)] = right if wheel % 2 else left
+            self.qvel[:, dof] = right if wheel % 2 else left
 
     def steer(self) -> None:
         """Set the front wheels of robots that steer to their controllers' angles."""
@@ -532,9 +516,6 @@ class Simulation(Stateful):
         ground = forward[:, None] - velocity[:, 5, None] * self._wheels_m[:, 1]
         aside = lateral[:, None] + velocity[:, 5, None] * self._wheels_m[:, 0]
         rim = self._turning(ids) * self.body.radius_m[ids, None]
-        if self._rollers is not None:  # across its free direction alone
-            slip = np.abs(ground - self._rollers[:, 0] * aside - rim) / np.sqrt(2)
-            return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
         if self.robot.steers:
             steering = self.qpos[ids].take(self._steering_qpos, axis=1)
             ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)

@@ -16,8 +16,7 @@ FRICTION = 0.8  # of the floor
 class RobotCommand:
     """Build the robot of a profile's [robot] in the twin, and test how it drives each action.
 
-    It also checks a MuJoCo model of your own (`mjcf`): missing parts are listed by name, and the
-    exit code is 2. See docs/robot.md.
+    See docs/robot.md.
 
     Example: `restock twin robot my_robot.toml`
     """
