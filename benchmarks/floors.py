@@ -19,14 +19,54 @@ from typing import Any
 import msgspec
 import numpy as np
 from harness import finish, markdown, option_parser
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from restock.errors import RestockError
+from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Body
+from restock.train.twin.floors.occupancy_grid import (
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    out_of_frame,
+)
+from restock.train.twin.survey.evidence import recorded_map
 from restock.train.twin.survey.survey import Surveyed, survey
 from restock.twin import EpisodeSpec, PlannerFollower, WarehouseVectorEnv
 
 MIN_ARRIVING = 0.5
+
+
+def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
+    """Return the intersection over union of two maps' occupied cells, within one cell.
+
+    A cell counts as shared where the other map has an occupied cell within one cell (of the coarser
+    of both, diagonals too). Of `known` only what lies where `made` knows something, or next to it,
+    counts. None where one of them has no walls there.
+    """
+    near_m = 1.5 * max(made.cell_m, known.cell_m)
+    mine, theirs = _walls(made), _walls(known)
+    seen = ndimage.binary_dilation(made.occupancy != UNKNOWN, np.ones((3, 3), np.bool_))
+    cells, inside = made.cells_at(theirs)
+    inside[inside] = seen[tuple(cells[inside].T)]
+    theirs = theirs[inside]
+    if not len(mine) or not len(theirs):
+        return None
+    # Cells may differ in size, and walls are lines: each counts by its length.
+    a, b = made.cell_m, known.cell_m
+    shared_mine = float((cKDTree(theirs).query(mine)[0] <= near_m).sum()) * a
+    shared_theirs = float((cKDTree(mine).query(theirs)[0] <= near_m).sum()) * b
+    shared = (shared_mine + shared_theirs) / 2
+    alone = len(mine) * a - shared_mine + len(theirs) * b - shared_theirs
+    return shared / (shared + alone)
+
+
+def _walls(grid: OccupancyGrid) -> np.ndarray:
+    """Return the centres (N, 2) of the occupied cells, in the map's frame."""
+    cells = np.argwhere(grid.occupancy == OCCUPIED)
+    return out_of_frame((cells + 0.5) * grid.cell_m, grid.origin)
 
 
 def drive(made: Surveyed, missions: int) -> Counter[str]:
@@ -55,12 +95,15 @@ def measure(path: Path, missions: int) -> dict[str, Any]:
         ends = drive(made, missions)
     except RestockError as error:
         return {"recording": path.stem, "made from": f"refused: {error.what}"}
-    agreement = made.agreement
+    agreement = None
     if made.by == "map":
         try:
-            agreement = survey(path, by="scans").agreement
+            with open_recording(path) as recording:
+                known = recorded_map(recording)
+            if known is not None:
+                agreement = walls_agreement(survey(path, by="scans").grid, known[0])
         except RestockError:
-            agreement = None  # no scans, or none that can be placed
+            pass  # no scans, or none that can be placed
     low, high = made.floor.way_m
     return {
         "recording": path.stem,

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.driven_robot import (
     Drive,
     columns,
@@ -33,7 +34,6 @@ from restock.cli.start.work import Work
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.propose import drives
 from restock.replay.store.store import Store
-from restock.train.twin.floors.floor_files import write_pgm
 from restock.train.twin.missions import DEFAULT_CONDITIONS
 
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
@@ -47,7 +47,7 @@ def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, capsys):
     """And its map of another frame stops it at the floor."""
     damaged = cut_bag(tmp_path / "bags" / "damaged")
     out, hall = tmp_path / "out", tmp_path / "hall.yaml"
-    write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
+    Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
     hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [200.0, -2.0, 0]\n")
     argv = (str(damaged), "--out", str(out), "--map", str(hall))
     code, document = start(capsys, *argv)
@@ -90,7 +90,7 @@ WHEEL = """<link name='{0}'><collision><geometry><cylinder radius='0.09' length=
 def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, capsys):
     urdf, hall, out = tmp_path / "cart.urdf", tmp_path / "hall.yaml", tmp_path / "out"
     urdf.write_text(CART.format(WHEEL.format("left", 0.22) + WHEEL.format("right", -0.22)))
-    write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
+    Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
     hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [-1.0, -1.0, 0]\n")
     topics = typed_topics(Drive(20.0))
     topics["/scan"][1].fields["ranges"].values[:] = np.inf  # returns would not lie on its walls

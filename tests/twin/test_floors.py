@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from packaging.version import Version
+from PIL import Image
 from scipy.sparse import csgraph
 
 import restock  # noqa: F401 - registers the environment
@@ -28,8 +29,6 @@ from restock.train.twin.floors.floor_files import (
     read_image,
     read_map,
     write_floor,
-    write_map,
-    write_pgm,
 )
 from restock.train.twin.floors.floors import (
     RECIPES,
@@ -82,22 +81,11 @@ def test_the_splits_share_no_floor() -> None:
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
 @settings(max_examples=6)
-def test_a_floor_survives_toml_and_an_occupancy_map(seed, kind, tmp_path_factory):
+def test_a_floor_survives_toml(seed, kind, tmp_path_factory):
     folder = tmp_path_factory.mktemp("floor")
     floor = replace(generate(seed, RECIPES[kind]), map_origin=(-3.0, 2.0, 0.5))
     write_floor(floor, folder / "floor.toml")
     assert read_floor(folder / "floor.toml") == floor
-    write_map(floor, folder / "map.yaml")
-    again = read_map(folder / "map.yaml")
-    assert (again.width_m, again.depth_m) == (floor.width_m, floor.depth_m)
-    np.testing.assert_array_equal(cells_of(again, 0.05), cells_of(floor, 0.05))
-    np.testing.assert_allclose(again.map_origin, floor.map_origin, atol=1e-9)
-    ruled = Planner(replace(floor, one_way=()))  # a map has no rules
-    mapped = Planner(again)
-    start = floor.segments[0].area.center
-    for goal in floor.goals[:: max(len(floor.goals) // 4, 1)]:
-        place = (float(goal[0]), float(goal[1]))
-        assert abs(mapped.distance_m(*start, place) - ruled.distance_m(*start, place)) < 0.3
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
@@ -113,7 +101,7 @@ def test_every_mode_of_a_map_reads_the_same_free_space(tmp_path, mode, negate):
         pixels = np.where(free, 254, 0)
         pixels[0, 0] = 205
         pixels = 255 - pixels if negate else pixels
-    write_pgm(tmp_path / "map.pgm", pixels.astype(np.uint8))
+    Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "map.pgm")
     (tmp_path / "map.yaml").write_text(
         f"image: map.pgm\nresolution: 0.1\norigin: [1.0, 2.0, 0.0]\nmode: {mode}\n"
         f"negate: {negate}\nfree_thresh: 0.25\noccupied_thresh: 0.65\n"
@@ -125,7 +113,7 @@ def test_every_mode_of_a_map_reads_the_same_free_space(tmp_path, mode, negate):
 
 
 def test_a_map_turned_by_its_origin_goes_back_to_the_map(tmp_path: Path) -> None:
-    write_pgm(tmp_path / "map.pgm", np.pad(np.full((40, 60), 254, np.uint8), 10))
+    Image.fromarray(np.pad(np.full((40, 60), 254, np.uint8), 10)).save(tmp_path / "map.pgm")
     (tmp_path / "map.yaml").write_text(
         f"image: map.pgm\nresolution: 0.1\norigin: [5.0, 0.0, {np.pi / 2}]\n"
     )

@@ -11,8 +11,6 @@ cannot affect the physics.
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,8 +18,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from restock.arrays import F64
+from restock.arrays import F64, Bools
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import (
     FORKLIFT_HALF_M,
@@ -34,6 +33,7 @@ from restock.train.twin.floors.layout import (
     Rect,
     Warehouse,
 )
+from restock.train.twin.floors.occupancy_grid import OCCUPIED, OccupancyGrid, into_frame
 from restock.train.twin.physics.model import RACK_HALF_HEIGHT_M, building_boxes
 from restock.train.twin.physics.robot_model import RobotModel
 
@@ -49,20 +49,32 @@ FORKLIFT, ICE, ROUTE, ROBOT, MAP_GOAL = (
     *((240, 130, 30), (30, 150, 60)),
 )
 AISLE, DOCK, ONE_WAY, MAP_WALL = (222, 232, 220), (250, 214, 150), (205, 70, 60), (70, 74, 80)
-FLOOR_PIXELS_PER_M, MAP_PIXELS_PER_M = 24, 40
+FLOOR_PIXELS, MAP_PIXELS_PER_M = 960, 40  # of a floor's longer side
 
 
-def draw_floor(floor: Warehouse) -> NDArray[np.uint8]:
-    """Draw racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, with walls."""
-    canvas = _Canvas(floor, FLOOR_PIXELS_PER_M)
+def draw_floor(
+    floor: Warehouse, grid: OccupancyGrid | None = None, driven_m: F64 | None = None
+) -> NDArray[np.uint8]:
+    """Draw racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, with walls.
+
+    Of a floor that was made from a `grid` its occupied cells are drawn too, and the places that the
+    robot drove through, `driven_m` (N, 2) in the map's frame.
+    """
+    canvas = _Canvas(floor, int(FLOOR_PIXELS / max(floor.width_m, floor.depth_m)))
     for color, areas in (
         (AISLE, [segment.area for segment in floor.segments]),
         (DOCK, [dock.area for dock in floor.docks]),
         (RACK, floor.racks),
-        (MAP_GOAL, [Rect(x - 0.06, y - 0.06, x + 0.06, y + 0.06) for x, y in floor.goals.tolist()]),
     ):
         for area in areas:
             canvas.fill(area, color)
+    if grid is not None:
+        canvas.cells(grid.occupancy == OCCUPIED, grid.cell_m, MAP_WALL)
+    if driven_m is not None:
+        for x, y in into_frame(driven_m, floor.map_origin).tolist():
+            canvas.disc(x, y, 0.03, ROBOT)
+    for x, y in floor.goals.tolist():
+        canvas.fill(Rect(x - 0.06, y - 0.06, x + 0.06, y + 0.06), MAP_GOAL)
     for rule in floor.one_way:
         canvas.arrow(*rule.area.center, HEADINGS[rule.heading], ONE_WAY)
     return canvas.pixels(wall=4)
@@ -114,6 +126,14 @@ class _Canvas:
         x0, y0, x1, y1 = (round(edge * self._scale) for edge in area.edges)
         self._image[y0:y1, x0:x1] = color
 
+    def cells(self, cells: Bools, cell_m: float, color: Pixel) -> None:
+        """Fill the pixels whose centres are in these cells (X, Y), from the south-west corner."""
+        column, row = (
+            np.minimum((at / cell_m).astype(np.int64), size - 1)
+            for at, size in zip((self._x, self._y), cells.shape, strict=True)
+        )
+        self._image[cells[np.ix_(column, row)].T] = color
+
     def box(
         self, x: float, y: float, half_x: float, half_y: float, yaw: float, color: Pixel
     ) -> None:
@@ -156,18 +176,8 @@ def _dense(plan_m: F64) -> F64:
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     """Write pixels (H, W, 3). Raises ConfigError if they cannot be written."""
-    height, width = image.shape[:2]
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        crc = zlib.crc32(kind + data)
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header)
-    data += chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)) + chunk(b"IEND", b"")
     try:
-        path.write_bytes(data)
+        Image.fromarray(image).save(path, format="PNG")
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
 

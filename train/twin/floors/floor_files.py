@@ -299,29 +299,6 @@ def occupancy_of(pixels: F64, description: MapDescription) -> NDArray[np.int8]:
     return np.ascontiguousarray(occupancy[::-1].T.astype(np.int8))
 
 
-def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
-    """Write a floor as `map.yaml` with a PGM beside it, walls as cells around it.
-
-    Raises:
-        ConfigError: it cannot be written there.
-    """
-    image = path.with_suffix(".pgm")
-    free = np.pad(cells_of(floor, cell_m), 1)  # a wall around it
-    x0, y0, yaw = floor.map_origin
-    cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
-    corner = (x0 - cell_m * (cos - sin), y0 - cell_m * (sin + cos), yaw)
-    text = (
-        f"image: {image.name}\nmode: trinary\nresolution: {cell_m}\n"
-        f"origin: [{', '.join(repr(float(value)) for value in corner)}]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
-    )
-    try:
-        write_pgm(image, np.where(free, 254, 0).astype(np.uint8).T[::-1])
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
-
-
 def read_image(path: Path) -> tuple[F64, NDArray[np.bool_]]:
     """Read shades (H, W) in [0, 1], top row first, and which pixels are opaque (H, W).
 
@@ -367,9 +344,3 @@ def read_image(path: Path) -> tuple[F64, NDArray[np.bool_]]:
         ) from error
     except (OSError, ValueError, SyntaxError, OverflowError) as error:
         raise ConfigError(f"cannot be read as an image: {error}", where=str(path)) from error
-
-
-def write_pgm(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write pixels (H, W) as P5."""
-    height, width = pixels.shape
-    path.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + pixels.tobytes())

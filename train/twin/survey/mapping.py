@@ -360,30 +360,6 @@ def way_between(places_m: F64) -> F64:
     return np.concatenate(parts)
 
 
-def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
-    """Return the intersection over union of two maps' occupied cells, within one cell.
-
-    A cell counts as shared where the other map has an occupied cell within one cell (of the coarser
-    of both, diagonals too). Of `known` only what lies where `made` knows something, or next to it,
-    counts. None where one of them has no walls there.
-    """
-    near_m = 1.5 * max(made.cell_m, known.cell_m)
-    mine, theirs = _wall_middles(made), _wall_middles(known)
-    seen = ndimage.binary_dilation(made.occupancy != UNKNOWN, np.ones((3, 3), np.bool_))
-    cells, inside = made.cells_at(theirs)
-    inside[inside] = seen[tuple(cells[inside].T)]
-    theirs = theirs[inside]
-    if not len(mine) or not len(theirs):
-        return None
-    # Cells may differ in size, and walls are lines: each counts by its length.
-    a, b = made.cell_m, known.cell_m
-    shared_mine = float((cKDTree(theirs).query(mine)[0] <= near_m).sum()) * a
-    shared_theirs = float((cKDTree(mine).query(theirs)[0] <= near_m).sum()) * b
-    shared = (shared_mine + shared_theirs) / 2
-    alone = len(mine) * a - shared_mine + len(theirs) * b - shared_theirs
-    return shared / (shared + alone)
-
-
 def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
     """Return the share of lidar returns within NEAR_M of an occupied cell of a map.
 

@@ -38,7 +38,6 @@ from restock.train.twin.survey.mapping import (
     driven_corridor,
     returns_on_walls,
     scan_map,
-    walls_agreement,
 )
 from restock.train.twin.survey.poses import Poses
 
@@ -68,7 +67,6 @@ class Surveyed:
     source: str  # in words
     footprint: Footprint
     poses: Poses | None = None
-    agreement: float | None = None  # of walls with those of the map that is there too
     notes: list[str] = field(default_factory=list)
     elsewhere: list[str] = field(default_factory=list)  # a store's recordings of other frames
 
@@ -86,8 +84,6 @@ class Surveyed:
         }
         if self.elsewhere:
             values["elsewhere"] = self.elsewhere
-        if self.agreement is not None:
-            values["walls_iou_with_map"] = round(self.agreement, 3)
         if self.poses is not None:
             free = self.grid.at(self.poses.places_m) == FREE
             values |= {
@@ -145,9 +141,6 @@ def survey(
     how, grid, source = _grid(evidence, by, body, str(path), notes)
     if body is None:
         body = _as_near_as_it_came(grid, poses) if how != "corridor" else STAND_IN
-    agreement = None
-    if how == "scans" and evidence.known is not None:
-        agreement = walls_agreement(grid, evidence.known[0])
     made = floor_of_grid(
         grid,
         name=path.stem if recording is None else f"{path.stem}: {Path(recording).stem}",
@@ -164,7 +157,7 @@ def survey(
             f"{len(elsewhere)} of {len(evidence.others)} other recordings are in other frames:"
             " their routes are not on this floor (--recording makes the floor of one)"
         )
-    return Surveyed(floor, made.grid, how, source, body, poses, agreement, notes, elsewhere)
+    return Surveyed(floor, made.grid, how, source, body, poses, notes, elsewhere)
 
 
 def _grid(
@@ -264,21 +257,6 @@ def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
     )
 
 
-def _apart(grid: OccupancyGrid, poses: Poses) -> str:
-    """Say how far the drive's centre is from that of a map's free floor."""
-    columns, rows = (np.flatnonzero(grid.free.any(axis=axis)) for axis in (1, 0))
-    if not len(columns):
-        return ""
-    middle = np.array([[columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]]) / 2 * grid.cell_m
-    free, drive = out_of_frame(middle, grid.origin)[0], np.median(poses.places_m, axis=0)
-    size = (len(columns) * grid.cell_m, len(rows) * grid.cell_m)
-    return (
-        f" (the middle of the drive is at {drive[0]:.1f}, {drive[1]:.1f} m,"
-        f" {np.hypot(*(drive - free)):.1f} m from the middle of {size[0]:.0f} x {size[1]:.0f} m of"
-        " free floor)"
-    )
-
-
 def _check_frames(
     grid: OccupancyGrid, poses: Poses | None, source: str, where: str, notes: list[str]
 ) -> None:
@@ -302,8 +280,8 @@ def _check_frames(
         frames = f"; the map is in frame {grid.frame!r}, they are in {poses.frame!r}"
     if off + walls + unknown > MAX_OFF:
         raise ConfigError(
-            f"{said}, and {int((found == FREE).sum()):,} on its free floor{_apart(grid, poses)}"
-            f"{frames}: it is not a map of these poses",
+            f"{said}, and {int((found == FREE).sum()):,} on its free floor{frames}: it is not a"
+            " map of these poses",
             where=f"{where}, {source}",
             remedy="give the map in which they were localised (--map map.yaml), or a --profile "
             "with a pose in the map's frame, or make the floor --by scans or --by corridor",

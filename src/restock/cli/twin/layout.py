@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from restock.train.twin.floors.layout import Warehouse
     from restock.train.twin.survey.survey import Surveyed
 
-MAPS = (".yaml", ".yml")
-
 
 @dataclass
 class LayoutCommand:
@@ -26,7 +24,7 @@ class LayoutCommand:
     occupancy map. With --from, the floor is made from a recording instead: from its map (or --map),
     or its scans, or the path that was driven. Missions then start and end where the robot was in
     the recording. --out writes the floor as TOML, for `restock train --set env.layouts=FILE.toml`,
-    or as map.yaml with a PGM. See docs/layouts.md.
+    or draws it. See docs/layouts.md.
 
         restock twin layout map.yaml --out hall.toml --out hall.png
         restock twin layout --from drive.mcap --out floor.toml --out floor.png
@@ -55,8 +53,8 @@ class LayoutCommand:
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     out: Annotated[tuple[Path, ...], Repeated("FILE")] = ()
-    """Write the floor to this file: FILE.toml, or map.yaml (and map.pgm beside it), or draw it from
-    above: FILE.png. May be given several times. Existing files are not overwritten."""
+    """Write the floor to FILE.toml, or draw it from above as FILE.png. May be given several times.
+    Existing files are not overwritten."""
     zones: Path | None = None
     """With --from: write the zones of the floor to this file, as [[zone]] tables for a profile, in
     the map frame."""
@@ -67,29 +65,27 @@ class LayoutCommand:
         """Print, and write what was asked for."""
         from restock.files import write_text
         from restock.train.twin.env.render import draw_floor, write_png
-        from restock.train.twin.floors.floor_files import write_floor, write_map
+        from restock.train.twin.floors.floor_files import write_floor
         from restock.train.twin.physics.episode import describe_floor
-        from restock.train.twin.survey.picture import write_picture
         from restock.train.twin.survey.survey import profile_zones
 
         written = self._to_write()
         floor, surveyed = self._floor()
         facts = describe_floor(floor)
         remarks: list[str] = []
+        drawn: tuple[Any, ...] = ()
         if surveyed is not None:
             if not facts["episodes"]:
                 surveyed.notes.append("no mission fits on this floor: the robot moved too little")
             facts = {**surveyed.facts(), **facts, "notes": surveyed.notes}
             remarks = [f"made from {surveyed.source}", *surveyed.notes]
+            poses = surveyed.poses
+            drawn = surveyed.grid, None if poses is None else poses.places_m
         for path in self.out:
-            if path.suffix in MAPS:
-                write_map(floor, path)
-            elif path.suffix == ".toml":
+            if path.suffix == ".toml":
                 write_floor(floor, path, remarks)
-            elif surveyed is not None:
-                write_picture(surveyed, path)
             else:
-                write_png(path, draw_floor(floor))
+                write_png(path, draw_floor(floor, *drawn))
         if self.zones is not None:
             write_text(self.zones, profile_zones(floor), exclusive=True)
         if self.json:
@@ -104,13 +100,12 @@ class LayoutCommand:
         from restock.files import expect_file_place
 
         for path in self.out:
-            if path.suffix not in (*MAPS, ".toml", ".png"):
-                what = f"{path.name!r} does not end in .toml, .yaml or .png"
+            if path.suffix not in (".toml", ".png"):
+                what = f"{path.name!r} does not end in .toml or .png"
                 raise RestockError(what, where="--out")
             expect_file_place(path, "--out")
         expect_file_place(self.zones, "--zones")
         written = [*self.out, *([self.zones] if self.zones is not None else [])]
-        written += [path.with_suffix(".pgm") for path in self.out if path.suffix in MAPS]
         for path in written:
             if path.exists():
                 raise RestockError(
