@@ -6,14 +6,13 @@ Every contender fills a batch of 256 rows of equal width from a million rows in 
 thread: uniformly, by quota, and by priority with weights and the update of the priorities. Figures
 are medians over rounds of CPU time, in which contenders take turns. Then: quotas over ten million
 rows, what a panel and its index cost to build, the record of what was fed as a share of an update,
-a cold panel in chunks beside one read at random, and the fresh ring. `--check` exits 1 where a
+and the fresh ring. `--check` exits 1 where a
 target of the design is missed. Libraries that are not installed are left out.
 """
 
 from __future__ import annotations
 
 import gc
-import os
 import sys
 import tempfile
 import time
@@ -41,7 +40,6 @@ from replay_contenders import (
     strata,
 )
 
-from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.packed_rows import row_width
 from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.sampler import QuotaSampler, uniform_sampler
@@ -175,62 +173,6 @@ def panel_build(count: int) -> dict[str, float]:
         return {"rows": len(table), "packed": len(panel), "rows_per_cpu_s": len(table) / elapsed}
 
 
-def cold_panel(count: int, batches: int) -> dict[str, float]:
-    """Measure rows a second of wall time of a panel on disk, read at random and in chunks.
-
-    The file is dropped from the page cache before each; where the system does not do that (as on
-    some virtual machines' own caches) both are faster than a disk.
-    """
-    width = row_width(OBSERVATION)
-    stratum_rows = strata(count)
-    disk = Path("/var/tmp")  # what /tmp lies on may be memory
-    with tempfile.TemporaryDirectory(dir=disk if disk.is_dir() else None) as folder:
-        path = Path(folder) / "rows.f32"
-        written = np.memmap(path, np.float32, "w+", shape=(count, width))
-        for begin in range(0, count, 65_536):
-            written[begin : begin + 65_536] = 1.0
-        written.flush()
-        del written
-        rows = np.memmap(path, np.float32, "r", shape=(count, width))
-        batch = np.empty((BATCH, width), np.float32)
-
-        def forget() -> None:
-            fd = os.open(path, os.O_RDONLY)
-            os.fsync(fd)
-            os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
-            os.close(fd)
-
-        forget()
-        at_random = quota_sampler(stratum_rows)
-        few = max(batches // 20, 10)
-        began = time.perf_counter()
-        for _ in range(few):
-            np.take(rows, at_random.draw()[0], axis=0, out=batch, mode="clip")
-        random_rows_per_s = few * BATCH / (time.perf_counter() - began)
-        del rows
-        rows = np.memmap(path, np.float32, "r", shape=(count, width))
-        forget()
-        # The natural mixture: with boosted strata most rows come from those held in memory.
-        shares = np.array([len(members) for members in stratum_rows]) / count
-        rng = np.random.default_rng(0)
-        chunked = ChunkedSampler(
-            rows, stratum_rows, shares, BATCH, rng, chunk_rows=8192, memory_bytes=128 << 20
-        )
-        began = time.perf_counter()
-        for _ in range(batches):
-            chunked.draw()
-            chunked.gather(batch)
-        chunked_rows_per_s = batches * BATCH / (time.perf_counter() - began)
-        chunked.close()
-    return {
-        "rows": count,
-        "file_mb": count * width * 4 / 2**20,
-        "random_rows_per_s": random_rows_per_s,
-        "chunked_rows_per_s": chunked_rows_per_s,
-        "chunked / random": chunked_rows_per_s / random_rows_per_s,
-    }
-
-
 def record_share(rounds: int, updates: int) -> dict[str, float]:
     """Measure an update of the default recipe with and without the record of what was fed."""
     from own_updates import Restock, config
@@ -323,7 +265,6 @@ SECTIONS: dict[str, Callable[[bool], dict[str, Any]]] = {
     "many_rows": lambda quick: ten_million(1_000_000 if quick else 10_000_000, *_turns(quick)),
     "panel_build": lambda quick: panel_build(20_000 if quick else 200_000),
     "record": lambda quick: record_share(*((5, 100) if quick else (15, 300))),
-    "cold_panel": lambda quick: cold_panel(*((200_000, 300) if quick else (1_000_000, 3000))),
     "fresh_ring": lambda quick: fresh_ring(500 if quick else 5000),
 }
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
+from restock.replay.sampling.sampler import QuotaSampler, uniform_sampler
 from restock.train.feed.batches import gather_rows
 
 Draw = Callable[[], None]
@@ -28,7 +28,7 @@ NATURAL = np.array([0.88, 0.05, 0.03, 0.02, 0.01, 0.005, 0.004, 0.001])  # of th
 class Packed:
     """Packed rows and a sampler: one draw and one gather."""
 
-    def __init__(self, rows: torch.Tensor, sampler: Sampler) -> None:
+    def __init__(self, rows: torch.Tensor, sampler: QuotaSampler) -> None:
         self.rows, self.sampler = rows, sampler
         self.batch = torch.empty(0)
 
@@ -63,7 +63,7 @@ class IndexSelected(Packed):
 class Prioritised(Packed):
     """The same with weights, and the update of the priorities of what was drawn."""
 
-    def __init__(self, rows: torch.Tensor, sampler: Sampler, errors: np.ndarray) -> None:
+    def __init__(self, rows: torch.Tensor, sampler: QuotaSampler, errors: np.ndarray) -> None:
         super().__init__(rows, sampler)
         sampler.update(np.arange(len(rows)), errors)
         self.errors = errors[:BATCH]

@@ -13,16 +13,13 @@ if TYPE_CHECKING:
     from restock.replay.fleet.store_difference import diff_stores as diff_stores
     from restock.replay.mixture.mixture import load_mixture as load_mixture
     from restock.replay.panel.build import build_panel as build_panel
-    from restock.replay.panel.iterable import PanelDataset as PanelDataset
     from restock.replay.panel.logged_sampler import sampler_for as sampler_for
     from restock.replay.panel.panel import Panel as Panel
-    from restock.replay.sampling.chunked import ChunkedSampler as ChunkedSampler
     from restock.replay.sampling.rules import RULES as RULES
     from restock.replay.sampling.rules import Rule as Rule
     from restock.replay.sampling.rules import StratumDraws as StratumDraws
     from restock.replay.sampling.rules import StratumRows as StratumRows
     from restock.replay.sampling.sampler import QuotaSampler as QuotaSampler
-    from restock.replay.sampling.sampler import Sampler as Sampler
     from restock.replay.store.audit import load_audits as load_audits
     from restock.replay.store.audit import load_thresholds as load_thresholds
     from restock.replay.store.audit import recommend_capacity as recommend_capacity

@@ -309,7 +309,6 @@ class Mixture(Checked, frozen=True):
     discount: Fraction = 0.99  # discount (gamma) per step
     n_step: AtLeastOne = 1  # steps of a logged row's return; ends with the episode, or the policy
     return_to_go: bool = False  # pack each row's discounted return to the end of its episode
-    sampling: Literal["memory", "chunked"] = "memory"  # chunked: for panels larger than memory
     evaluation_split: EvaluationSplit = EvaluationSplit()
     # Which rows may be drawn.
     where: str | None = None  # SQL predicate: only these transitions
@@ -348,14 +347,6 @@ class Mixture(Checked, frozen=True):
             "no strata: list some under [[strata]], or give [each_condition]",
         )
         _check_within(self.within)
-        rules: list[Mixture | EachCondition | StratumRule] = [self, *self.strata]
-        if self.each_condition is not None:
-            rules.append(self.each_condition)
-        _require(
-            self.sampling == "memory"
-            or all(rule.within in (None, "without_replacement") for rule in rules),
-            'sampling = "chunked" shuffles by itself: within must be "without_replacement"',
-        )
         names = [rule.name for rule in self.strata]
         _require(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")
         _require(not any("/" in name for name in names), "a stratum's name cannot contain a /")

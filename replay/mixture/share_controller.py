@@ -188,13 +188,6 @@ class ShareController(Stateful):
         total = max(sum(parts.values()), 1e-12)
         return {name: part * self._share_given / total for name, part in parts.items()}
 
-    @property
-    def strata_move(self) -> bool:
-        """Return whether `shares` follow the environment steps."""
-        portions = [s.rule.share for s in self.strata if not isinstance(s.rule.share, str)]
-        parts = list(self.mixture.sources.parts.values())
-        return any(map(knots, portions + (parts if len(parts) > 1 else [])))
-
     def at(self, env_steps: float, stock: F64 | None = None) -> bool:
         """Advance to the next online batch; return whether the shares changed.
 

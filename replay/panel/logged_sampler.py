@@ -3,7 +3,7 @@
     sampler = sampler_for(panel, 256, seed=0)
     batch = sampler.draw()                           # row numbers, strata, weights
     sampler.gather(batch.rows, out)                  # (B, W) float32
-    sampler.update(batch.rows, batch.strata, td_abs)  # once it was learnt from
+    sampler.update(batch.rows, td_abs)               # once it was learnt from
 
 The shares follow the mixture's schedules, a stratum's rows are drawn by its `within`, weights are
 those of the shares in force, and no row comes more often than `max_replays_per_row`.
@@ -29,9 +29,8 @@ from restock.replay.mixture.shares import stands_for_others
 from restock.replay.plan.plan import outcome_column
 from restock.replay.plan.strata import rules_of
 from restock.replay.plan.weights import WeightsInForce
-from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.rules import follow_td
-from restock.replay.sampling.sampler import QuotaSampler, Sampler
+from restock.replay.sampling.sampler import QuotaSampler
 from restock.state import Stateful
 
 if TYPE_CHECKING:
@@ -59,7 +58,6 @@ class LoggedSampler(Stateful):
         rows: (n, W) the packed rows.
         weights: importance weights of the rows: (n,), or those that follow the shares; None: ones.
         rng: of the replacements.
-        needs_td: whether priorities follow the TD errors given to `update`.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("sampler", "controller", "replays", "replaced", "_rng")
@@ -67,15 +65,14 @@ class LoggedSampler(Stateful):
     def __init__(
         self,
         controller: ShareController,
-        sampler: Sampler,
+        sampler: QuotaSampler,
         rows: F32,
         stratum_rows: Sequence[Ints],
         *,
         weights: WeightsInForce | F32 | None,
         rng: np.random.Generator,
-        needs_td: bool = False,
     ) -> None:
-        self.controller, self.sampler, self.needs_td = controller, sampler, needs_td
+        self.controller, self.sampler = controller, sampler
         self._rows, self._stratum_rows, self._weights = rows, list(stratum_rows), weights
         self.batch_size = sampler.batch_size  # of a draw that names no count
         if isinstance(weights, WeightsInForce):
@@ -86,15 +83,9 @@ class LoggedSampler(Stateful):
         if limit is not None:
             self.replays = np.zeros(len(rows), np.int32)
         self._budget: Ints = (limit or 0) * np.array([len(members) for members in stratum_rows])
-        self._swapped = False  # rows of the last batch, for the limit
         # Rows of each stratum that were replaced, for the limit.
         self.replaced: Ints = np.zeros(len(controller.shares), np.int64)
         self._rng = rng
-
-    @property
-    def reads_chunks(self) -> bool:
-        """Return whether `gather` must be asked for the rows: they are not in memory."""
-        return isinstance(self.sampler, ChunkedSampler)
 
     def move_to(self, env_steps: int, stock: F64 | None = None) -> bool:
         """Advance the shares to the next online batch; return whether they changed.
@@ -136,18 +127,16 @@ class LoggedSampler(Stateful):
         return None if self._weights is None else self._weights[rows]
 
     def gather(self, rows: Ints, out: F32) -> None:
-        """Copy the packed rows last drawn (L,) into `out` (L, W)."""
-        if (
-            not isinstance(self.sampler, ChunkedSampler)
-            or len(rows) < self.sampler.batch_size
-            or self._swapped
-        ):
-            np.take(self._rows, rows, axis=0, out=out, mode="clip")
-        else:
-            self.sampler.gather(out)
+        """Copy packed rows (L,) into `out` (L, W)."""
+        np.take(self._rows, rows, axis=0, out=out, mode="clip")
 
-    def update(self, rows: Ints, strata: Ints, td_abs: NDArray[Any]) -> None:
-        """Take |TD error| (n,) of rows (n,) of these strata (n,) that were just learnt from."""
+    @property
+    def needs_td(self) -> bool:
+        """Return whether draws follow the TD errors given to `update`."""
+        return follow_td(self.sampler.within)
+
+    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
+        """Take |TD error| (n,) of rows (n,) that were just learnt from."""
         self.sampler.update(rows, td_abs)
 
     def _follow(self) -> None:
@@ -167,7 +156,6 @@ class LoggedSampler(Stateful):
             raise RuntimeError("draws are not counted")
         np.add.at(replays, rows, 1)
         beyond = np.flatnonzero(replays[rows] > limit)
-        self._swapped = bool(len(beyond))
         if not len(beyond):
             return rows, strata, weight
         rows, strata = rows.copy(), strata.copy()
@@ -214,11 +202,6 @@ class LoggedSampler(Stateful):
         controller, full = self.controller, self.controller.drawn >= self._budget
         return bool(controller.shares[full].any()) and controller.logs_share > 0
 
-    def close(self) -> None:
-        """Close the file of a panel that is read in chunks."""
-        if isinstance(self.sampler, ChunkedSampler):
-            self.sampler.close()
-
     def describe(self) -> list[dict[str, Any]]:
         """Return a row a stratum, for the run's table `shares`."""
         replays = self.replays
@@ -249,27 +232,22 @@ def sampler_for(
         fresh: (S,) which strata rows of a ring beside the panel can be in; None: there is no ring.
 
     Raises:
-        MixtureError: rows too few for what is planned, where the mixture refuses that; too little
-            memory for a panel that is read in chunks.
+        MixtureError: rows too few for what is planned, where the mixture refuses that.
     """
     header = panel.header
     mixture, members = header.mixture, panel.stratum_rows()
     controller = controller_for(panel, planned or planned_by(mixture), logs_share, fresh)
     seeds = [seed] if isinstance(seed, int | np.integer) else seed
     rng = np.random.default_rng([*seeds, 2])
-    sampler: Sampler
-    if mixture.sampling == "chunked":
-        sampler = ChunkedSampler(panel.rows, members, controller.shares, batch_size, rng)
-    else:
-        sampler = QuotaSampler(
-            members,
-            controller.shares,
-            batch_size,
-            rng,
-            within=[stratum.within for stratum in panel.strata],
-            prioritised=mixture.prioritised,
-            column=panel.meta_column,
-        )
+    sampler = QuotaSampler(
+        members,
+        controller.shares,
+        batch_size,
+        rng,
+        within=[stratum.within for stratum in panel.strata],
+        prioritised=mixture.prioritised,
+        column=panel.meta_column,
+    )
     return LoggedSampler(
         controller,
         sampler,
@@ -277,7 +255,6 @@ def sampler_for(
         members,
         weights=_weights(panel),
         rng=np.random.default_rng([*seeds, 3]),
-        needs_td=needs_td(panel),
     )
 
 
@@ -313,11 +290,6 @@ def sampler_by_shares(
         weights=weights,
         rng=np.random.default_rng([seed, 3]),
     )
-
-
-def needs_td(panel: Panel) -> bool:
-    """Return whether draws from a panel follow the TD errors of what was drawn."""
-    return follow_td(stratum.within for stratum in panel.strata)
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:

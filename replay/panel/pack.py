@@ -34,7 +34,7 @@ from restock.replay.panel.scratch import SourceSteps
 from restock.replay.plan.candidates import any_order, as_stored, matrix, stretches
 from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
-from restock.replay.sampling.packed_rows import read_into, row_columns, row_width
+from restock.replay.sampling.packed_rows import row_columns, row_width
 
 BLOCK_ROWS = 512  # of packed rows, written together
 HELD_BYTES = 128 << 20  # of blocks that are not full, in memory at a time
@@ -127,7 +127,7 @@ class PackedFile:
             if self._put[number]:
                 if (writing := self._writing.pop(number, None)) is not None:
                     writing.result()
-                if not read_into(held, self._file, number * self._block_bytes):
+                if not _read_into(held, self._file, number * self._block_bytes):
                     raise PanelError("its written files are gone", where=str(self._path))
             self._held[number] = held
         return held
@@ -151,6 +151,17 @@ class PackedFile:
         while rest:  # a full disk is an OSError; what is written short goes on
             written = os.pwrite(self._file, rest, place)
             rest, place = rest[written:], place + written
+
+
+def _read_into(out: F32, file: int, at: int) -> bool:
+    """Fill `out` with what a file has from byte `at` on; False where it ends before that."""
+    rest = out.data.cast("B")
+    while rest:
+        got = os.preadv(file, [rest], at)
+        if got <= 0:
+            return False
+        rest, at = rest[got:], at + got
+    return True
 
 
 class _Stretches:

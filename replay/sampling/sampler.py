@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.sampling.rules import RULES, Prioritised, StratumDraws, StratumRows, follow_td
+from restock.replay.sampling.rules import RULES, Prioritised, StratumRows, follow_td
 from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time
@@ -49,39 +49,6 @@ def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
             remedy="give their absolute values",
         )
     return errors
-
-
-class Sampler(Protocol):
-    """What draws the rows of batches. `QuotaSampler` and `ChunkedSampler`."""
-
-    @property
-    def batch_size(self) -> int: ...
-
-    @property
-    def shares(self) -> F64:
-        """Return the share of each stratum, (S,)."""
-
-    @property
-    def drawn_weights(self) -> F32 | None:
-        """Importance weights (B,) that the batch last drawn needs; None for ones."""
-
-    def draw(self) -> tuple[Ints, Ints]:
-        """Draw row numbers (B,) and the stratum of each (B,)."""
-
-    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """Take |TD error| (n,) of rows (n,) that were just learnt from."""
-
-    def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Set the shares from the next batch on."""
-
-    def set_batch_size(self, batch_size: int) -> None:
-        """Change the batch size, from the next batch on."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all state that decides later draws: arrays and JSON values."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the draws to come where `state_dict` found them."""
 
 
 class Quotas(Stateful):
@@ -193,16 +160,27 @@ class Quotas(Stateful):
         self._carry = back.tolist()
 
 
-class BlockSampler(Stateful):
-    """Exact quotas per batch over strata, the rows of each by draws of its own.
+class QuotaSampler(Stateful):
+    """Exact quotas per batch over strata, the rows of each by a rule of RULES.
 
     Batches are drawn a block at a time and handed out one by one, which takes the cost of a draw
     from about that of the gather to a tenth of it; what is drawn ahead is part of `state_dict`.
 
     Args:
-        draws: of each stratum, (S,).
-        stratum_rows: the row numbers of each stratum, S arrays (n_s,).
-        block: batches drawn at a time.
+        stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty if
+            their share is 0.
+        shares: of each stratum, (S,), summing to 1.
+        batch_size: rows per draw.
+        rng: the generator of the draws; its state is part of `state_dict`.
+        within: the rule of all strata or of each, (S,).
+        prioritised: numbers of the rule "per".
+        column: gives a column of the panel's `meta`, for rules that ask for one.
+        block: batches drawn at a time; None: 64, or if a rule follows TD errors as many as a
+            sixteenth of the rows make, at least 8 and at most 128. 1 draws every batch from
+            priorities as they are.
+
+    Raises:
+        MixtureError: shares that are no distribution, or a share on an empty stratum.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("sizes", "within")
@@ -213,24 +191,40 @@ class BlockSampler(Stateful):
 
     def __init__(
         self,
-        draws: Sequence[StratumDraws],
-        stratum_rows: Sequence[Ints],
-        quotas: Quotas,
+        stratum_rows: Sequence[NDArray[Any]],
+        shares: Sequence[float] | F64,
+        batch_size: int,
         rng: np.random.Generator,
         *,
-        within: Sequence[str],
-        block: int,
+        within: str | Sequence[str] = "uniform",
+        prioritised: Prioritised | None = None,
+        column: Callable[[str], NDArray[Any]] = lambda name: np.empty(0),
+        block: int | None = None,
     ) -> None:
-        self.draws, self.within, self.block = list(draws), list(within), block
-        self.quotas, self.rng = quotas, rng
-        self._rows = list(stratum_rows)
-        self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
+        self._rows = [np.asarray(rows, np.int64) for rows in stratum_rows]
+        self.sizes: Ints = np.array([len(rows) for rows in self._rows], np.int64)
+        self.within = [within] * len(self.sizes) if isinstance(within, str) else list(within)
+        self.quotas, self.rng = Quotas(shares, batch_size, self.sizes), rng
+        self._follows_td = follow_td(self.within)
+        if block is None:
+            block = BLOCK
+            if self._follows_td:
+                block = min(max(int(self.sizes.sum()) // (16 * batch_size), MIN_BLOCK), MAX_BLOCK)
+        self.block = block
+        numbers = prioritised or Prioritised()
+        self.draws = [
+            RULES[name].draws(StratumRows(rows, rng, numbers, column))
+            for name, rows in zip(self.within, self._rows, strict=True)
+        ]
         self._batches = 0  # handed out
         self._next = 0  # of those drawn ahead
         none: Ints = np.zeros((0, self.batch_size), np.int64)
         self._ahead_rows, self._ahead_strata = none, none
         self._ahead_places = none  # within their strata
         self._ahead_weights: F32 | None = None
+        self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
+        if self._follows_td:
+            self._place_rows()
 
     @property
     def batch_size(self) -> int:
@@ -254,7 +248,14 @@ class BlockSampler(Stateful):
         return self._ahead_rows[self._next - 1], self._ahead_strata[self._next - 1]
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """Take the |TD error| (n,) of rows (n,) that were just learnt from."""
+        """Take the |TD error| (n,) of rows (n,) just learnt from: they count from the next block.
+
+        Raises:
+            MixtureError: a rule follows them, and one is negative or not finite, or they are not
+                one a row.
+        """
+        if self._follows_td:
+            self._learnt.append((np.array(rows), checked_errors(td_abs, rows).copy()))
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
         """Set other shares (S,) from the next batch on; what was drawn ahead goes back.
@@ -276,6 +277,7 @@ class BlockSampler(Stateful):
             self._ahead_rows, self._ahead_places, self._ahead_strata = none, none, none
 
     def _draw_block(self) -> None:
+        self._pass_on_errors()
         quota = self.quotas.take(self.block)  # (block, S)
         strata = np.tile(np.arange(len(self.sizes)), self.block)
         # All that a stratum gives to the block is taken at once, and dealt out in order.
@@ -319,65 +321,6 @@ class BlockSampler(Stateful):
         self._ahead_weights = None
         self._next = 0
 
-    def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Return the error for the state of a sampler over other strata."""
-        return MixtureError(
-            "the saved sampler drew from other strata, or by another rule",
-            remedy="resume with the panel and the settings the run began with",
-        )
-
-
-class QuotaSampler(BlockSampler):
-    """Exact quotas per batch over strata, the rows of each by a rule of RULES.
-
-    Args:
-        stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty if
-            their share is 0.
-        shares: of each stratum, (S,), summing to 1.
-        batch_size: rows per draw.
-        rng: the generator of the draws; its state is part of `state_dict`.
-        within: the rule of all strata or of each, (S,).
-        prioritised: numbers of the rule "per".
-        column: gives a column of the panel's `meta`, for rules that ask for one.
-        block: batches drawn at a time; None: 64, or if a rule follows TD errors as many as a
-            sixteenth of the rows make, at least 8 and at most 128. 1 draws every batch from
-            priorities as they are.
-
-    Raises:
-        MixtureError: shares that are no distribution, or a share on an empty stratum.
-    """
-
-    def __init__(
-        self,
-        stratum_rows: Sequence[NDArray[Any]],
-        shares: Sequence[float] | F64,
-        batch_size: int,
-        rng: np.random.Generator,
-        *,
-        within: str | Sequence[str] = "uniform",
-        prioritised: Prioritised | None = None,
-        column: Callable[[str], NDArray[Any]] = lambda name: np.empty(0),
-        block: int | None = None,
-    ) -> None:
-        members = [np.asarray(rows, np.int64) for rows in stratum_rows]
-        names = [within] * len(members) if isinstance(within, str) else list(within)
-        sizes = np.array([len(rows) for rows in members], np.int64)
-        quotas = Quotas(shares, batch_size, sizes)
-        self._follows_td = follow_td(names)
-        if block is None:
-            block = BLOCK
-            if self._follows_td:
-                block = min(max(int(sizes.sum()) // (16 * batch_size), MIN_BLOCK), MAX_BLOCK)
-        numbers = prioritised or Prioritised()
-        draws = [
-            RULES[name].draws(StratumRows(rows, rng, numbers, column))
-            for name, rows in zip(names, members, strict=True)
-        ]
-        super().__init__(draws, members, quotas, rng, within=names, block=block)
-        self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
-        if self._follows_td:
-            self._place_rows()
-
     def _place_rows(self) -> None:
         """Note the stratum of each row number and its place there, for `update`."""
         last = max((int(rows.max(initial=-1)) for rows in self._rows), default=-1)
@@ -386,20 +329,6 @@ class QuotaSampler(BlockSampler):
         for stratum, rows in enumerate(self._rows):
             self._stratum[rows] = stratum
             self._place[rows] = np.arange(len(rows))
-
-    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """Take the |TD error| (n,) of rows (n,) just learnt from: they count from the next block.
-
-        Raises:
-            MixtureError: a rule follows them, and one is negative or not finite, or they are not
-                one a row.
-        """
-        if self._follows_td:
-            self._learnt.append((np.array(rows), checked_errors(td_abs, rows).copy()))
-
-    def _draw_block(self) -> None:
-        self._pass_on_errors()
-        super()._draw_block()
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that decides the draws to come: arrays and JSON values."""
@@ -422,6 +351,13 @@ class QuotaSampler(BlockSampler):
             inside = stratum == index
             if inside.any():
                 draws.update(places[inside], errors[inside])
+
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Return the error for the state of a sampler over other strata."""
+        return MixtureError(
+            "the saved sampler drew from other strata, or by another rule",
+            remedy="resume with the panel and the settings the run began with",
+        )
 
 
 def _dealt(values: NDArray[Any], order: Ints) -> NDArray[Any]:

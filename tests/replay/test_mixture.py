@@ -64,7 +64,6 @@ def shares(plan: PanelPlan) -> dict[str, float]:
         ("max_rows_per_episode = 0\n" + EVERY, "max_rows_per_episode"),
         ("within = 'rank'\n" + EVERY, "within is 'rank': the rules are uniform"),
         (EVERY + "within = 'rank'", "within is 'rank'"),
-        ("sampling = 'chunked'\nwithin = 'per'\n" + EVERY, "without_replacement"),
         ("discount = 1.5\n" + EVERY, "discount"),
         ("seed = 'x'\n" + EVERY, "seed"),
         ("discount = 0.9", "no strata"),

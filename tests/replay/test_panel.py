@@ -341,7 +341,7 @@ def test_packing_gives_the_bytes_of_its_version(transitions, tmp_path):
         digest.update(json.dumps(table.drop_columns(["robot", "site"]).to_pydict()).encode())
     rows = hashlib.blake2b((panel.path / ROWS).read_bytes(), digest_size=16)
     packed = [PACKING_VERSION, rows.hexdigest(), digest.hexdigest()]
-    assert packed == [5, "8ef3c35f31805b369d555229e0ebe493", "f080192c7ae0da98c3f284b8cc6c0f18"]
+    assert packed == [6, "8ef3c35f31805b369d555229e0ebe493", "f080192c7ae0da98c3f284b8cc6c0f18"]
     assert panel.header.packing_version == PACKING_VERSION
 
 

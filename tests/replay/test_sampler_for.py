@@ -9,13 +9,11 @@ import pyarrow as pa
 import pytest
 import torch
 from support.stores import CONDITIONS, recording_transitions
-from torch.utils.data import DataLoader
 
 from restock.errors import MixtureError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
-from restock.replay.panel.iterable import PanelDataset
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.ring import FreshRing
@@ -37,7 +35,6 @@ MIXTURES = {
     "once": "max_replays_per_row = 1\nwithin = 'uniform'\n" + EVERY,
     "per": "within = 'per'\n" + EVERY,
     "limited per": "max_replays_per_row = 3\nwithin = 'per'\n" + EVERY,
-    "chunked": "max_replays_per_row = 3\nsampling = 'chunked'\n" + EVERY,
     "scheduled": EVERY + "[[strata]]\nname = 'nominal'\n"
     "share = {schedule = 'linear', start = 0.8, end = 0.2, to_env_steps = 1000}\n",
     "quota": EVERY + "[[strata]]\nname = 'wheel_slip'\nshare = 0.25\n",
@@ -72,29 +69,8 @@ def by_sampler(make: Callable[[Panel], LoggedSampler]) -> Way:
             sampler.gather(batch.rows, packed)
             np.testing.assert_array_equal(packed, panel.rows[batch.rows])
             yield Drawn(batch.rows, batch.strata)
-            sampler.update(batch.rows, batch.strata, learn(sampler, batch.rows, batch.strata))
+            sampler.update(batch.rows, learn(sampler, batch.rows, batch.strata))
             number += 1
-
-    return draw
-
-
-def by_dataset(workers: int) -> Way:
-    def draw(panel: Panel) -> Iterator[Drawn]:
-        limited = panel.header.mixture.max_replays_per_row is not None
-        dataset = PanelDataset(panel, BATCH, batches=8 if limited else 200, seed=0)
-        context = "fork" if workers else None
-        loader = DataLoader(
-            dataset, batch_size=None, num_workers=workers, multiprocessing_context=context
-        )
-        for epoch in range(10**9):
-            dataset.set_epoch(epoch)
-            batches = iter(loader)
-            try:
-                for batch in batches:
-                    yield Drawn(batch["row"].numpy(), batch["stratum"].numpy())
-            finally:  # collected as garbage, its workers are waited for, five seconds each
-                if workers:
-                    batches._shutdown_workers()
 
     return draw
 
@@ -137,13 +113,10 @@ def by_library(reported: bool) -> Way:
 
 WAYS: dict[str, Way] = {
     "sampler_for": by_sampler(lambda panel: sampler_for(panel, BATCH, seed=0)),
-    "PanelDataset": by_dataset(0),
-    "PanelDataset, 2 workers": by_dataset(2),
     "training": by_batches,
     "a library's buffer": by_library(True),
     "a library's buffer without TD errors": by_library(False),
 }
-NOT_TOLD = {"PanelDataset", "PanelDataset, 2 workers", "a library's buffer without TD errors"}
 
 
 @pytest.fixture(scope="module")
@@ -179,15 +152,10 @@ def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(panels, name, way)
             if len(batches) == 200:
                 break
     except MixtureError as error:
-        # A worker passes the text on alone.
-        refusal = str(error) if error.remedy or "workers" in way else ""
-    if name in FOLLOW_TD and way in NOT_TOLD:
+        refusal = str(error) if error.remedy else ""
+    if name in FOLLOW_TD and way == "a library's buffer without TD errors":
         assert "depend on TD errors" in refusal
         assert len(batches) <= 1
-        return
-    if name == "scheduled" and way.startswith("PanelDataset"):
-        assert "depend on environment steps" in refusal
-        assert not batches
         return
     # With a limit the rows end; without one they do not.
     if limit is not None:
@@ -229,37 +197,18 @@ def _check_shares(panel: Panel, name: str, way: str, batches: list[Drawn]) -> No
         assert np.abs(owed).max() < 2
 
 
-def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels):
-    for workers in (0, 2):
-        dataset = PanelDataset(panels("limited"), BATCH, batches=3, seed=0)
-        context = "fork" if workers else None
-        loader = DataLoader(
-            dataset, batch_size=None, num_workers=workers, multiprocessing_context=context
-        )
-        first = [batch["row"].tolist() for batch in loader]
-        with pytest.raises(MixtureError, match=r"(?s)pass 0 was given already.*set_epoch\(1\)"):
-            list(loader)
-        dataset.set_epoch(1)
-        assert [batch["row"].tolist() for batch in loader] != first
-    endless = PanelDataset(panels("limited"), BATCH, seed=0)
-    endless.set_epoch(1)
-    with pytest.raises(MixtureError, match="an endless data set cannot start another pass"):
-        next(iter(endless))
-
-
 def test_draws_of_a_panel_go_on_where_they_were_saved(panels):
-    for name in ("limited per", "chunked"):
-        panel = panels(name)
-        one, other = sampler_for(panel, BATCH, seed=1), sampler_for(panel, BATCH, seed=2)
+    panel = panels("limited per")
+    one, other = sampler_for(panel, BATCH, seed=1), sampler_for(panel, BATCH, seed=2)
 
-        def some(sampler: LoggedSampler, batches: int) -> list[list[int]]:
-            found = []
-            for _ in range(batches):
-                batch = sampler.draw()
-                sampler.update(batch.rows, batch.strata, learn(None, batch.rows, batch.strata))
-                found.append(batch.rows.tolist())
-            return found
+    def some(sampler: LoggedSampler, batches: int) -> list[list[int]]:
+        found = []
+        for _ in range(batches):
+            batch = sampler.draw()
+            sampler.update(batch.rows, learn(None, batch.rows, batch.strata))
+            found.append(batch.rows.tolist())
+        return found
 
-        some(one, 7)
-        other.load_state_dict(one.state_dict())
-        assert some(one, 20) == some(other, 20)
+    some(one, 7)
+    other.load_state_dict(one.state_dict())
+    assert some(one, 20) == some(other, 20)

@@ -1,6 +1,6 @@
 """Every sampler meets exact quotas over time and draws the same after a restart."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from scipy import stats
 from support.states import through_json
 
 from restock.errors import MixtureError
-from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.rules import EPSILON, Prioritised
 from restock.replay.sampling.sampler import Quotas, QuotaSampler
 from restock.train.run import checkpoint
@@ -26,7 +25,6 @@ RULES = {
     "in turns beside PER": ["without_replacement", "per"],
 }
 PER = Prioritised(per_alpha=0.7)
-WIDTH = 3  # of the rows that are read in chunks
 
 
 class Drawing:
@@ -47,40 +45,20 @@ class Drawing:
 Make = Callable[..., Drawing]  # seed, batch_size
 
 
-@pytest.fixture(params=["memory", "chunks"])
-def kind(request) -> str:
-    return str(request.param)
-
-
 @pytest.fixture(params=RULES)
 def way(request) -> str:
     return str(request.param)
 
 
 @pytest.fixture
-def make(kind: str, way: str, tmp_path) -> Iterator[Make]:
-    if kind == "chunks" and way != "in turns":
-        pytest.skip("rows read in chunks have their turns")
-    opened: list[ChunkedSampler] = []
-
+def make(way: str) -> Make:
     def made(seed: int = 0, batch_size: int = 50) -> Drawing:
         rng = np.random.default_rng(seed)
-        if kind == "chunks":
-            rows = np.memmap(tmp_path / "rows", np.float32, "w+", shape=(400, WIDTH))
-            memory = 200 * (4 * WIDTH + 16)
-            opened.append(
-                ChunkedSampler(
-                    rows, STRATA, SHARES, batch_size, rng, chunk_rows=40, memory_bytes=memory
-                )
-            )
-            return Drawing(opened[-1])
         return Drawing(
             QuotaSampler(STRATA, SHARES, batch_size, rng, within=RULES[way], prioritised=PER)
         )
 
-    yield made
-    for sampler in opened:
-        sampler.close()
+    return made
 
 
 def in_turns(way: str) -> list[np.ndarray]:
@@ -146,10 +124,6 @@ def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
             if index == 105:
                 drawing.sampler.set_batch_size(31)
             drawn, stratum, weights = drawing.draw()
-            if isinstance(drawing.sampler, ChunkedSampler):
-                out = np.empty((len(drawn), WIDTH), np.float32)
-                drawing.sampler.gather(out)
-                seen.append(out.tolist())
             seen += [drawn.tolist(), stratum.tolist()]
             seen.append(None if weights is None else weights.tolist())
             drawing.update(drawn, rng.uniform(0, 9, len(drawn)))

@@ -132,7 +132,7 @@ def test_no_row_is_drawn_more_often_than_it_may_be(table, tmp_path, within):
         assert counted.max() <= 9
         if len(batch.rows) < 64:
             break
-        draws.update(batch.rows, batch.strata, rng.random(64))
+        draws.update(batch.rows, rng.random(64))
     assert drawn == 9 * len(built)  # all of it was given before the end
     np.testing.assert_array_equal(draws.replays, counted)
     rows = draws.describe()
@@ -181,7 +181,7 @@ def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> 
         assert (post[built.stratum_code] & of_nominal).any()
         for _ in range(80):
             batch = draws.draw(64)
-            draws.update(batch.rows, batch.strata, 1.0 + 3 * (batch.strata == step + 1))
+            draws.update(batch.rows, 1.0 + 3 * (batch.strata == step + 1))
 
 
 def toy_logs(built: Panel) -> Logs:

@@ -109,23 +109,21 @@ def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path)
     assert_same_run(whole, resumed)
 
 
-@pytest.mark.parametrize("mixture", ["sampling = 'chunked'\n", "within = 'per'\n"])
-def test_panels_of_all_kinds_feed_blocks_as_they_feed_one_by_one(mixture, device, tmp_path):
-    """Read in chunks, their rows are sent; by priority, a draw follows the TD errors before it."""
-    text = f"discount = 0.9\n{mixture}[each_condition]\nshare = 'equal'\n"
+def test_priorities_feed_blocks_as_they_feed_one_by_one(device, tmp_path):
+    """A draw follows the TD errors before it."""
+    text = "discount = 0.9\nwithin = 'per'\n[each_condition]\nshare = 'equal'\n"
     table = recording_transitions(1, task=TASK)
     built = panel_of(table, text, tmp_path / "panel", task=TASK, conditions=CONDITIONS)
     changes = {"schedule": {"env_steps": 200, "warmup_env_steps": 40, "offline_updates": 40}}
     one = run_to_end(tmp_path / "one", config(**changes), logs=Logs.of_panel(built))
     live = in_blocks(tmp_path / "blocks", device, logs=Logs.of_panel(built), **changes)
-    assert live.batches.reads_chunks == ("chunked" in mixture)
-    assert live.batches.needs_td == ("per" in mixture)
+    assert live.batches.needs_td
     blocks = trained(live)
     fed, expected = tables(blocks.run.path)["audit"], tables(one.run.path)["audit"]
     of_logs = [table.filter(pc.equal(table["source"], "logs")) for table in (fed, expected)]
     rows = ["gradient_step", "batch_row", "row_hash", "transition_id", "reward"]
     assert len(of_logs[0]) == len(of_logs[1]) > 0
-    if device == "cpu" or not live.batches.needs_td:  # a GPU's priorities differ by rounding
+    if device == "cpu":  # a GPU's priorities differ by rounding
         assert of_logs[0].select(rows).equals(of_logs[1].select(rows))
 
 

@@ -113,11 +113,6 @@ class Batches(Stateful):
         """Return whether the next batch depends on the TD errors of the last."""
         return self._draws is not None and self._draws.needs_td
 
-    @property
-    def reads_chunks(self) -> bool:
-        """Return whether the logs' rows are read in chunks from disk."""
-        return self._draws is not None and self._draws.reads_chunks
-
     def describe(self) -> list[dict[str, Any]]:
         """Return rows for the run's table `shares`; none without logs."""
         return self._draws.describe() if self._draws is not None else []
@@ -189,7 +184,7 @@ class Batches(Stateful):
         """Update priorities and shares by the TD errors (B,) of a batch that was learnt from."""
         if self._draws is not None and self._draws.needs_td and batch.logged:
             td_abs = td[: batch.logged].detach().abs().cpu().numpy()
-            self._draws.update(batch.log_rows, batch.log_stratum, td_abs)
+            self._draws.update(batch.log_rows, td_abs)
 
     def _sample_fresh(self, count: int, env_steps: int) -> Ints:
         if self._max_age is None:
@@ -208,18 +203,11 @@ class Batches(Stateful):
         if drawn.weight is not None:
             weight = torch.ones(len(drawn.rows) + len(slots))
             weight[: len(drawn.rows)] = torch.from_numpy(drawn.weight)
-        read: Tensor | None = None
-        if self.reads_chunks and self._draws is not None and len(drawn.rows):
-            # They are at hand until the next draw.
-            read = torch.empty((len(drawn.rows), self._fresh.shape[1]))
-            self._draws.gather(drawn.rows, read.numpy())
 
         def gather() -> Tensor:
             logged = len(drawn.rows)
             rows = torch.empty(logged + len(slots), self._fresh.shape[1])
-            if read is not None:
-                rows[:logged] = read
-            elif self.logs is not None and logged:
+            if self.logs is not None and logged:
                 gather_rows(self.logs.rows, torch.from_numpy(drawn.rows), rows[:logged])
             if len(slots):
                 gather_rows(self._fresh, torch.from_numpy(slots), rows[logged:])

@@ -111,7 +111,7 @@ class Logs:
         Their ages are against `as_of_ns`, when training began; None: against their newest.
         """
         rows = np.asarray(panel.rows)
-        if rows.nbytes <= _IN_MEMORY_BYTES and panel.header.mixture.sampling == "memory":
+        if rows.nbytes <= _IN_MEMORY_BYTES:
             rows = np.array(rows)
         with warnings.catch_warnings():  # a read-only map is fine: nothing writes to it
             warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
@@ -132,11 +132,7 @@ class Logs:
             behaviour_policy=Coded.of(meta["behaviour_policy"]),
             behaviour_version=Coded.of(meta["behaviour_version"]),
             episode=Coded.of(meta["episode_id"]),
-            perturbation=Coded.of(
-                meta["perturbation"]
-                if "perturbation" in meta.column_names  # a panel from before has no such column
-                else pa.chunked_array([pa.nulls(len(meta), pa.string())])
-            ),
+            perturbation=Coded.of(meta["perturbation"]),
             panel=panel,
             planned=planned,
         )

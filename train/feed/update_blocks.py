@@ -79,9 +79,7 @@ class UpdateBlocks:
     ) -> None:
         self.learner, self.batches, self.imitation = learner, batches, imitation
         logs, ring = batches.logs, batches.ring
-        self._table: DeviceTable | None = None
-        if not batches.reads_chunks:
-            self._table = DeviceTable(None if logs is None else logs.rows, ring, learner.device)
+        self._table = DeviceTable(None if logs is None else logs.rows, ring, learner.device)
         self._logs = 0 if logs is None else len(logs)
 
         expert = log_terms.expert
@@ -90,9 +88,8 @@ class UpdateBlocks:
 
         self._updates = CapturedUpdates(
             learner,
-            None if self._table is None else self._table.rows,
+            self._table.rows,
             batch_size=config.replay.batch_size,
-            width=ring.rows.shape[1],
             longest=LONGEST,
             labelled=0 if imitation is None else imitation.batch_size,
             has_conservative=logs is not None and config.loss.conservative > 0,
@@ -134,8 +131,7 @@ class UpdateBlocks:
     def _launch(
         self, drawn: Sequence[ReplayBatch], conservative: float, labelled: bool, ahead: int
     ) -> Launched:
-        if self._table is not None:
-            self._table.follow()
+        self._table.follow()
         rows = [np.concatenate([batch.log_rows, self._logs + batch.slots]) for batch in drawn]
         ones = torch.ones(len(rows[0]))
         weight = [ones if batch.weight is None else batch.weight for batch in drawn]
@@ -148,7 +144,6 @@ class UpdateBlocks:
             )
         block = UpdateBlock(
             rows=torch.from_numpy(np.stack(rows)),
-            packed=torch.stack([batch.rows for batch in drawn]) if self._table is None else None,
             weight=torch.stack(weight),
             logged=torch.tensor([float(batch.logged) for batch in drawn]),
             conservative=torch.full((len(drawn),), conservative),
@@ -173,7 +168,6 @@ class UpdateBlock:
     """The inputs of K consecutive updates, on the host."""
 
     rows: Tensor  # (K, B) int64, of the table
-    packed: Tensor | None  # (K, B, W) float32 those rows, where the table is not on the device
     weight: Tensor  # (K, B) float32
     logged: Tensor  # (K,) float32: how many of the first rows are from logs
     conservative: Tensor  # (K,) float32
@@ -224,9 +218,8 @@ class CapturedUpdates:
 
     Args:
         learner: whose parameters move.
-        table: (n, W) float32 on its device, which blocks name rows of; None: they bring their rows.
+        table: (n, W) float32 on its device, which blocks name rows of.
         batch_size: B.
-        width: W.
         longest: K, of a block.
         labelled: M of the behaviour network's batches; 0: none.
         has_conservative: whether the CQL term may come in.
@@ -236,10 +229,9 @@ class CapturedUpdates:
     def __init__(
         self,
         learner: Learner,
-        table: Tensor | None,
+        table: Tensor,
         *,
         batch_size: int,
-        width: int,
         longest: int,
         labelled: int = 0,
         has_conservative: bool = False,
@@ -252,7 +244,6 @@ class CapturedUpdates:
         self._place = torch.arange(batch_size, device=device)
         self._cursor = torch.zeros(1, dtype=torch.int64, device=device)
         self._rows = torch.zeros(batch, dtype=torch.int64, device=device)
-        self._packed = torch.zeros((*batch, width) if table is None else 0, device=device)
         self._weight = torch.ones(batch, device=device)
         # Of each update: logged rows, weight of CQL, rates of the two averages.
         self._scalars = torch.zeros(longest, 4, device=device)
@@ -279,8 +270,6 @@ class CapturedUpdates:
         self._send(self._rows, block.rows)
         self._send(self._weight, block.weight)
         self._send(self._scalars, self._scalars_of(block, ahead))
-        if block.packed is not None:
-            self._send(self._packed, block.packed)
         if block.labelled is not None and self._labelled is not None:
             self._send(self._labelled.observation, block.labelled.observation)
             self._send(self._labelled.action, block.labelled.action)
@@ -317,7 +306,7 @@ class CapturedUpdates:
     def _one(self, labels: bool) -> None:
         """Make the update at the cursor."""
         row = self._now(self._rows)
-        rows = self._now(self._packed) if self.table is None else self.table.index_select(0, row)
+        rows = self.table.index_select(0, row)
         logged, conservative, rate, behaviour_rate = self._now(self._scalars).unbind()
         is_logged = self._place < logged
         expert = None if self._expert is None else self._expert[row]

@@ -257,7 +257,7 @@ class MixedFeed:
             self._td_missing = td is None
             if td is not None:
                 td_abs = np.abs(td[: len(drawing.rows)])
-                self._sampler.update(drawing.rows, drawing.strata, td_abs)
+                self._sampler.update(drawing.rows, td_abs)
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
             self._close_interval()  # an interval is of one phase

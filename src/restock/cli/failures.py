@@ -80,8 +80,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
     if package == "torch" and kind.__name__ == "OutOfMemoryError":
         return known(
             f"out of GPU memory: {first_line(error)}",
-            "use --device cpu, a smaller replay.ring_capacity, or a panel that is read in chunks"
-            ' (sampling = "chunked" in its mixture)',
+            "use --device cpu, a smaller replay.ring_capacity, or a panel of fewer rows",
         )
     if package in _REMEDIES or isinstance(error, OSError | UnicodeDecodeError):
         return known(first_line(error), _REMEDIES.get(package, _CHECK))
