@@ -87,7 +87,6 @@ SITUATIONS = {  # of a rare kind: exposure, and in how many steps, as in R's quo
 }
 MIXTURE = """
 n_step = 3
-return_to_go = true
 where = "{where}"
 evaluation_split = {{ by = "none" }}
 correction = {{ post = "none" }}

@@ -308,7 +308,6 @@ class Mixture(Checked, frozen=True):
     # How rows are packed.
     discount: Fraction = 0.99  # discount (gamma) per step
     n_step: AtLeastOne = 1  # steps of a logged row's return; ends with the episode, or the policy
-    return_to_go: bool = False  # pack each row's discounted return to the end of its episode
     evaluation_split: EvaluationSplit = EvaluationSplit()
     # Which rows may be drawn.
     where: str | None = None  # SQL predicate: only these transitions

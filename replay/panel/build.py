@@ -47,7 +47,6 @@ from restock.replay.panel.panel import (
     Panel,
     seal,
 )
-from restock.replay.panel.scratch import SourceSteps
 from restock.replay.plan.plan import AllStores, PanelPlan, PinnedStore, all_stores, plan_panel
 from restock.replay.sampling.packed_rows import PACKING_VERSION
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
@@ -343,12 +342,9 @@ def write_panel(
         scratch = partial / "scratch"
         scratch.mkdir()
         task_json = source.task_json(plan.task_hash)
-        steps = SourceSteps(
-            scratch,
-            plan.rows,
-            random_probability=_random_probability(task_json),
+        packer = Packer(
+            source.connection, plan, scratch, random_probability=_random_probability(task_json)
         )
-        packer = Packer(source.connection, plan, steps, scratch)
         size, record = _write_all(packer, partial, advance)
         identity = panel_id(source, plan, packer.digest())
         shutil.rmtree(scratch)

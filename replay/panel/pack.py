@@ -5,6 +5,17 @@ Observations are read in the order of the files and put at their places, because
 wide would first spill all of them to disk. A recording's rows are together in both orders, so a
 block is full soon after it was begun. A block that is full is hashed and written by other threads,
 while the next ones are filled.
+
+An n-step return of step t uses the rewards of [t, t + n) and bootstraps from the state at t + n. It
+is cut where the episode ends, where a step is missing, and before an off-policy action: step j's
+action is no part of the return of an earlier step where
+
+- another behaviour policy (or version) chose it than the step before: a handover;
+- its policy thought it less likely than chance (below 1 / number of actions): it explored.
+
+Such a cut looks at the action of j, which is chosen at the state that the return then bootstraps
+from: given that state it is independent of the rewards before it, so the cut adds no bias (it is
+the cut of Watkins's Q(lambda), 1989). It never looks at a reward or a state after j.
 """
 
 from __future__ import annotations
@@ -26,12 +37,11 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Ints
+from restock.arrays import F32, Bools, Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.panel import FileRecord, Leaves
-from restock.replay.panel.scratch import SourceSteps
-from restock.replay.plan.candidates import any_order, as_stored, matrix, stretches
+from restock.replay.plan.candidates import Places, any_order, as_stored, codes, matrix, stretches
 from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import row_columns, row_width
@@ -189,7 +199,7 @@ FINITE = (
     ' + reward)"'
 )
 # Of these hardly two rows have the same.
-_NO_DICTIONARY = ("transition_id", "stamp_ns", "logged_ns", "reward", "return_to_go")
+_NO_DICTIONARY = ("transition_id", "stamp_ns", "logged_ns", "reward")
 _SPLIT_COLUMNS = (
     "transition_id",
     "recording_id",
@@ -202,32 +212,74 @@ _SPLIT_COLUMNS = (
 )
 
 
+def going_on(rows: pa.Table, random_probability: float) -> Bools:
+    """Return whether the next row is part of what a row's return may sum over, (N,).
+
+    It is if it is the next step of the same episode, and the same policy chose its action without
+    exploring. `rows` (N) are META_COLUMNS in order. `random_probability` is that of an action
+    chosen blindly; below it a policy explores. 0: unknown.
+    """
+    # A row without a version is of the version "" of its policy.
+    version = pc.coalesce(rows["behaviour_version"].cast(pa.string()), "")
+    version = version.combine_chunks().dictionary_encode()
+    policy = codes(rows, "behaviour_policy").astype(np.int64)
+    policy = np.where(policy < 0, -1, policy * len(version.dictionary) + version.indices.to_numpy())
+    episode, step = codes(rows, "episode_id"), rows["step_index"].to_numpy()
+    ended = rows["terminated"].to_numpy() | rows["truncated"].to_numpy()
+    explored = rows["action_probability"].to_numpy() < random_probability
+    goes_on = np.zeros(len(rows), np.bool_)
+    goes_on[:-1] = (episode[1:] == episode[:-1]) & (step[1:] == step[:-1] + 1) & ~ended[:-1]
+    goes_on[:-1] &= (policy[1:] == policy[:-1]) & ~explored[1:]
+    return goes_on
+
+
+def n_step_horizon(continues: Bools, n_step: int) -> Ints:
+    """Return how many steps each row's return spans, (N,) in 1..n_step.
+
+    `continues` (N,) is as `going_on` gives it.
+    """
+    horizon = np.ones(len(continues), np.int64)
+    unbroken = np.ones(len(continues), np.bool_)
+    for ahead in range(1, min(n_step, len(continues) + 1)):
+        # Row i reaches i + ahead if it reached i + ahead - 1 and that one continues.
+        step = np.zeros(len(continues), np.bool_)
+        step[: len(continues) - ahead + 1] = continues[ahead - 1 :]
+        unbroken &= step
+        horizon += unbroken
+    return horizon
+
+
 class Packer:
-    """Packs one plan. `steps` are those of the source, in the order of the plan."""
+    """Packs one plan; `random_probability` as `going_on` takes it."""
 
     def __init__(
         self,
         connection: duckdb.DuckDBPyConnection,
         plan: PanelPlan,
-        steps: SourceSteps,
         scratch: Path,
+        *,
+        random_probability: float,
     ) -> None:
-        self.connection, self.plan, self.steps = connection, plan, steps
+        self.connection, self.plan = connection, plan
         self.mixture: Mixture = plan.mixture
+        self._ids: Ints = plan.rows["transition_id"].to_numpy()
+        self._reward: F32 = plan.rows["reward"].to_numpy()
         count = len(plan.weight)
         # Of each packed row: its place in the source, and that of the last step of its return.
         self.chosen: Ints = np.memmap(scratch / "chosen", np.int64, "w+", shape=(count,))
         self.last: Ints = np.memmap(scratch / "last", np.int64, "w+", shape=(count,))
         at = 0
         for begin, end, rows in self._stretches():
-            horizon = steps.horizon(begin, end, self.mixture.n_step)[rows]
+            # With the rows behind, as far as a return can reach.
+            part = plan.rows.slice(begin, end - begin + self.mixture.n_step)
+            horizon = n_step_horizon(going_on(part, random_probability), self.mixture.n_step)[rows]
             self.chosen[at : at + len(rows)] = begin + rows
             self.last[at : at + len(rows)] = begin + rows + horizon - 1
             at += len(rows)
 
     def _stretches(self) -> Iterator[tuple[int, int, Ints]]:
         """Yield stretches of the source, and which of their rows are packed."""
-        for begin, end in stretches(self.steps.rows):
+        for begin, end in stretches(len(self.plan.rows)):
             yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
 
     def digest(self) -> str:
@@ -239,7 +291,7 @@ class Packer:
             for digest, values in zip(
                 digests,
                 (
-                    self.steps.ids[self.chosen[packed]],
+                    self._ids[self.chosen[packed]],
                     self.plan.stratum[begin + rows],
                     self.last[packed] - self.chosen[packed],
                     self.plan.weight[packed],
@@ -261,7 +313,7 @@ class Packer:
         at_a_time = max(BATCH_BYTES // (8 * size), 1)
         names = "transition_id, action, terminated, observation, next_observation"
         query = f"SELECT {names} {of_task}"
-        places = self.steps.places()
+        places = Places(self._ids)
         # Two halves of a row: what is observed and done, and what comes of it.
         with (
             PackedFile(path, len(self.chosen), row_width(size), parts=2) as rows,
@@ -285,7 +337,7 @@ class Packer:
         returns = np.zeros(len(batch))
         for ahead in range(int(horizon.max(initial=0))):
             reach = packed[horizon > ahead]
-            reward = self.steps.reward[place[reach] + ahead]
+            reward = self._reward[place[reach] + ahead]
             returns[reach] += self.mixture.discount**ahead * reward
         rows.put(
             target,
@@ -332,9 +384,6 @@ class Packer:
                 column = pa.DictionaryArray.from_arrays(np.zeros(len(part), np.int8), split_by)
                 write(part.append_column("split_by", column))
         names = pa.array([line.name for line in self.plan.strata], pa.string())
-        to_go = None
-        if self.mixture.return_to_go:
-            to_go = self.steps.returns_to_go(self.mixture.discount)
         with _writer(meta) as write:
             for packed in _groups(len(self.chosen), stop):
                 chosen = np.asarray(self.chosen[packed])
@@ -346,9 +395,6 @@ class Packer:
                     "weight": pa.array(self.plan.weight[packed]),
                     **{name: pa.array(v[packed]) for name, v in self.plan.beside.items()},
                 }
-                if to_go is not None:
-                    beside["return_to_go"] = pa.array(to_go[0][chosen])
-                    beside["return_to_go_whole"] = pa.array(to_go[1][chosen])
                 for name, values in beside.items():
                     part = part.append_column(name, values)
                 write(part)

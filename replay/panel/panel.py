@@ -341,8 +341,7 @@ class Panel:
         Columns: transition_id, recording_id, episode_id, step_index, stamp_ns, logged_ns,
         condition, zone, behaviour_policy, behaviour_version, action_probability, action, reward (of
         one step), terminated, truncated, perturbation, stratum, stratum_code (its index in
-        `strata`), horizon, weight. If the mixture asks for it: return_to_go and return_to_go_whole
-        (whether it ran to a termination). If shares move: what their weights need (state_code,
+        `strata`), horizon, weight. If shares move: what their weights need (state_code,
         probability_of_…).
         """
         if self._meta is None:
@@ -378,20 +377,6 @@ class Panel:
     def weights(self) -> F32:
         """Return each row's importance weight, (n,), with mean 1 over what the quotas draw."""
         return np.asarray(self.meta_column("weight"), np.float32)
-
-    @property
-    def return_to_go(self) -> F32:
-        """Return discounted rewards to the end of each row's episode, (n,).
-
-        Raises PanelError where the mixture did not ask for it.
-        """
-        if not self.header.mixture.return_to_go:
-            raise PanelError(
-                "it contains no return-to-go",
-                where=str(self.path),
-                remedy="set `return_to_go = true` in the mixture and mix again",
-            )
-        return np.asarray(self.meta_column("return_to_go"), np.float32)
 
     def stratum_rows(self) -> list[Ints]:
         """Return the row numbers of each stratum, in order of `strata`."""

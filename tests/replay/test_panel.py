@@ -12,8 +12,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.panels import panel_of
 from support.stores import CONDITIONS, TASK, manifest, recording_transitions, write_store
 
@@ -23,11 +21,10 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, load_mixture, parse_mixture
-from restock.replay.panel import build, pack, scratch
+from restock.replay.panel import build, pack
 from restock.replay.panel import panel as panel_module
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import ROWS, Panel
-from restock.replay.panel.scratch import n_step_horizon, n_step_return
 from restock.replay.plan import candidates
 from restock.replay.sampling.packed_rows import PACKING_VERSION, row_width
 from restock.replay.store.store import Store
@@ -57,7 +54,7 @@ def test_packed_rows_are_those_of_a_naive_reading(transitions, tmp_path, n_step)
     shuffled = transitions.take(pa.array(order)).filter(
         pa.array(transitions["transition_id"].to_numpy()[order] != (2 << 25) + 40)
     )
-    mixture = uniform(n_step=n_step, discount=0.9, return_to_go=True)
+    mixture = uniform(n_step=n_step, discount=0.9)
     panel = build_panel(shuffled, mixture, tmp_path / "p", task=TASK)
     assert len(panel) == len(transitions) - 1
     episodes = by_episode(shuffled)
@@ -82,14 +79,6 @@ def test_packed_rows_are_those_of_a_naive_reading(transitions, tmp_path, n_step)
         np.testing.assert_allclose(
             packed[part["discount"]], 0.9 ** len(span) * (not span[-1]["terminated"]), rtol=1e-6
         )
-        to_go = [episode[at]]
-        while to_go[-1] is not episode[-1] and (
-            episode[at + len(to_go)]["step_index"] == span[0]["step_index"] + len(to_go)
-        ):
-            to_go.append(episode[at + len(to_go)])
-        expected = sum(0.9**k * row["reward"] for k, row in enumerate(to_go))
-        assert meta["return_to_go"] == pytest.approx(expected, abs=1e-4)
-        assert meta["return_to_go_whole"] == to_go[-1]["terminated"]
 
 
 def handed_over(table: pa.Table) -> pa.Table:
@@ -107,15 +96,8 @@ def handed_over(table: pa.Table) -> pa.Table:
 
 def test_returns_stop_at_a_handover(tmp_path):
     table = handed_over(recording_transitions(1, episodes=1))
-    panel = build_panel(table, uniform(n_step=4, return_to_go=True, discount=1.0), tmp_path / "p")
+    panel = build_panel(table, uniform(n_step=4), tmp_path / "p")
     assert panel.meta["horizon"].to_pylist()[:6] == [4, 4, 3, 2, 1, 4]
-    reward = table["reward"].to_numpy()
-    assert panel.return_to_go[0] == pytest.approx(float(reward[:5].sum()), abs=1e-4)
-    assert panel.return_to_go[5] == pytest.approx(float(reward[5:].sum()), abs=1e-4)
-    whole = [False] * 5 + [True] * (len(table) - 5)
-    assert panel.meta["return_to_go_whole"].to_pylist() == whole
-    with pytest.raises(PanelError, match="no return-to-go"):
-        _ = build_panel(table, uniform(), tmp_path / "q").return_to_go
 
 
 def test_returns_stop_before_an_action_less_likely_than_chance(tmp_path):
@@ -137,10 +119,9 @@ def test_small_stretches_and_batches_pack_the_same_bytes(tmp_path, monkeypatch, 
     table = pa.concat_tables(tables)  # some 9,000 rows, more than DuckDB gives at a time
     if not whole_file:
         table = table.take(pa.array(np.random.default_rng(0).permutation(len(table))))
-    mixture = uniform(n_step=5, return_to_go=True, by="episode")
+    mixture = uniform(n_step=5, by="episode")
     at_once = build_panel(table, mixture, tmp_path / "a", task=TASK)
     for module, name, value in (
-        (scratch, "STRETCH", 64),
         (candidates, "STRETCH", 64),
         (candidates, "BATCH_ROWS", 2048),
         (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
@@ -174,26 +155,6 @@ def test_a_row_that_is_no_number_is_refused(transitions, tmp_path):
         build_panel(table, uniform(), tmp_path / "p")
     where = str(caught.value).split('where = "')[1].split('"')[0]
     assert len(build_panel(table, uniform(where=where), tmp_path / "p")) == len(table) - 1
-
-
-@settings(max_examples=100)
-@given(
-    continues=st.lists(st.booleans(), min_size=1, max_size=40),
-    n_step=st.integers(1, 45),
-    discount=st.floats(0, 1),
-)
-def test_horizons_and_returns_follow_their_definition(continues, n_step, discount):
-    going_on = np.array([*continues[:-1], False])
-    reward = np.random.default_rng(0).normal(size=len(going_on)).astype(np.float32)
-    horizon = n_step_horizon(going_on, n_step)
-    returns = n_step_return(reward, horizon, discount)
-    for row in range(len(going_on)):
-        steps = 1
-        while steps < n_step and going_on[row + steps - 1]:
-            steps += 1
-        assert horizon[row] == steps
-        expected = sum(discount**k * float(reward[row + k]) for k in range(steps))
-        assert returns[row] == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_store_and_the_same_table_pack_the_same_rows(transitions, store_path, tmp_path):
@@ -320,7 +281,6 @@ def test_a_killed_build_leaves_nothing_in_the_way(transitions, tmp_path):
 GOLDEN = """
 n_step = 3
 uncertain = "keep"
-return_to_go = true
 evaluation_split = {by = "episode", share = 0.2}
 [correction]
 pre = "full"
@@ -341,7 +301,7 @@ def test_packing_gives_the_bytes_of_its_version(transitions, tmp_path):
         digest.update(json.dumps(table.drop_columns(["robot", "site"]).to_pydict()).encode())
     rows = hashlib.blake2b((panel.path / ROWS).read_bytes(), digest_size=16)
     packed = [PACKING_VERSION, rows.hexdigest(), digest.hexdigest()]
-    assert packed == [6, "8ef3c35f31805b369d555229e0ebe493", "f080192c7ae0da98c3f284b8cc6c0f18"]
+    assert packed == [6, "8ef3c35f31805b369d555229e0ebe493", "35aac5b0b670221e5b2602639b4f2d7b"]
     assert panel.header.packing_version == PACKING_VERSION
 
 
@@ -399,7 +359,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.plan import candidates
 from restock.replay.store.store import Store
 
-text = "n_step = 3\\nreturn_to_go = true\\nevaluation_split = {by = 'none'}\\n[each_condition]"
+text = "n_step = 3\\nevaluation_split = {by = 'none'}\\n[each_condition]"
 mixture = parse_mixture(text)
 with Store(sys.argv[1], memory_limit="110MB") as store:
     store.sql("SET threads = 1")
