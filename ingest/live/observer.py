@@ -3,8 +3,7 @@
 A recording is read in columns, and all its steps are made at once. On a robot there are only the
 last few messages of each topic and the current tick. Both use the same holds, fills and
 `restock.ingest.task.task.observe`; only the source of the columns differs. `LiveClock` computes
-from the messages so far what `align` computes from a whole recording: the median offset or, if the
-clocks drift, a line through the delays of the last seconds.
+from the last messages what `align` computes from a whole recording: the median offset.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, j
 from restock.ingest.profile.profile import Profile, not_live
 from restock.ingest.profile.signal_paths import conventions_of, element_of
 from restock.ingest.profile.tables import Input
-from restock.ingest.steps.align import NS, TOLERANCE_S, ClockSegment, Samples
+from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.steps.clocks import JUMP_S, WINDOW_NS, ClockMap, median
+from restock.ingest.steps.clocks import JUMP_S, ClockMap, median
 from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
@@ -34,11 +33,6 @@ from restock.ingest.task.task_sql import Past
 from restock.ingest.task.tracks import Tracker
 
 _DELAYS = 200  # of each topic, of which the median counts
-_MINUTES = 10  # over which drift is looked for
-_PACE_NS = 4_000_000_000  # of the messages that say how fast the offset grows
-_LEVEL_NS = 300_000_000  # … and of those that say where it is
-_MOMENT_NS = 100_000_000
-_FEWEST = 4  # messages that either takes at least
 
 
 class LiveClock:
@@ -49,128 +43,33 @@ class LiveClock:
 
     def __init__(self, jump_ns: int) -> None:
         self._jump_ns = jump_ns
-        self._topics: dict[str, _Delays] = {}
-        self._line: tuple[int, int, float] | None = None  # log time, offset there, its growth
-        self._fitted = False  # to every message
+        self._delays_ns: dict[str, deque[int]] = {}  # log time less stamp, by topic
+        self._offset_ns: int | None = 0  # None: to be computed
 
     def receive(self, topic: str, log_time_ns: int, stamp_ns: int) -> bool:
         """Return whether a message is on the clock; one that is also sets it."""
         if not self.agrees(log_time_ns, stamp_ns):
             return False
-        self._topics.setdefault(topic, _Delays()).add(log_time_ns, log_time_ns - stamp_ns)
-        self._fitted = False
+        delays = self._delays_ns.setdefault(topic, deque(maxlen=_DELAYS))
+        delays.append(log_time_ns - stamp_ns)
+        self._offset_ns = None
         return True
 
     def agrees(self, log_time_ns: int, stamp_ns: int) -> bool:
-        """Return whether a stamp is near the clock; any is before the first message.
+        """Return whether a stamp is near the clock; any is before the first message."""
+        away_ns = abs(log_time_ns - stamp_ns - self.offset_ns)
+        return not self._delays_ns or away_ns <= self._jump_ns
 
-        A recent clock is accurate enough for that: fitting it to every message would take longer.
+    @property
+    def offset_ns(self) -> int:
+        """Return log time less the robot's time: that of the topic with the least delay.
+
+        It is 0 before the first message.
         """
-        if not self._topics:
-            return True
-        line = self._line
-        if line is None or abs(log_time_ns - line[0]) > _MOMENT_NS:
-            line = self._fit()
-        return abs(log_time_ns - stamp_ns - _at(line, log_time_ns)) <= self._jump_ns
-
-    def offset_ns(self, log_time_ns: int) -> int:
-        """Return log time less the robot's time at this log time; 0 before the first message.
-
-        It is that of the topic with the least delay.
-        """
-        if not self._topics:
-            return 0
-        line = self._line if self._fitted else None
-        return _at(line or self._fit(), log_time_ns)
-
-    @property
-    def drifts(self) -> bool:
-        """Return whether the clocks drifted apart by more than `align` tolerates."""
-        return self._reference.drift_ns > round(TOLERANCE_S * NS)
-
-    @property
-    def _reference(self) -> _Delays:
-        """Return the delays of the topic with most messages."""
-        return max(self._topics.values(), key=lambda delays: delays.count)
-
-    def _fit(self) -> tuple[int, int, float]:
-        """Draw the line through the messages so far."""
-        topics, growth = self._topics.values(), 0.0
-        now_ns = max(delays.newest_ns for delays in topics)
-        if self.drifts:
-            growth = self._reference.growth()
-            heard = [delays for delays in topics if now_ns - delays.newest_ns <= _PACE_NS]
-            offset_ns = min(delays.at_ns(now_ns, growth) for delays in heard)
-        else:
-            offset_ns = min(delays.median_ns for delays in topics)
-        self._line, self._fitted = (now_ns, offset_ns, growth), True
-        return self._line
-
-
-def _at(line: tuple[int, int, float], log_time_ns: int) -> int:
-    at_ns, offset_ns, growth = line
-    return offset_ns + round(growth * (log_time_ns - at_ns))
-
-
-class _Delays:
-    """Log time less stamp of one topic's last messages."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._log_ns: deque[int] = deque(maxlen=_DELAYS)
-        self._delay_ns: deque[int] = deque(maxlen=_DELAYS)
-        # Latency only ever adds to the offset: each second's least delay shows how that drifts.
-        self._least_ns: deque[int] = deque(maxlen=60 * _MINUTES)
-        self._second = -1
-        self.drift_ns = 0
-
-    def add(self, log_time_ns: int, delay_ns: int) -> None:
-        self.count += 1
-        self._log_ns.append(log_time_ns)
-        self._delay_ns.append(delay_ns)
-        # The median of the last three: a single bad stamp is none of it.
-        lately = median(np.array(list(self._delay_ns)[-3:], np.int64))
-        second = log_time_ns // WINDOW_NS
-        if second == self._second:
-            self._least_ns[-1] = min(self._least_ns[-1], lately)
-            return
-        self._second = second
-        if len(self._least_ns) > 1:
-            values = np.array(self._least_ns, np.int64)
-            low, high = np.percentile(values - values[0], [5, 95])
-            self.drift_ns = int(high - low)
-        self._least_ns.append(lately)
-
-    @property
-    def newest_ns(self) -> int:
-        return self._log_ns[-1]
-
-    @property
-    def median_ns(self) -> int:
-        return median(np.array(self._delay_ns, np.int64))
-
-    def growth(self) -> float:
-        """Return the seconds by which the delay grows per second, between two halves."""
-        log, delay = self._recent(_PACE_NS)
-        half = len(log) // 2
-        if not half:
-            return 0.0
-        apart = np.median(log[half:]) - np.median(log[:half])
-        grown = np.median(delay[half:]) - np.median(delay[:half])
-        return float(grown / apart) if apart > 0 else 0.0
-
-    def at_ns(self, log_time_ns: int, growth: float) -> int:
-        """Return the delay at a log time, by the last messages."""
-        log, delay = self._recent(_LEVEL_NS)
-        ahead = float(np.median(delay - growth * log)) + growth * (log_time_ns - self.newest_ns)
-        return self._delay_ns[-1] + round(ahead)
-
-    def _recent(self, length_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return times and delays of the last messages less the newest's, to fit into floats."""
-        log, delay = (np.array(times, np.int64) for times in (self._log_ns, self._delay_ns))
-        first = min(int(np.searchsorted(log, log[-1] - length_ns)), max(len(log) - _FEWEST, 0))
-        log, delay = log[first:] - log[-1], delay[first:] - delay[-1]
-        return log.astype(np.float64), delay.astype(np.float64)
+        if self._offset_ns is None:
+            delays = self._delays_ns.values()
+            self._offset_ns = min(median(np.array(each, np.int64)) for each in delays)
+        return self._offset_ns
 
 
 # No robot acts by these.
@@ -232,7 +131,6 @@ class LiveObserver:
         """Discard all messages: the clock was set, or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
         self._clock = LiveClock(round(JUMP_S * NS))
-        self._newest_ns = 0  # log time of the last message
         self._command: _Message | None = None  # the first since the last tick, or the last before
         self._ticked = True
         self._before_ns: int | None = None
@@ -247,11 +145,8 @@ class LiveObserver:
 
     @property
     def offset_ns(self) -> int:
-        """Return log time less the alignment clock at the last message, as ingest finds it.
-
-        It is the median of the topic with the least delay, or if the clocks drift, the offset now.
-        """
-        return self._clock.offset_ns(self._newest_ns)
+        """Return log time less the alignment clock, as ingest finds it."""
+        return self._clock.offset_ns
 
     def receive(self, topic: str, message: Any, log_time_ns: int) -> None:
         """Take a message of one of `topics`, received at `log_time_ns`.
@@ -265,7 +160,6 @@ class LiveObserver:
         latched = all(source.max_age_s is None for source in sources)
         fields = {path: _column(message, path) for path in paths}
         fields |= _said(message, sources)
-        self._newest_ns = log_time_ns
         stamp_ns = self._stamp(topic, message, log_time_ns, latched)
         if stamp_ns is None:
             return
@@ -279,9 +173,7 @@ class LiveObserver:
 
     def observe(self, now_ns: int) -> Observed:
         """Make the observation of a tick at `now_ns`, by the clock of the messages' log times."""
-        offset_ns = (
-            0 if self.profile.clock.alignment == "log_time" else self._clock.offset_ns(now_ns)
-        )
+        offset_ns = 0 if self.profile.clock.alignment == "log_time" else self.offset_ns
         stamp_ns = now_ns - offset_ns
         ticks = [stamp_ns] if self._before_ns is None else [self._before_ns, stamp_ns]
         topics: dict[str, TopicColumns] = {}
@@ -348,7 +240,7 @@ class LiveObserver:
         """Return when a message was measured, on the alignment clock; None, counted, if unknown."""
         if self.profile.clock.alignment == "log_time":
             return log_time_ns
-        received_ns = log_time_ns - self._clock.offset_ns(log_time_ns)
+        received_ns = log_time_ns - self.offset_ns
         header = getattr(message, "header", None)
         if header is None:
             return received_ns
