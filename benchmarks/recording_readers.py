@@ -17,7 +17,7 @@ import zstandard
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from restock.ingest.containers.mcap_records import crc32
+from restock.ingest.containers.chunks import crc32
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Leaf, Ragged, equal, join, take
 from restock.ingest.decoding.definitions import message_type

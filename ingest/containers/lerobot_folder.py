@@ -33,11 +33,9 @@ from restock.files import first_line, read_json
 from restock.ingest.containers.storage import (
     LEROBOT_DATA,
     LEROBOT_INFO,
-    Damage,
     Extra,
-    Integrity,
     Metadata,
-    Packed,
+    Storage,
     Watch,
     keep_entries,
     unwatched,
@@ -68,7 +66,7 @@ class _Frames(NamedTuple):
     stamp_ns: Ints  # (N,)
 
 
-class LeRobotFolder:
+class LeRobotFolder(Storage):
     """The folder of a data set, read only. The format has no checksums, so it is never verified.
 
     Raises:
@@ -76,15 +74,9 @@ class LeRobotFolder:
             or is out of order (unless `salvage`).
     """
 
-    from_ros2 = False
-
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+        super().__init__()
         self._path, self._salvage, self._watch = path, salvage, watch
-        self.integrity: Integrity = "unverified"
-        self.damage: list[Damage] = []
-        self.notes: list[str] = []
-        self.extras: list[Extra] = []
-        self.packed: list[Packed] = []
         info = read_json(path / LEROBOT_INFO, error=RecordingError)
         if (version := info.get("codebase_version")) != VERSION:
             raise RecordingError(
@@ -181,7 +173,7 @@ class LeRobotFolder:
             row = problem[0] - (ends[at] - len(parts[at][0]))
             what = f"{found[at][1]}: row {row:,} {problem[1]}"
             self._refuse(what)
-            self._damaged(what)
+            self.damaged(what)
         for channel in self.channels:
             self.counts[channel] += len(stamps)
         cuts = np.cumsum([len(episode) for episode, _ in parts])[:-1]
@@ -218,12 +210,7 @@ class LeRobotFolder:
         """Count frames that there should be and are not."""
         for channel in self.channels:
             self.counts[channel] += frames
-        self._damaged(what, dict.fromkeys(self.channels, frames))
-
-    def _damaged(self, what: str, messages: dict[int, int] | None = None) -> None:
-        self.integrity = "damaged"
-        if all(item.what != what for item in self.damage):
-            self.damage.append(Damage(what, messages or {}))
+        self.damaged(what, dict.fromkeys(self.channels, frames))
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Yield the frames of each data file in order."""
@@ -244,9 +231,9 @@ class LeRobotFolder:
                     done += len(part)
             except UNREADABLE as error:
                 lost = dict.fromkeys(wanted, len(file.stamp_ns) - done)
-                self._damaged(f"{file.name} from row {done:,} on: {first_line(error)}", lost)
+                self.damaged(f"{file.name} from row {done:,} on: {first_line(error)}", lost)
             for (number, why), count in short.items():
-                self._damaged(f"{file.name}: frames with {why}", {number: count})
+                self.damaged(f"{file.name}: frames with {why}", {number: count})
 
     def _batch(
         self, number: int, part: pa.RecordBatch, stamp_ns: Ints, short: Counter[tuple[int, str]]

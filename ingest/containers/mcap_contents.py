@@ -18,13 +18,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from restock.errors import visible
+from restock.ingest.containers.chunks import FileBytes
 from restock.ingest.containers.mcap_records import (
     HEAD_SIZE,
     MAGIC,
     PREFIX,
     Chunk,
     Definitions,
-    FileBytes,
     Malformed,
     Op,
     parse,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -15,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
-from restock.ingest.containers import mcap_records
+from restock.ingest.containers import chunks, mcap_records
+from restock.ingest.containers.chunks import BadChunk, FileBytes
 from restock.ingest.containers.mcap_contents import ROSBAG2, Contents, resume, survey
 from restock.ingest.containers.mcap_records import (
     LATEST_NS,
     MAGIC,
     PREFIX,
-    BadChunk,
     Chunk,
     Definitions,
-    FileBytes,
     Indexed,
     Messages,
     Op,
@@ -33,10 +31,9 @@ from restock.ingest.containers.mcap_records import (
 from restock.ingest.containers.storage import (
     NOT_KEPT,
     Container,
-    Damage,
     Integrity,
     Metadata,
-    Packed,
+    Storage,
     Watch,
     custom_data,
     unwatched,
@@ -49,37 +46,6 @@ _Room: TypeAlias = tuple[Chunk, int, bytes | None]  # its bytes; of the cut one,
 _Outcome: TypeAlias = tuple[Chunk, BadChunk | None]  # what is wrong with it
 
 AHEAD = 1  # groups that are decompressed, each on a thread, while the one before is decoded
-
-
-@dataclass
-class Checks:
-    """The state of a file's integrity so far."""
-
-    damage: list[Damage] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    verified: int = 0  # chunks and data sections that a CRC confirms
-    unchecked: int = 0  # … that carry none
-
-    @property
-    def integrity(self) -> Integrity:
-        """Return whether checksums confirm what was read so far."""
-        if self.damage:
-            return "damaged"
-        return "verified" if self.verified and not self.unchecked else "unverified"
-
-    def damaged(self, what: str, messages: dict[int, int]) -> None:
-        """Note damage, once."""
-        if all(item.what != what for item in self.damage):
-            self.damage.append(Damage(what, messages))
-
-    def lost(self, chunk: Chunk, why: BadChunk) -> None:
-        """Note a chunk that cannot be read."""
-        self.damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
-
-    def read(self, chunk: Chunk) -> None:
-        """Count a chunk whose CRC matches, or that has none."""
-        self.verified += bool(chunk.crc)
-        self.unchecked += not chunk.crc
 
 
 class _Inflated(NamedTuple):
@@ -98,36 +64,31 @@ class ChunkReader:
 
     ahead: ClassVar[bool] = True
 
-    def __init__(self, file: FileBytes, checks: Checks, cut: Chunk | None) -> None:
+    def __init__(self, file: FileBytes, owner: Storage, cut: Chunk | None) -> None:
         self.walked: dict[int, Positions] = {}  # chunk.at -> its messages, where it has no index
-        self._file, self._checks, self._cut = file, checks, cut
+        self.verified = self.unchecked = 0  # chunks and data sections with a CRC, and without one
+        self._file, self._owner, self._cut = file, owner, cut
         self._scratch = _no_scratch()
 
     def inflate(self, chunk: Chunk) -> bytes:
         """Return one chunk's records; nothing if they cannot be read."""
         if chunk is self._cut:
-            return mcap_records.inflate_partly(chunk, self._file)
+            return chunks.inflate_partly(chunk, self._file)
         try:
-            data = mcap_records.inflate(chunk, self._file[chunk.start : chunk.stop])
+            data = chunks.inflate(chunk, self._file[chunk.start : chunk.stop])
         except BadChunk as bad:
-            self._checks.lost(chunk, bad)
+            self._lost(chunk, bad)
             return b""
-        self._checks.read(chunk)
+        self._read(chunk)
         return data
 
-    def begin_in(self, chunk: Chunk, channels: set[int]) -> tuple[set[int], bytes]:
-        """Return which of these channels have messages in a chunk, as far as known without walking.
+    def _lost(self, chunk: Chunk, why: BadChunk) -> None:
+        self._owner.damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
 
-        Also returns its records before the first messages of all of them, unchecked.
-        """
-        if walked := self.walked.get(chunk.at):
-            first = {n: int(walked[n].min()) for n in walked.keys() & channels}
-        else:
-            held = {n for n, count in chunk.counts().items() if count} & channels
-            first = {n: mcap_records.first_offset(self._file[slice(*chunk.index[n])]) for n in held}
-        if not first:
-            return set(), b""
-        return {*first}, mcap_records.inflate_partly(chunk, self._file, max(first.values()))
+    def _read(self, chunk: Chunk) -> None:
+        """Count a chunk whose CRC matches, or that has none."""
+        self.verified += bool(chunk.crc)
+        self.unchecked += not chunk.crc
 
     def walk(self, chunk: Chunk) -> Positions:
         """Find a chunk's messages by walking it, and remember them."""
@@ -147,9 +108,9 @@ class ChunkReader:
         for inflated in _ahead(works) if ahead else (work(0) for work in works):
             for chunk, bad in inflated.outcomes:
                 if bad is None:
-                    self._checks.read(chunk)
+                    self._read(chunk)
                 else:
-                    self._checks.lost(chunk, bad)
+                    self._lost(chunk, bad)
             yield from self._messages(inflated.buffer, inflated.parts, wanted)
         self._scratch = _no_scratch()  # the file stays open while rows are made
 
@@ -188,11 +149,11 @@ class ChunkReader:
         refused: list[_Outcome] = []
         for chunk in group:
             if chunk is self._cut:
-                torn = mcap_records.inflate_partly(chunk, self._file)
+                torn = chunks.inflate_partly(chunk, self._file)
                 rooms.append((chunk, len(torn), torn))
                 continue
             try:
-                mcap_records.refuse_implausible(chunk)
+                chunks.refuse_implausible(chunk)
             except BadChunk as bad:
                 refused.append((chunk, bad))
             else:
@@ -214,7 +175,7 @@ class ChunkReader:
             else:
                 try:
                     stored = self._file.large(chunk.start, chunk.stop)
-                    mcap_records.inflate_into(chunk, stored, room)
+                    chunks.inflate_into(chunk, stored, room)
                 except BadChunk as bad:
                     outcomes.append((chunk, bad))
                     continue
@@ -233,7 +194,7 @@ class ChunkReader:
             return located
         chunk, base, size = part
         if chunk.index and chunk.at not in self.walked:
-            self._checks.notes.append(
+            self._owner.notes.append(
                 f"chunk at byte {chunk.at:,}: its message index is wrong: read message by message"
             )
         positions = self._walk_part(chunk, buffer[base : base + size].data)
@@ -248,7 +209,7 @@ class ChunkReader:
             return self.walked[chunk.at]
         positions, cut = mcap_records.walked_messages(part)
         if cut and chunk is not self._cut:
-            self._checks.damaged(f"chunk at byte {chunk.at:,}: {cut}", {})
+            self._owner.damaged(f"chunk at byte {chunk.at:,}: {cut}")
         return positions
 
 
@@ -289,7 +250,7 @@ MIN_GROUPS = 5  # to decompress ahead
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 
 
-class McapFile:
+class McapFile(Storage):
     """An MCAP file, chunked or not, with or without summary, statistics and message index.
 
     `watch` gets the progress of opening: without statistics the messages must be counted.
@@ -299,26 +260,24 @@ class McapFile:
     """
 
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+        super().__init__()
         self.path, self._watch = path, watch
-        self._checks = Checks()
-        self.damage, self.notes = self._checks.damage, self._checks.notes
         self._file = FileBytes(path)
         if self._file[: len(MAGIC)] != MAGIC:
             raise RecordingError("not an MCAP file: its first bytes are wrong", where=str(path))
         self._contents = survey(self._file, watch)
         self.from_ros2 = self._contents.profile == "ros2"
         for what in self._contents.damaged:
-            self._checks.damaged(what, {})
+            self.damaged(what)
         self._refuse_cut(salvage)
         self.extras = self._contents.extras
         self.metadata = _metadata(self._contents, path, self.notes)
         if self._contents.unnamed:
             self.notes.append(f"{self._contents.unnamed:,} more attachments and metadata records")
-        self._chunks = ChunkReader(self._file, self._checks, self._contents.cut_chunk)
+        self._chunks = ChunkReader(self._file, self, self._contents.cut_chunk)
         self.counts = self._count()
         self.channels = self._channels()
         self.span_ns = self._span()
-        self.packed = self._packed()
 
     def _refuse_cut(self, salvage: bool) -> None:
         cut = self._contents.cut
@@ -329,9 +288,9 @@ class McapFile:
             raise RecordingError(
                 what, where=str(self.path), remedy="`--salvage` reads what can still be read of it"
             )
-        self._checks.damaged(what, {})
+        self.damaged(what)
         for lost in resume(self._file, self._contents):
-            self._checks.damaged(lost, {})
+            self.damaged(lost)
         if self._contents.cut_chunk:
             self._contents.chunks.append(self._contents.cut_chunk)
 
@@ -362,50 +321,30 @@ class McapFile:
         return counts
 
     def _channels(self) -> dict[int, Channel]:
-        """Return the channels as the data section defines them.
+        """Return the channels as the file defines them.
 
-        The summary's copies count only for what it does not define.
+        What the summary repeats counts if its CRC matches. Else the data counts, and the summary
+        only for what the data does not define; a difference is damage.
         """
-        contents = self._contents
+        contents, copies = self._contents, self._contents.copies
         needed = {channel for channel, count in self.counts.items() if count}
-        own = self._compared(contents.definitions, contents.data_end[1] > 0)
+        proven = copies if contents.summary_proven else Definitions()
+        known = contents.definitions.beneath(proven)
         for chunk in contents.chunks:
-            if not (left := own.lacking(needed)):
+            if not known.lacking(needed):
                 break
-            begun, records = self._chunks.begin_in(chunk, left)
-            sought = left if chunk is contents.chunks[0] else begun  # some writers define all first
-            own = contents.copies.repeated_in(records, sought).beneath(own)
-            if own.lacking(begun):
-                own = self._defined_in(chunk).beneath(own)
-        every = contents.copies.beneath(own)
-        if (every if contents.summary_proven else own).lacking(needed):
-            for chunk in contents.chunks:  # a definition may lie chunks before the first message
-                if not own.lacking(needed):
-                    break
-                own = self._defined_in(chunk).beneath(own)
-            every = contents.copies.beneath(own)
-        for number in needed - every.channels.keys():
+            records = self._chunks.inflate(chunk)
+            known = mcap_records.definitions_in(records).beneath(known)
+        if not contents.summary_proven:
+            for what in known.differing(copies):
+                self.damaged(
+                    f"its summary and its data define {what} differently: the data's is used"
+                )
+            known = copies.beneath(known)
+        for number in needed - known.channels.keys():
             what = f"{self.counts[number]} messages of channel {number}, which the file never names"
-            self._checks.damaged(what, {number: self.counts[number]})
-        return every.named()
-
-    def _defined_in(self, chunk: Chunk) -> Definitions:
-        """Return what a whole chunk defines, checked by its CRC; nothing if that does not match."""
-        records = self._chunks.inflate(chunk)
-        return self._compared(mcap_records.definitions_in(records), chunk.crc > 0)
-
-    def _compared(self, found: Definitions, checked: bool) -> Definitions:
-        """Compare the data section's definitions with the summary's copies; differences are damage.
-
-        If no CRC covers the data section but one confirms the summary, the copies count.
-        """
-        copies = self._contents.copies
-        trusted = "summary" if self._contents.summary_proven and not checked else "data"
-        for what in found.differing(copies):
-            self._checks.damaged(
-                f"its summary and its data define {what} differently: the {trusted}'s is used", {}
-            )
-        return found if trusted == "data" else found.as_in(copies)
+            self.damaged(what, {number: self.counts[number]})
+        return known.named()
 
     def _span(self) -> tuple[int, int] | None:
         contents = self._contents
@@ -419,32 +358,26 @@ class McapFile:
         low, high = min(low for low, _ in spans), max(high for _, high in spans)
         return min(low, LATEST_NS), min(high, LATEST_NS)
 
-    def _packed(self) -> list[Packed]:
-        by: dict[str, list[Chunk]] = {}
-        for chunk in self._contents.chunks:
-            by.setdefault(chunk.compression, []).append(chunk)
-        return [
-            Packed(name, len(some), sum(c.stop - c.start for c in some), sum(c.size for c in some))
-            for name, some in by.items()
-        ]
-
     # -- integrity -------------------------------------------------------------------------
 
     @property
     def integrity(self) -> Integrity:
         """Return whether checksums confirm what was read so far."""
-        return self._checks.integrity
+        if self.damage:
+            return "damaged"
+        read = self._chunks
+        return "verified" if read.verified and not read.unchecked else "unverified"
 
     def _check_loose(self) -> None:
         """Check messages outside chunks by the CRC of the whole data section."""
         position, crc = self._contents.data_end
         if not crc:
-            self._checks.unchecked += 1
+            self._chunks.unchecked += 1
             return
         if self._file.crc(0, position) == crc:
-            self._checks.verified += 1
+            self._chunks.verified += 1
         else:
-            self._checks.damaged("the CRC of its data section does not match", {})
+            self.damaged("the CRC of its data section does not match")
 
     # -- reading ---------------------------------------------------------------------------
 

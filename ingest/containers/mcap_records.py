@@ -1,135 +1,29 @@
 """MCAP's records and chunks. See https://mcap.dev/spec.
 
-One table of the records' fields and one bounded parser; bounded decompression of chunks, the places
-of messages in them, and definitions.
+One table of the records' fields and one bounded parser; the places of messages in chunks, and
+definitions.
 """
 
 from __future__ import annotations
 
-import os
 import struct
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, overload
+from typing import Any, NamedTuple, TypeAlias
 
-import lz4.frame
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from restock.arrays import Ints
-from restock.errors import RecordingError
-from restock.ingest.containers.storage import most_bytes
+from restock.ingest.containers.chunks import Buffer, StoredChunk
 from restock.ingest.decoding.columns import Channel, gather
 
 MAGIC = b"\x89MCAP0\r\n"
-Buffer: TypeAlias = "bytes | FileBytes"
 MAX_KEPT = 64 << 10  # bytes of a definition that is kept for other files
 PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
-
-
-def _fastest_crc32() -> Callable[..., int]:
-    """Return the fastest CRC-32 function: `isal`'s, nine times as fast, if it is installed."""
-    try:
-        from isal import isal_zlib
-    except ImportError:
-        return zlib.crc32
-    fast: Callable[..., int] = isal_zlib.crc32
-    return fast
-
-
-crc32 = _fastest_crc32()  # (data, CRC of what came before = 0)
-
-
-class FileBytes:
-    """A file's bytes, read on access.
-
-    It is not mapped into memory: if a mapped file shrinks, reading it kills the process.
-    """
-
-    WINDOW = 16 << 10  # bytes kept of the last small read: fields are read one by one
-    PIECE = 8 << 20  # searched or checked at a time
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file = path.open("rb", buffering=0)
-        self._size = path.stat().st_size
-        self._window, self._from = b"", 0
-
-    def __len__(self) -> int:
-        return self._size
-
-    @overload
-    def __getitem__(self, key: int) -> int: ...
-    @overload
-    def __getitem__(self, key: slice) -> bytes: ...
-    def __getitem__(self, key: int | slice) -> int | bytes:
-        """Return a byte or a slice, as bytes do.
-
-        Raises:
-            RecordingError: the file is shorter than it was when it was opened.
-        """
-        if isinstance(key, int):
-            if not 0 <= key < self._size:
-                raise IndexError(key)
-            return self._read(key, key + 1)[0]
-        start, stop = key.start or 0, key.stop
-        at = start - self._from
-        if at >= 0 and stop is not None and start <= stop <= self._from + len(self._window):
-            return self._window[at : stop - self._from]
-        return self._read(*key.indices(self._size)[:2])
-
-    def _read(self, start: int, stop: int) -> bytes:
-        if stop - start > self.WINDOW:
-            return self.large(start, stop)
-        self._window = self.large(start, start + self.WINDOW)
-        self._from = start
-        return self._window[: max(stop - start, 0)]
-
-    def large(self, start: int, stop: int) -> bytes:
-        """Read a large slice that is needed once; safe to call from several threads.
-
-        Raises:
-            RecordingError: the file is shorter than it was when it was opened.
-        """
-        stop = min(stop, self._size)
-        parts, left = list[bytes](), stop - start
-        while left > 0:
-            part = os.pread(self._file.fileno(), left, stop - left)
-            if not part:
-                raise RecordingError(
-                    f"it shrank while it was read: it had {self._size:,} bytes when it was "
-                    f"opened, and has {self.path.stat().st_size:,} now",
-                    where=str(self.path),
-                    remedy="read it when nothing writes to it, or read a copy",
-                )
-            parts.append(part)
-            left -= len(part)
-        return parts[0] if len(parts) == 1 else b"".join(parts)
-
-    def crc(self, start: int, stop: int) -> int:
-        """Return the CRC-32 of the bytes from `start` to `stop`."""
-        crc = 0
-        for at in range(start, stop, self.PIECE):
-            crc = crc32(self[at : min(at + self.PIECE, stop)], crc)
-        return crc
-
-    def find(self, what: bytes, start: int) -> int:
-        """Return where these bytes occur next, from `start` on; -1 if they do not."""
-        for at in range(start, self._size, self.PIECE):
-            found = self[at : at + self.PIECE + len(what) - 1].find(what)
-            if found >= 0:
-                return at + found
-        return -1
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
 
 class Malformed(Exception):
@@ -320,16 +214,7 @@ class _Cursor:
         return start, self.position
 
 
-# A chunk's uncompressed size is the file's claim: beyond this it is refused, not allocated.
-MAX_CHUNK = 4 << 30
 LATEST_NS = 2**63 - 1
-STEP = 1 << 12  # of damaged data at a time: damage costs no more than what is near it
-
-_DECODERS: dict[str, Callable[[], Any]] = {
-    "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
-    "lz4": lz4.frame.LZ4FrameDecompressor,
-}
-_DAMAGED = (zstandard.ZstdError, RuntimeError, EOFError, OSError)
 
 _HEAD = np.dtype(  # a message record up to its data
     [
@@ -349,20 +234,10 @@ _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 Positions: TypeAlias = dict[int, Ints]  # of message records, by channel
 
 
-class BadChunk(Exception):
-    """A chunk whose content cannot be read."""
-
-
 @dataclass(frozen=True)
-class Chunk:
-    """Place of a chunk in the file, with the fields of its record and its message index."""
+class Chunk(StoredChunk):
+    """A chunk's place, the log times that it spans, and its message index."""
 
-    at: int  # of its record in the file
-    start: int  # of its (compressed) records
-    stop: int
-    size: int  # uncompressed
-    crc: int  # of the uncompressed records; 0: unchecked
-    compression: str
     span_ns: tuple[int, int]
     index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
 
@@ -385,93 +260,6 @@ class Messages:
 
     def __len__(self) -> int:
         return len(self.start)
-
-
-def refuse_implausible(chunk: Chunk) -> None:
-    """Check the size that a chunk claims, before as much is allocated.
-
-    Raises:
-        BadChunk: it is more than its stored bytes can hold.
-    """
-    stored = chunk.stop - chunk.start
-    if chunk.size > min(most_bytes(stored), MAX_CHUNK):
-        raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
-
-
-def inflate(chunk: Chunk, stored: bytes) -> bytes:
-    """Decompress a chunk's stored bytes and check them against its CRC.
-
-    Raises:
-        BadChunk: unknown compression, an implausible size, damaged data or a wrong CRC.
-    """
-    refuse_implausible(chunk)
-    data = _decompress(chunk.compression, stored, chunk.size)
-    if len(data) != chunk.size:
-        raise BadChunk(f"{len(data):,} bytes uncompressed, where it claims {chunk.size:,}")
-    _check(chunk, data)
-    return data
-
-
-def inflate_into(chunk: Chunk, stored: bytes, room: NDArray[np.uint8]) -> None:
-    """Decompress into `room`, which has the chunk's size: reusing memory costs less.
-
-    Raises:
-        BadChunk: as `inflate`.
-    """
-    if chunk.compression == "zstd" and _unpack(stored, room):
-        _check(chunk, room.data)
-    else:  # which names what is wrong with it
-        room[:] = np.frombuffer(inflate(chunk, stored), np.uint8)
-
-
-def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:
-    """Decompress zstd data that fills the room exactly; False where it does not."""
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
-            at = 0
-            while at < len(room) and (count := reader.readinto(room.data[at:])):
-                at += count
-            return at == len(room) and not reader.read(1)
-    except zstandard.ZstdError:
-        return False
-
-
-def _check(chunk: Chunk, data: bytes | memoryview) -> None:
-    if chunk.crc and crc32(data) != chunk.crc:
-        raise BadChunk("its CRC does not match")
-
-
-def inflate_partly(chunk: Chunk, file: Buffer, limit: int = MAX_CHUNK) -> bytes:
-    """Return a chunk's first records, unchecked, up to `limit` bytes or the damage."""
-    limit = min(limit, chunk.size, most_bytes(chunk.stop - chunk.start))
-    if chunk.compression == "":
-        return file[chunk.start : min(chunk.start + limit, chunk.stop)]
-    if chunk.compression not in _DECODERS:
-        return b""
-    decoder, parts, size = _DECODERS[chunk.compression](), list[bytes](), 0
-    with suppress(*_DAMAGED):
-        for position in range(chunk.start, chunk.stop, STEP):
-            parts.append(decoder.decompress(file[position : min(position + STEP, chunk.stop)]))
-            size += len(parts[-1])
-            if size >= limit:
-                break
-    return b"".join(parts)[:limit]
-
-
-def _decompress(compression: str, stored: bytes, size: int) -> bytes:
-    if compression == "":
-        return stored
-    try:
-        if compression == "zstd":
-            if zstandard.frame_content_size(stored) > size:
-                raise BadChunk("it would decompress to more than it claims")
-            return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-        if compression == "lz4":
-            data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size + 1)
-            return data
-    except _DAMAGED as error:
-        raise BadChunk(f"its {compression} data is damaged ({error})") from error
-    raise BadChunk(f"compression {compression!r} is not supported")
 
 
 @dataclass(frozen=True)
@@ -515,11 +303,6 @@ def indexed_messages(
         return None
     messages = _messages(at, head)
     return None if (messages.stop > base + size).any() else messages
-
-
-def first_offset(entries: bytes) -> int:
-    """Return where the first message of some index entries, one at least, lies in its chunk."""
-    return int(np.frombuffer(entries, _INDEX, len(entries) // _INDEX.itemsize)["offset"].min())
 
 
 def _stamps(values: NDArray[np.uint64]) -> Ints:
@@ -593,7 +376,6 @@ class Definitions:
 
     schemas: dict[int, SchemaRecord] = field(default_factory=dict)
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
-    raw: dict[tuple[int, int], bytes] = field(default_factory=dict)  # records, by opcode and id
 
     def take(self, opcode: int, buffer: Buffer, at: int, stop: int) -> None:
         """Add the record whose content is buffer[at:stop], if it is a schema or a channel."""
@@ -605,7 +387,6 @@ class Definitions:
             number, record = (_defined if len(raw) < MAX_KEPT else _defined.__wrapped__)(raw)
         except Malformed as bad:
             raise Malformed(bad.what, at - PREFIX + bad.at) from None
-        self.raw[opcode, number] = raw
         if isinstance(record, SchemaRecord):
             self.schemas[number] = record
         else:
@@ -615,13 +396,6 @@ class Definitions:
         """Return both; where both define an id, what `other` says."""
         return Definitions(self.schemas | other.schemas, self.channels | other.channels)
 
-    def as_in(self, other: Definitions) -> Definitions:
-        """Return what defines the same ids: as `other` does, for those that it has."""
-        return Definitions(
-            {number: other.schemas.get(number, own) for number, own in self.schemas.items()},
-            {number: other.channels.get(number, own) for number, own in self.channels.items()},
-        )
-
     def lacking(self, channels: set[int]) -> set[int]:
         """Return those of these channels that are not defined, or whose schemas are not."""
         known = self.schemas.keys() | {0}
@@ -630,18 +404,6 @@ class Definitions:
             for number in channels
             if number not in self.channels or self.channels[number].schema_id not in known
         }
-
-    def repeated_in(self, records: bytes, channels: set[int]) -> Definitions:
-        """Return the definitions of these channels whose exact records are among `records`.
-
-        Searching for bytes takes a hundredth of the time of walking.
-        """
-        channels = channels & self.channels.keys()
-        schemas = {self.channels[n].schema_id for n in channels} & self.schemas.keys()
-        return Definitions(
-            {n: self.schemas[n] for n in schemas if self.raw[Op.SCHEMA, n] in records},
-            {n: self.channels[n] for n in channels if self.raw[Op.CHANNEL, n] in records},
-        )
 
     def differing(self, other: Definitions) -> list[str]:
         """Return what both define, but differently."""

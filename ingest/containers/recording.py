@@ -27,7 +27,6 @@ from restock.ingest.containers.storage import (
     Integrity,
     LostMessages,
     Metadata,
-    Packed,
     Reduction,
     Storage,
     TopicInfo,
@@ -205,16 +204,6 @@ class Recording:
     def size_bytes(self) -> int:
         """Return the bytes of all its files."""
         return sum(file.stat().st_size for file in self.files)
-
-    @property
-    def packed(self) -> list[Packed]:
-        """Return the chunks of all its files by their compression; none if files have none."""
-        found: dict[str, Packed] = {}
-        for one in (one for storage in self._storages for one in storage.packed):
-            had = found.get(one.compression, Packed(one.compression, 0, 0, 0))
-            sums = (a + b for a, b in zip(had[1:], one[1:], strict=True))
-            found[one.compression] = Packed(one.compression, *sums)
-        return list(found.values())
 
     def qos(self, topic: str) -> str:
         """Return the quality of service that a topic's publishers offered: YAML, as in the file."""

@@ -7,7 +7,6 @@ queries are bounded, and only plain tables are read.
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import shutil
@@ -16,31 +15,22 @@ import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeAlias
 from urllib.parse import quote
-
-import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
 from restock.ingest.containers.storage import (
     NOT_KEPT,
     Container,
-    Damage,
-    Extra,
-    Integrity,
-    Metadata,
-    Packed,
+    Storage,
     Watch,
     custom_data,
     unwatched,
 )
-from restock.ingest.decoding.columns import Channel, MessageBatch, PendingBatch
+from restock.ingest.decoding.columns import Channel, MessageBatch
 
 MAGIC = b"SQLite format 3\x00"
-ROWS_PER_FETCH = 1000
 BYTES_PER_BATCH = 8 << 20
-LARGE_ROW = 1 << 20  # bytes: larger ones are not fetched some at a time
 MAX_MESSAGE = 256 << 20
 MAX_METADATA = 2 << 20  # characters
 MAX_QOS = 8192  # characters of a topic's offered profiles
@@ -51,7 +41,7 @@ STEPS_AT_ONCE = 100_000
 # What the check says of values, not of pages: those are read as they are.
 _OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
 
-_Row: TypeAlias = tuple[int, int, Any, int | None, int]  # topic, stamp, data, its size, row number
+_Pending = dict[int, tuple[list[bytes], list[int]]]  # payloads and stamps, by topic
 
 
 def open_sqlite(
@@ -79,7 +69,7 @@ class DamagedSqliteError(RecordingError):
         )
 
 
-class SqliteFile:
+class SqliteFile(Storage):
     """A whole sqlite3 storage file, read only.
 
     rosbag2 keeps no checksums, so it is never verified, but SQLite's own check of its pages must
@@ -96,13 +86,8 @@ class SqliteFile:
     from_ros2 = True
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
-        self.integrity: Integrity = "unverified"
-        self.damage: list[Damage] = []
-        self.notes: list[str] = []
-        self.extras: list[Extra] = []
-        self.metadata: list[Metadata] = []
-        self.packed: list[Packed] = []
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._refuse_short()
         self._connection = self._connect()
@@ -212,7 +197,7 @@ class SqliteFile:
         ):
             if number not in self.channels:
                 what = f"{count} messages of topic id {number}, which no topic has"
-                self.damage.append(Damage(what, {number: count}))
+                self.damaged(what, {number: count})
                 continue
             counts[number] = count
             stamps += [stamp for stamp in (first, last) if stamp is not None]
@@ -236,70 +221,38 @@ class SqliteFile:
         if left_out:
             self.notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
 
-    def _damaged(self, what: str) -> None:
-        self.integrity = "damaged"
-        if all(item.what != what for item in self.damage):
-            self.damage.append(Damage(what))
-
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Yield all messages in one pass in rowid order, which is the order of arrival."""
         wanted = [channel for channel in channels if channel in self.channels]
         marks = ",".join("?" * len(wanted))
-        query = (  # large ones are fetched one by one
+        query = (
             "SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END, length(data),"
             f" id FROM messages NOT INDEXED WHERE topic_id IN ({marks})"
             " AND typeof(timestamp) = 'integer' ORDER BY id"
         )
+        pending, size = _Pending(), 0
         try:
-            cursor = self._connection.execute(query, (LARGE_ROW, *wanted))
-        except sqlite3.DatabaseError as error:
-            self._damaged(f"its rows are lost: {error}")
-            return
-        pending, size = dict[int, PendingBatch](), 0
-        for rows in self._rows(cursor):
-            if size + sum(row[3] or 0 for row in rows) > BYTES_PER_BATCH:
-                yield from ((channel, some.batch()) for channel, some in pending.items())
-                pending, size = {}, 0
-            size += _add_rows(rows, pending)
-        yield from ((channel, some.batch()) for channel, some in pending.items())
-
-    def _rows(self, cursor: sqlite3.Cursor) -> Iterator[list[_Row]]:
-        """Yield rows in order, some at a time; a large one alone."""
-        row_bytes = BYTES_PER_BATCH // 16
-        while rows := self._fetch(cursor, row_bytes):
-            row_bytes = sum(row[3] or 0 for row in rows) // len(rows) + 64
-            for large, some in itertools.groupby(rows, lambda row: (row[3] or 0) > LARGE_ROW):
-                if not large:
-                    yield list(some)
+            for topic, stamp, data, length, row in self._connection.execute(
+                query, (MAX_MESSAGE, *wanted)
+            ):
+                if data is None and length is not None:
+                    self._refuse_large(topic, row, length)
                     continue
-                for row in some:
-                    if whole := self._large(row):
-                        yield whole
-
-    def _large(self, row: _Row) -> list[_Row]:
-        """Read a row with its data, up to some hundred MB; return nothing for a larger one."""
-        topic, stamp, _, size, number = row
-        if size is not None and size <= MAX_MESSAGE:
-            query = "SELECT data FROM messages WHERE id = ?"
-            try:
-                (data,) = self._connection.execute(query, (number,)).fetchone()
-            except sqlite3.DatabaseError as error:
-                self._damaged(f"row {number:,} is lost: {error}")
-                return []
-            return [(topic, stamp, data, size, number)]
-        what = f"row {number:,} is not read: its message of {size:,} bytes is too large"
-        if len(self.damage) < MAX_FOUND and all(item.what != what for item in self.damage):
-            self.damage.append(Damage(what, {topic: 1}))
-        return []
-
-    def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[_Row]:
-        """Fetch some rows, fewer if the rows before were large."""
-        some = min(max(BYTES_PER_BATCH // max(row_bytes, 1), 1), ROWS_PER_FETCH)
-        try:
-            return cursor.fetchmany(some)
+                payloads, stamps = pending.setdefault(topic, ([], []))
+                payloads.append(data if isinstance(data, bytes) else str(data or "").encode())
+                stamps.append(stamp)
+                size += len(payloads[-1]) + 64
+                if size >= BYTES_PER_BATCH:
+                    yield from _batches(pending)
+                    pending, size = _Pending(), 0
         except sqlite3.DatabaseError as error:
-            self._damaged(f"rows after the damage are lost: {error}")
-            return []
+            self.damaged(f"rows after the damage are lost: {error}")
+        yield from _batches(pending)
+
+    def _refuse_large(self, topic: int, row: int, length: int) -> None:
+        if len(self.damage) < MAX_FOUND:
+            what = f"row {row:,} is not read: its message of {length:,} bytes is too large"
+            self.damaged(what, {topic: 1})
 
     def close(self) -> None:
         """Close the file and remove the private copy, if there was one."""
@@ -348,19 +301,9 @@ def _connection(path: Path, immutable: str) -> sqlite3.Connection:
     return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
 
-def _add_rows(rows: list[_Row], pending: dict[int, PendingBatch]) -> int:
-    """Sort (topic, stamp, data) rows by topic; returns how many bytes they take."""
-    topics, stamps, payloads, _, _ = zip(*rows, strict=True)
-    if set(map(type, payloads)) != {bytes}:
-        payloads = tuple(
-            data if isinstance(data, bytes) else str(data or "").encode() for data in payloads
-        )
-    topic_of, stamp_ns = np.array(topics), np.array(stamps, np.int64)
-    for topic in np.unique(topic_of).tolist():
-        chosen = np.flatnonzero(topic_of == topic)
-        some = [payloads[row] for row in chosen.tolist()]
-        pending.setdefault(topic, PendingBatch()).add(some, stamp_ns[chosen], stamp_ns[chosen])
-    return sum(map(len, payloads)) + 64 * len(rows)
+def _batches(pending: _Pending) -> Iterator[tuple[int, MessageBatch]]:
+    for topic, (payloads, stamps) in pending.items():
+        yield topic, MessageBatch.of(payloads, stamps, stamps)
 
 
 def guard(connection: sqlite3.Connection, size: int) -> None:

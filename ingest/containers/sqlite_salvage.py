@@ -21,7 +21,7 @@ import numpy as np
 
 from restock.arrays import Bools, Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed
+from restock.ingest.containers.storage import Damage, Storage
 from restock.ingest.decoding.columns import Channel, MessageBatch, PendingBatch
 
 LEAF, INTERIOR = 0x0D, 0x05  # of a table
@@ -247,7 +247,7 @@ MAX_MESSAGE = 256 << 20
 PIECE_ROWS = 4096
 
 
-class SalvagedSqliteFile:
+class SalvagedSqliteFile(Storage):
     """A damaged sqlite3 storage file, of which every row in a whole page is read.
 
     Rows that lie in the pages more than once count once. rosbag2 numbers its rows one by one: by
@@ -262,14 +262,11 @@ class SalvagedSqliteFile:
     def __init__(
         self, path: Path, what: str, copy: tempfile.TemporaryDirectory[str] | None = None
     ) -> None:
+        super().__init__()
         self.path, self._copy = path, copy  # a private copy has what a `-wal` file held
-        self.integrity: Integrity = "damaged"
-        self.damage = [Damage(what)]
+        self.damaged(what)
         # By all passes: each finds what others have found, of its own topics.
         self._unread = Damage("their pages are missing, damaged or too many")
-        self.notes, self.extras = list[str](), list[Extra]()
-        self.packed: list[Packed] = []
-        self.metadata = list[Metadata]()  # what of it is in the file is not looked for
         self._pages = Pages(Path(copy.name) / path.name if copy else path)
         self._taken = np.zeros(self._pages.count + 2, np.bool_)
         self._texts: list[Cell] = []  # rows of `topics` and `message_definitions`
@@ -354,16 +351,14 @@ class SalvagedSqliteFile:
         rows = rows[first]
         named = np.isin(rows[:, 1], list(self.channels))
         if lost := int((~named).sum()):
-            self._lost(f"{lost:,} messages of topics without a name", lost)
+            self.damaged(f"{lost:,} messages of topics without a name", {-1: lost})
         last = max(self._last, int(rows[-1, 0]) if len(rows) else 0)
         missing = last - int((rows[:, 0] > 0).sum())
         room = self._pages.count * self._pages.page_size // MIN_CELL
         if missing > 0 and last <= room:
-            self._lost(f"at least {missing:,} messages are missing, by their row numbers", missing)
+            what = f"at least {missing:,} messages are missing, by their row numbers"
+            self.damaged(what, {-1: missing})
         return rows[named]
-
-    def _lost(self, what: str, count: int) -> None:
-        self.damage.append(Damage(what, {-1: count}))
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Yield all messages in one pass in the order of row numbers, the order of arrival."""

@@ -9,9 +9,11 @@ not grow with a recording's bytes.
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -76,15 +78,6 @@ class Extra:
     def __post_init__(self) -> None:
         for name in ("name", "media_type"):
             object.__setattr__(self, name, visible(getattr(self, name)))
-
-
-class Packed(NamedTuple):
-    """Chunks of a file that are compressed alike."""
-
-    compression: str  # "" for none
-    chunks: int
-    stored_bytes: int
-    plain_bytes: int  # as the chunks say
 
 
 class Metadata(NamedTuple):
@@ -160,38 +153,46 @@ def yaml_value(text: str, key: str, *, kind: str = "safe") -> Any:
         raise ValueError(visible(why[:200])) from error
 
 
-class Storage(Protocol):
+class Storage(ABC):
     """An open file of messages.
 
-    `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
-    last log time, or None when it holds no message. `damage` is final once everything wanted has
-    been read. `notes` inform the user about things that lose no data. `extras` are listed, not
-    read; `metadata` are the entries among them that describe the whole recording. `packed` is empty
-    if a file has no chunks. `from_ros2` says whether a ROS 2 middleware serialised its messages.
+    A container's class calls `__init__` and sets `channels`, `counts` (messages by the container's
+    own count, per channel id) and `span_ns` (the first and last log time; None without a message).
+    `damage` is final once everything wanted has been read. `notes` inform the user about things
+    that lose no data. `extras` are listed, not read; `metadata` are the entries among them that
+    describe the whole recording. `from_ros2` says whether a ROS 2 middleware serialised its
+    messages.
     """
 
     channels: dict[int, Channel]
     counts: dict[int, int]
     span_ns: tuple[int, int] | None
-    damage: list[Damage]
-    notes: list[str]
-    extras: list[Extra]
-    metadata: list[Metadata]
-    packed: list[Packed]
-    from_ros2: bool
+    from_ros2: bool = False
+
+    def __init__(self) -> None:
+        self.damage: list[Damage] = []
+        self.notes: list[str] = []
+        self.extras: list[Extra] = []
+        self.metadata: list[Metadata] = []
 
     @property
     def integrity(self) -> Integrity:
-        """Return whether checksums confirm what was read so far."""
-        ...
+        """Return whether checksums confirm what was read so far; most formats have none."""
+        return "damaged" if self.damage else "unverified"
 
+    def damaged(self, what: str, messages: Mapping[int, int] = MappingProxyType({})) -> None:
+        """Note damage, once, and how many messages it costs, by channel id."""
+        found = Damage(what, dict(messages))
+        if all(item.what != found.what for item in self.damage):
+            self.damage.append(found)
+
+    @abstractmethod
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Yield the messages of these channels, in file order within each channel."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Close the file."""
-        ...
 
 
 class Opener(Protocol):

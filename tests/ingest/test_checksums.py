@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from restock.ingest.containers.mcap_records import _fastest_crc32, crc32
+from restock.ingest.containers.chunks import _fastest_crc32, crc32
 
 
 @given(st.binary(max_size=300), st.integers(0, 300))

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from support.paths import SHARED
 
+from restock.ingest.containers.chunks import inflate
 from restock.ingest.containers.mcap_file import McapFile
-from restock.ingest.containers.mcap_records import MAGIC, Chunk, Op, inflate, parse, walk
+from restock.ingest.containers.mcap_records import MAGIC, Chunk, Op, parse, walk
 
 pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 

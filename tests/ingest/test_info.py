@@ -48,25 +48,10 @@ def test_one_bad_recording_does_not_hide_the_others(folder, tmp_path, capsys):
     assert "Traceback" not in printed.err
 
 
-def test_it_says_when_it_ends_and_how_an_mcap_file_is_packed(folder, capsys):
-    from mcap.reader import make_reader
-
+def test_it_says_when_a_recording_ends(folder, capsys):
     assert main(["info", str(folder), "--json"]) == 0
-    bag, mcap = json.loads(capsys.readouterr().out)["recordings"]
-    assert [entry["end"] for entry in (bag, mcap)] == ["2023-11-14T22:13:20Z"] * 2
-    assert bag["chunks"] == []
-    with (folder / "one.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    indexes = summary.chunk_indexes
-    assert mcap["chunks"] == [
-        {
-            "compression": indexes[0].compression,
-            "chunks": len(indexes),
-            "stored_bytes": sum(one.compressed_size for one in indexes),
-            "plain_bytes": sum(one.uncompressed_size for one in indexes),
-        }
-    ]
+    entries = json.loads(capsys.readouterr().out)["recordings"]
+    assert [entry["end"] for entry in entries] == ["2023-11-14T22:13:20Z"] * 2
 
 
 OFFERED = {

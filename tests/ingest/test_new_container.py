@@ -6,39 +6,23 @@ from pathlib import Path
 
 from restock.ingest.containers import open_recording as opening
 from restock.ingest.containers.open_recording import open_recording, recordings_in
-from restock.ingest.containers.storage import (
-    Container,
-    Damage,
-    Extra,
-    Integrity,
-    Metadata,
-    Packed,
-    Watch,
-    unwatched,
-)
+from restock.ingest.containers.storage import Container, Storage, Watch, unwatched
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
 MAGIC = b"#JSONLINES\n"
 
 
-class JsonLines:
+class JsonLines(Storage):
     """A line a message: its time and its JSON; all of one topic."""
 
-    from_ros2 = False
-    integrity: Integrity = "unverified"
-
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+        super().__init__()
         lines = [json.loads(line) for line in path.read_text().splitlines()[1:]]
         self.stamps = [line["ns"] for line in lines]
         self.payloads = [json.dumps(line["message"]).encode() for line in lines]
         self.channels = {1: Channel(1, "/speed", "Speed", "json")}
         self.counts = {1: len(lines)}
         self.span_ns = (min(self.stamps), max(self.stamps)) if lines else None
-        self.damage: list[Damage] = []
-        self.notes: list[str] = []
-        self.extras: list[Extra] = []
-        self.metadata: list[Metadata] = []
-        self.packed: list[Packed] = []
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         if 1 in channels:

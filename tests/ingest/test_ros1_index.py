@@ -138,3 +138,16 @@ def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> 
         reasons = [account.reasons for account in recording.accounts.values()]
         assert [list(one) for one in reasons] == [[lost.reason]] * 2  # each topic's own share
         assert sum(one[lost.reason] for one in reasons) == lost.messages
+
+
+def test_damage_between_chunks_costs_no_more_than_the_chunk_in_it(bag: Path) -> None:
+    whole = bag.read_bytes()
+    second = whole.index(b"op=\x05", whole.index(b"op=\x05") + 1)
+    content = bytearray(whole)
+    content[second - 40 : second + 40] = bytes(80)  # its record, and the index behind the first
+    bag.write_bytes(content)
+    with open_recording(bag) as recording:
+        there = sum(len(one) for one in recording.read({"/flag": [], "/number": []}).values())
+        (lost,) = recording.lost_messages
+    assert there == 2 * ROWS - (lost.messages or 0)
+    assert 0 < there < 2 * ROWS

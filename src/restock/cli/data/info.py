@@ -185,7 +185,6 @@ def describe_recording(
                 }
                 for topic in recording.topics.values()
             },
-            "chunks": [packed._asdict() for packed in recording.packed],
             "attachments": [
                 {"name": extra.name, "media_type": extra.media_type, "size_bytes": extra.size_bytes}
                 for extra in recording.extras
@@ -257,18 +256,6 @@ def _size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 999_950 else f"{count / 1e3:.1f} kB"
 
 
-def _share(stored: int, plain: int | None) -> str:
-    return f"{_size(stored)}, {stored / plain:.0%} of {_size(plain)}" if plain else _size(stored)
-
-
-def _packed(chunks: dict[str, Any]) -> str:
-    """Describe in one line how a file's messages are compressed."""
-    stored, plain = chunks["stored_bytes"], chunks["plain_bytes"]
-    kind = chunks["compression"] or "not compressed"
-    number = counted(chunks["chunks"], "chunk")
-    return visible(f"{number}, {kind}: {_share(stored, plain if chunks['compression'] else None)}")
-
-
 def _names(names: list[str]) -> str:
     """List names, each once, and how often it occurs if that is more than once."""
     often = Counter(names)
@@ -317,8 +304,6 @@ def _print(entry: dict[str, Any]) -> None:
     coded = ["encoding"] if mixed and entry["format"] != "ros1" else []
     qos = ["offered QoS"] if any(row["offered QoS"] for row in rows) else []
     shown = ["topic", "type", *coded, "messages", "rate Hz", *clock, *qos]
-    for packed in entry["chunks"]:
-        sys.stdout.write(f"{_packed(packed)}\n")
     output.print_table(rows, shown)
     if not clocked:
         sys.stdout.write("not decoded, so damage may be missed: --clocks reads every message\n")
