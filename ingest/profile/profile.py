@@ -78,7 +78,6 @@ from restock.ingest.task.robot import Limiter, Robot, beyond_limits, refuse_beyo
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import PLAN_SIGNALS, Noise, Task
 from restock.ingest.task.task_sql import Past, own_sql, own_values
-from restock.renamed import PROFILE_KEYS
 from restock.toml import Checked, changed, parse_toml, read_toml, toml_value, typed
 
 ELSEWHERE = "elsewhere"
@@ -289,7 +288,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
         if not isinstance(term, list):
             what = f'`task.reward_terms.{name}` must be [WEIGHT, "SQL"], got {term!r}'
             raise ConfigError(what, where=where)
-    profile = typed(document, Profile, where=where, renamed=PROFILE_KEYS)
+    profile = typed(document, Profile, where=where)
     if not profile.inputs.scans:
         profile = without_lidar(profile)  # whatever number of sectors it gives
     check_profile(profile, where)

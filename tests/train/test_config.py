@@ -88,13 +88,13 @@ def test_a_run_that_cannot_be_opened_leaves_no_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
-def test_removed_key_is_refused_with_its_row_in_renamed(tmp_path: Path) -> None:
+def test_a_renamed_key_is_refused_with_its_new_name(tmp_path: Path) -> None:
     old = tmp_path / "old.toml"
-    old.write_text("[guard]\nmargin = 0.3\n")
-    for path, overrides in ((old, []), (None, ["guard.margin=0.3"])):
-        with pytest.raises(ConfigError, match="unknown key `guard`") as refused:
+    old.write_text("[network]\nensemble = 3\n")
+    for path, overrides in ((old, []), (None, ["network.ensemble=3"])):
+        with pytest.raises(ConfigError, match=r"unknown key `network\.ensemble`") as refused:
             load_config(path, overrides)
-        assert "it was removed" in str(refused.value)
+        assert "network.members" in str(refused.value)
 
 
 def test_the_default_shares_are_those_of_the_environment_itself() -> None:
