@@ -58,12 +58,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
     plan = plan_evaluation(run, policies=("agent",), episodes=KINDS)
     for recorded in read_evaluations(run).to_pylist()[:2]:
-        result, frames, states = drive_again(plan, recorded)
+        result, frames = drive_again(plan, recorded)
         assert differing_fields(recorded, result) == []
         assert result.undiscounted_return == pytest.approx(recorded["return"], abs=1e-4)
-        assert len(frames) == len(states) == round(recorded["time_s"] / 0.2) + 1
-        end = states[-1]["robot"]
-        assert end[:2] == pytest.approx([recorded["end_x_m"], recorded["end_y_m"]], abs=0.3)
+        assert len(frames) == round(recorded["time_s"] / 0.2) + 1
 
 
 def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, capsys):
@@ -86,7 +84,6 @@ def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, capsys):
     (figure,) = section.figures
     assert figure.title == "wheel slip: worst failure"
     assert figure.moving.startswith("data:image/webp;base64,")
-    assert figure.widest.count("<g transform") == 6
     (run / "eval" / "films" / "films.json").write_text("{}")
     assert films_section(cast(Any, facts)) is None
     assert "could not be read" in facts.missing[0]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -24,16 +24,12 @@ from restock.arrays import F32, Ints
 from restock.errors import RestockError, RunError, policy_words, quoted
 from restock.files import write_bytes, write_text
 from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy
-from restock.train.evaluation.evaluate import EpisodeResult, Stepper, run_episodes
+from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Step
 from restock.train.twin.env.render import draw_map
-from restock.train.twin.floors.layout import PEOPLE
 from restock.train.twin.physics.episode import EpisodeSpec
-
-if TYPE_CHECKING:
-    from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 FOLDER = Path("eval") / "films"  # in a run
 DOCUMENT = "films.json"
@@ -43,7 +39,6 @@ OTHER_RUN = "run:"
 CAPTION_PIXELS, GAP_PIXELS = 44, 12
 MAX_FRAMES = 60
 FRAME_MS = 100
-STRIP = 6  # frames of the strip, first and last among them
 _SAME = ("success", "bumps", "time_s", "failure")
 
 
@@ -126,7 +121,7 @@ def film_evaluation(
     folder.mkdir(parents=True, exist_ok=True)
     paths, films, missing = [], [], []
     for scene in chosen:
-        result, frames, states = drive_again(plan, scene.row)
+        result, frames = drive_again(plan, scene.row)
         if progress is not None:
             progress(1)
         if differing := differing_fields(scene.row, result):
@@ -142,7 +137,7 @@ def film_evaluation(
         file = folder / f"{scene.name}.webp"
         write_bytes(file, _animation(frames))
         paths.append(file)
-        films.append(_document(scene, file.name, states))
+        films.append(_document(scene, file.name))
     write_text(folder / DOCUMENT, json.dumps({"films": films}) + "\n")
     return paths, missing
 
@@ -154,7 +149,7 @@ def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8
     it.
     """
     try:
-        result, frames, _ = drive_again(plan, row)
+        result, frames = drive_again(plan, row)
     except RestockError:
         return None
     return None if differing_fields(row, result) else frames
@@ -162,41 +157,14 @@ def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8
 
 def drive_again(
     plan: EvaluationPlan, row: dict[str, Any]
-) -> tuple[EpisodeResult, list[NDArray[np.uint8]], list[dict[str, Any]]]:
+) -> tuple[EpisodeResult, list[NDArray[np.uint8]]]:
     """Drive an episode once more with the policy that drove it.
 
-    Returns how it went, a picture of each step (H, W, 3), and where everything was (metres and
-    radians, in the map frame).
+    Returns how it went, and a picture of each step (H, W, 3).
     """
-    frames: list[NDArray[np.uint8]] = []
-    states: list[dict[str, Any]] = []
-
-    def watched(env: WarehouseVectorEnv) -> Stepper:
-        def look() -> None:
-            frames.append(draw_map(env, 0))
-            states.append(scene_state(env, len(states) * env.task.control_period_s))
-
-        def step(_: F32, action: Ints) -> Step:
-            if not frames:
-                look()
-            made = env.step(action)
-            look()
-            return made
-
-        return step
-
-    return drive_row(plan, row, watched), frames, states
-
-
-def drive_row(
-    plan: EvaluationPlan,
-    row: dict[str, Any],
-    watched: Callable[[WarehouseVectorEnv], Stepper],
-) -> EpisodeResult:
-    """Drive an episode once more with its policy, stepping the twin by what `watched` makes."""
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
-    profile = profile_of_run(plan.run)
+    profile, frames = profile_of_run(plan.run), list[NDArray[np.uint8]]()
     task = profile.task
     env = WarehouseVectorEnv(
         1,
@@ -207,6 +175,14 @@ def drive_row(
         nav_command=profile.inputs.nav_command is not None,
         autoreset_mode=AutoresetMode.DISABLED,
     )
+
+    def step(_: F32, action: Ints) -> Step:
+        if not frames:
+            frames.append(draw_map(env, 0))
+        made = env.step(action)
+        frames.append(draw_map(env, 0))
+        return made
+
     (result,) = run_episodes(
         env,
         make_policy(row["policy"], plan),
@@ -215,10 +191,10 @@ def drive_row(
         time_limit_steps=task.time_limit_steps,
         goal=task.goal != "none",
         discount=plan.config.loss.discount,
-        step=watched(env),
+        step=step,
     )
     env.close()
-    return result
+    return result, frames
 
 
 def differing_fields(row: dict[str, Any], result: EpisodeResult) -> list[str]:
@@ -229,40 +205,7 @@ def differing_fields(row: dict[str, Any], result: EpisodeResult) -> list[str]:
     return differing + (["end"] if float(np.abs(ends).max()) > 1e-3 else [])
 
 
-def scene_state(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
-    """Return where everything is: robot, people, forklifts, pallets, patches, plan and goal.
-
-    In metres and radians in the map frame, rounded to millimetres.
-    """
-    sim, navigation = env.simulation, env.navigation
-    traffic = sim.traffic
-    here = np.isfinite(sim.traffic.gaps_m(sim.middle(sim.pose()))[0])
-    agents = [
-        [*traffic.position_m[0, agent].tolist(), float(traffic.heading_rad[0, agent])]
-        for agent in range(len(here))
-    ]
-    floor = env.floor_of(0)
-
-    def rounded(values: Any) -> Any:
-        return np.round(np.asarray(values, np.float64), 3).tolist()
-
-    def inside(place: Sequence[float]) -> bool:
-        return 0 <= place[0] <= floor.width_m and 0 <= place[1] <= floor.depth_m
-
-    return {
-        "time_s": round(time_s, 2),
-        "robot": rounded(sim.middle(sim.pose())[0]),
-        "people": rounded([a for i, a in enumerate(agents) if i < PEOPLE and inside(a)]),
-        "forklifts": rounded([a for i, a in enumerate(agents) if i >= PEOPLE and inside(a)]),
-        "pallets": rounded([p for p in sim.pallets[0].tolist() if inside(p)]),
-        "patches": rounded([p[:4] for p in sim.patches[0].tolist() if inside(p)]),
-        "plan": rounded(navigation.plans_m[0]),
-        "goal": rounded(navigation.goals_m[0]),
-    }
-
-
-def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str, Any]:
-    picked = np.unique(np.linspace(0, len(states) - 1, STRIP).round().astype(int))
+def _document(scene: Scene, file: str) -> dict[str, Any]:
     row = scene.row
     return {
         "kind": scene.kind,
@@ -279,8 +222,6 @@ def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str
         "version": row["version"],
         "rescued_from": None if scene.other is None else scene.other["policy"],
         "other_failure": None if scene.other is None else scene.other["failure"],
-        "track": [state["robot"][:2] for state in states],
-        "strip": [{**states[i], "step": i} for i in picked.tolist()],
     }
 
 

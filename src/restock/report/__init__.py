@@ -26,23 +26,18 @@ else:
     __getattr__, __dir__, _ = lazy(__name__)
 
 
-def build_report(
-    run: Path | str, out: Path | str | None = None, figures: Path | str | None = None
-) -> Path:
+def build_report(run: Path | str, out: Path | str | None = None) -> Path:
     """Write the report of a run directory; returns its path.
-
-    If a folder `figures` is named, each figure is also written there, as SVG and PNG.
 
     Raises:
         RunError: no run there, or one with nothing to report on yet.
     """
-    from restock.report.history import history_page as history_page
     from restock.report.look.write import write_page
     from restock.report.run.facts import gather
     from restock.report.run.page import page
 
     content = page(gather(Path(run)))
-    return write_page(content, out if out is not None else Path(run) / "report.html", figures)
+    return write_page(content, out if out is not None else Path(run) / "report.html")
 
 
 __all__ = ["build_report"]  # the others serve the verbs

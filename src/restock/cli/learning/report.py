@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from restock.cli.output import print_json, progress
-from restock.cli.words import Positional
-from restock.errors import ConfigError
+from restock.cli.words import Positional, refuse
 
 
 @dataclass
@@ -37,9 +36,6 @@ class ReportCommand:
     all of them; or a store, for a page about its gap only."""
     out: Path | None = None
     """Where to write the page. Default: RUN/report.html. Replaces an existing file."""
-    figures: Path | None = None
-    """Also write each figure of the page as SVG and PNG into this folder. Replaces files of the
-    same names."""
     card: bool = False
     """Write the replay card instead of the page."""
     json: bool = False
@@ -54,12 +50,8 @@ class ReportCommand:
         from restock.train.twin.calibration.twin_gap import FOLDER, read_gap
 
         if self.card:
-            for flag, path in (("--out", self.out), ("--figures", self.figures)):
-                if path is not None:
-                    raise ConfigError(
-                        "applies only to the page: the card is written to the run's directory",
-                        where=flag,
-                    )
+            why = "applies only to the page: the card is written to the run's directory"
+            refuse(self, ("out",), why, remedy="leave it out")
             card, markdown = write_card(self.run_directory)
             if self.json:
                 print_json(card)
@@ -67,20 +59,15 @@ class ReportCommand:
                 sys.stdout.write(markdown)
             return None
         expect_file_place(self.out, "--out", run=self.run_directory)
-        if self.figures is not None:
-            expect_file_place(self.figures / "figure.svg", "--figures", run=self.run_directory)
         with progress("report", None):
             if is_store(Location.of(self.run_directory)):
                 folder = self.run_directory / FOLDER
-                content = gap_page(read_gap(folder))
-                path = write_page(content, self.out or folder / "index.html", self.figures)
+                path = write_page(gap_page(read_gap(folder)), self.out or folder / "index.html")
             elif self.run_directory.is_dir() and kind_beside(self.run_directory) is None:
-                content = history_page(self.run_directory)
-                path = write_page(
-                    content, self.out or self.run_directory / "report.html", self.figures
-                )
+                page = self.out or self.run_directory / "report.html"
+                path = write_page(history_page(self.run_directory), page)
             else:
-                path = build_report(self.run_directory, self.out, self.figures)
+                path = build_report(self.run_directory, self.out)
         if self.json:
             print_json({"report": str(path), "bytes": path.stat().st_size})
         else:

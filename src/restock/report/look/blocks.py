@@ -34,23 +34,17 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing and what is said of it; `name` is its file's."""
+    """A drawing and what is said of it; or, without a drawing, an animation."""
 
-    drawing: Drawing
+    drawing: Drawing = Drawing({})
     title: str = ""
     caption: str = ""
-    name: str = ""
-    moving: str = ""  # a data URI of an animation, which is shown above the drawing
-
-    @property
-    def widest(self) -> str:
-        """Return the SVG at its widest."""
-        return self.drawing.svg[max(self.drawing.svg)]
+    moving: str = ""  # a data URI of the animation
 
     @property
     def kind(self) -> str:
         """Return the CSS class: half of a line, or all of it."""
-        return "half" if max(self.drawing.svg) < 500 else "full"
+        return "half" if max(self.drawing.svg, default=0) < 500 else "full"
 
     @property
     def shown(self) -> list[tuple[str, str, dict[str, Any] | None]]:

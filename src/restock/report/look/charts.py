@@ -45,11 +45,7 @@ POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d")
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
 FEW_POINTS = 10  # a line of at most so many points shows each of them
-STEPS = {
-    "env_steps": "environment steps",
-    "gradient_steps": "updates",
-    "capacity": "newest rows kept",
-}
+STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
 SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; as an axis' `format`, zero is 0k
 LETTER_PX = 5.8  # width of a letter of a label, about
 WIDER_FONT = 0.15  # by so much a label may be wider in a browser than in the font it was drawn with
@@ -59,6 +55,7 @@ CONFIG = {
     "background": "transparent",
     "font": FONT,
     "view": {"stroke": None},
+    "mark": {"tooltip": True},  # of the fields that the chart encodes
     "axis": {
         "labelColor": "#475569",
         "titleColor": "#475569",
@@ -278,13 +275,10 @@ def lines(
     points: bool = False,
     steps: bool = False,
     marker: float | None = None,
-    marked: str = "kept",
-    log: bool = False,
 ) -> Drawing:
-    """Draw lines over training, by `env_steps` or `gradient_steps`, or over a capacity.
+    """Draw lines over training, by `env_steps` or `gradient_steps`.
 
-    With `steps`, values hold until the next one. `marker` is a vertical line (the step of the kept
-    checkpoint), and `marked` its text. With `log`, the x axis is logarithmic.
+    With `steps`, values hold until the next one. `marker` is the step of the kept checkpoint.
     """
     names = ordered(rows, series, colours)
     # A line of a single point would not be seen.
@@ -298,7 +292,6 @@ def lines(
                 f"{x}:Q",
                 title=STEPS[x],
                 axis=x_axis(width),
-                scale=alt.Scale(type="log") if log else alt.Undefined,
             ),
             color=coloured(series, names, colours, width),
         )
@@ -309,7 +302,7 @@ def lines(
         ).encode(y=alt.Y(f"{y}:Q", title=y_title, axis=axis, scale=y_scale))
         layers = [line]
         if marker is not None:
-            at = plot([{"at": marker, "text": marked}]).encode(x="at:Q")
+            at = plot([{"at": marker, "text": "kept"}]).encode(x="at:Q")
             early = marker < max(row[x] for row in rows) / 2  # before it, no room beside the axis
             layers.append(at.mark_rule(strokeDash=[4, 3], color="#0f172a"))
             layers.append(

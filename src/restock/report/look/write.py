@@ -1,7 +1,7 @@
-"""Write a page: the template and style filled in, live charts, and each figure as files.
+"""Write a page: the template and style filled in, and live charts.
 
 Figures are drawn in the colours of the light page. The style sheet exchanges them on a screen that
-prefers dark; what is printed, and figures written as files, stay light. A chart's SVG is what is
+prefers dark; what is printed stays light. A chart's SVG is what is
 printed and what is shown without scripts. A script replaces it by Vega's drawing of the same
 specification, to which `live` adds interaction: the values of a mark, and one series of a legend
 alone. Specifications and rows are in the page once, as JSON. The runtime is in it, too, compressed,
@@ -15,7 +15,7 @@ import gzip
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from datetime import UTC, datetime
 from functools import cache
@@ -28,21 +28,13 @@ import vl_convert
 from markupsafe import Markup, escape
 
 from restock import __version__
-from restock.files import write_bytes, write_text
-from restock.report.look.blocks import Figure, Section, Table, dark_rules, words
+from restock.files import write_text
+from restock.report.look.blocks import Table, dark_rules
 from restock.report.look.charts import CONFIG
 
-PNG_SCALE = 2.0  # pixels a CSS pixel
 
-
-def write_page(
-    content: dict[str, Any],
-    out: Path | str,
-    figures: Path | str | None = None,
-    *,
-    markdown: bool = False,
-) -> Path:
-    """Write a page, and its figures into the folder `figures`; returns the page's path.
+def write_page(content: dict[str, Any], out: Path | str, *, markdown: bool = False) -> Path:
+    """Write a page; returns its path.
 
     With `markdown` the same words and tables are written beside it, as FILE.md.
 
@@ -72,8 +64,6 @@ def write_page(
         "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC{source}",
     }
     write_text(out, template.render({"verdict": None, **content, **own}))
-    if figures is not None:
-        write_figures(sections, Path(figures))
     if markdown:
         write_text(out.with_suffix(".md"), as_markdown(content))
     return out
@@ -108,41 +98,6 @@ def _plain(value: Any) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("\n", " ")
 
 
-def write_figures(sections: Sequence[Section], folder: Path) -> list[Path]:
-    """Write each figure as SVG and PNG, on white, named after its section and title."""
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, figure in _named(sections):
-        svg = _on_white(figure.widest)
-        written += [folder / f"{name}.svg", folder / f"{name}.png"]
-        write_text(written[-2], svg)
-        write_bytes(written[-1], vl_convert.svg_to_png(svg, scale=PNG_SCALE))
-    return written
-
-
-def _named(sections: Sequence[Section]) -> Iterator[tuple[str, Figure]]:
-    taken: set[str] = set()
-    for section in sections:
-        for number, figure in enumerate(section.figures, start=1):
-            text = figure.name or figure.title.lower() or str(number)
-            short = "-".join(re.findall(r"[a-z0-9]+", text.lower())[:6])
-            name = section.id if short in ("", "1") else f"{section.id}-{short}"
-            name = name if name not in taken else f"{name}-{number}"
-            taken.add(name)
-            yield name, figure
-
-
-def _on_white(svg: str) -> str:
-    """Return a drawing that stands alone: on white, as complete XML."""
-    box = re.search(r'viewBox="([-\d.]+) ([-\d.]+) ([-\d.]+) ([-\d.]+)"', svg)
-    if box is None:
-        return svg
-    x, y, width, height = box.groups()
-    ground = f'<rect x="{x}" y="{y}" width="{width}" height="{height}" fill="#ffffff"/>'
-    end = svg.index(">") + 1
-    return svg[:end] + ground + svg[end:]
-
-
 def _code(text: str) -> Markup:
     """Return a sentence as escaped HTML, with text in backticks set as code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
@@ -151,9 +106,6 @@ def _code(text: str) -> Markup:
 Spec = dict[str, Any]
 
 HIDDEN_SHARE = 0.12  # share of a series' opacity while another is isolated
-HALO_PX2, HALO_OPACITY = 280, 0.35  # halo of a line's point below the pointer
-_POSITIONS = ("x", "x2", "y", "y2")
-_ENDS = ("", "low", "high")  # endings of the names of an interval's columns
 _LICENCE = "/* Vega, Vega-Lite, Vega-Embed: (c) University of Washington, BSD-3-Clause */\n"
 
 
@@ -198,28 +150,30 @@ def policy(charts: bool) -> str:
 
 
 def live(spec: Spec) -> Spec:
-    """Turn the specification of a still chart into one that answers the pointer."""
+    """Turn the specification of a still chart into one that answers the pointer.
+
+    Vega-Lite makes the tooltips (`charts.CONFIG`). A line gets them from points that are not drawn,
+    and a click on a name of the legend shows that series alone, a second one all again.
+    """
     found = deepcopy(spec)
-    rows = found.get("datasets", {})
     for name in ("config", "$schema"):
         found.pop(name, None)
     inner = found["spec"] if "facet" in found else found
-    inner.setdefault("layer", None)
-    if inner["layer"] is None:  # one mark alone: a layer of one
-        del inner["layer"]
-        inner["layer"] = [{name: inner.pop(name) for name in ("mark", "encoding")}]
-    units = inner["layer"]
-    reported = _told([unit for unit in units if _is_of_rows(unit)], found.get("facet", {}), rows)
+    units = inner.get("layer", [inner])
+    for unit in units:
+        if _mark(unit)["type"] == "line" and not _mark(unit).get("point"):
+            unit["mark"] = {**_mark(unit), "point": "transparent"}
     series = next(filter(None, map(_series, units)), None)
-    if series is not None:
-        for number, unit in enumerate(of for of in units if _series(of) == series):
-            _isolate(unit, series, first=number == 0)
-    for unit in list(units):
-        if not _is_of_rows(unit):
-            continue
-        unit["encoding"].setdefault("tooltip", reported)
-        if _mark(unit)["type"] == "line":
-            units.append(_points(unit))
+    of_series = [unit for unit in units if series is not None and _series(unit) == series]
+    for unit in of_series:
+        full = _mark(unit).get("opacity", 1)
+        unit["encoding"]["opacity"] = {
+            "condition": {"param": "alone", "value": full},
+            "value": full * HIDDEN_SHARE,
+        }
+    if of_series:
+        select = {"type": "point", "fields": [series]}
+        of_series[0]["params"] = [{"name": "alone", "select": select, "bind": "legend"}]
     return found
 
 
@@ -228,95 +182,12 @@ def _mark(unit: Spec) -> Spec:
     return mark if isinstance(mark, dict) else {"type": mark}
 
 
-def _is_of_rows(unit: Spec) -> bool:
-    """Return whether a mark stands for rows, with a field on each axis."""
-    encoding = unit["encoding"]
-    return _mark(unit)["type"] != "text" and all(
-        "field" in encoding.get(axis, {}) for axis in ("x", "y")
-    )
-
-
 def _series(unit: Spec) -> str | None:
     """Return the field whose values the legend names, if it names several."""
     colour = unit["encoding"].get("color", {})
     several = len(colour.get("scale", {}).get("domain", ())) > 1
     named = colour.get("type") == "nominal" and colour.get("legend", {}) is not None
     return colour["field"] if several and named else None
-
-
-def _isolate(unit: Spec, series: str, *, first: bool) -> None:
-    """Let a click on a name of the legend show it alone, and a second one all again."""
-    full = _mark(unit).get("opacity", 1)
-    unit["encoding"]["opacity"] = {
-        "condition": {"param": "alone", "value": full},
-        "value": full * HIDDEN_SHARE,
-    }
-    if first:
-        select = {"type": "point", "fields": [series]}
-        unit.setdefault("params", []).append({"name": "alone", "select": select, "bind": "legend"})
-
-
-def _points(line: Spec) -> Spec:
-    """Add a line's points, wider than they are drawn and visible under the pointer."""
-    mark = {"type": "point", "filled": True, "size": HALO_PX2, "clip": True}
-    pointed = {"param": "pointed", "empty": False, "value": HALO_OPACITY}
-    select = {"type": "point", "on": "pointerover", "clear": "pointerout"}
-    return {
-        **{name: line[name] for name in ("data", "transform") if name in line},
-        "mark": mark | {name: _mark(line)[name] for name in ("color",) if name in _mark(line)},
-        "encoding": {**line["encoding"], "opacity": {"condition": pointed, "value": 0}},
-        "params": [{"name": "pointed", "select": select}],
-    }
-
-
-def _told(units: list[Spec], facet: Spec, rows: Mapping[str, Any]) -> list[Spec]:
-    """Return what the tooltip of a row says: names, numbers and ends of intervals."""
-    facets = [facet] if "field" in facet else list(facet.values())
-    found: dict[str, Spec] = {}
-    for channel in (*facets, *_channels(units)):
-        if "field" in channel and (channel.get("title") or channel["field"] not in found):
-            found.setdefault(channel["field"], channel)
-    reported = [_field(name, channel, units, rows) for name, channel in found.items()]
-    several = [one for one in reported if one is not None]
-    return sorted(several, key=lambda one: ("format" in one, _ENDS.index(_end(one["field"]))))
-
-
-def _channels(units: list[Spec]) -> Iterator[Spec]:
-    for name in ("color", *_POSITIONS):
-        for unit in units:
-            if name in unit["encoding"]:
-                yield unit["encoding"][name]
-
-
-def _field(name: str, channel: Spec, units: list[Spec], rows: Mapping[str, Any]) -> Spec | None:
-    """Return a field of the tooltip; None for a name that is the same everywhere."""
-    end = _end(name)
-    title = f"95 %, {end}" if end else channel.get("title") or words(name)
-    values = [row[name] for of in rows.values() for row in of if row.get(name) is not None]
-    numbers = [value for value in values if isinstance(value, int | float)]
-    if len(numbers) < len(values) or not numbers:
-        reported = {"field": name, "type": "nominal", "title": title}
-        return reported if len(set(map(str, values))) > 1 else None
-    whole = all(float(value).is_integer() for value in numbers)
-    form = ".1~%" if _is_share(name, units) else "," if whole and not end else ",.4~r"
-    return {"field": name, "type": "quantitative", "title": title, "format": form}
-
-
-def _end(name: str) -> str:
-    """Return `low` or `high` for the end of an interval."""
-    return next((end for end in _ENDS[1:] if f"_{name}".endswith(f"_{end}")), "")
-
-
-def _is_share(name: str, units: list[Spec]) -> bool:
-    """Return whether an axis that the mark is drawn along is in percent."""
-    encodings = [unit["encoding"] for unit in units]
-    along = {
-        channel[0]
-        for channel in _POSITIONS
-        if any(encoding.get(channel, {}).get("field") == name for encoding in encodings)
-    }
-    axes = [encoding.get(axis, {}).get("axis") or {} for encoding in encodings for axis in along]
-    return name == "share" or any("%" in axis.get("format", "") for axis in axes)
 
 
 @cache

@@ -142,7 +142,6 @@ def outcome_sections(
             f"Probability that {second} is better",
             "The probability that its return on an episode is higher, ties counting half, over "
             "all pairs of runs; 0.5 means no difference.",
-            name="probability of improvement",
         )
     ]
     if goal:
@@ -210,7 +209,7 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
         "curves",
         "How did they learn?",
         intro=f"Greedy success at the evaluations in training, mean over seeds. {bands}",
-        figures=[Figure(charts.curves(rows, arms), name="learning curves")],
+        figures=[Figure(charts.curves(rows, arms))],
     )
 
 
@@ -517,7 +516,6 @@ def _evidence(cells: list[dict[str, Any]]) -> Section:
             f"{words(measure).capitalize()}: by how much the policy was better",
             "The bounds after each pair hold at every moment. The policy is shown not to be worse"
             " once the lower one is above the dashed line, the margin.",
-            name=f"bounds of {words(measure)}",
         )
         for measure, of in by_measure.items()
     ]

@@ -70,8 +70,6 @@ class Facts:
     floors: int = 1  # number of floors that the run drives on
     recordings: Rows = field(default_factory=list)
     logged: Rows = field(default_factory=list)  # share of logged rows per condition
-    labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
-    reliability: Rows = field(default_factory=list)  # how reliable the labels' probabilities are
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     clones: list[CloneQuality] = field(default_factory=list)  # clones of the logs' drivers
     clean: dict[str, dict[str, Any]] = field(default_factory=dict)  # measures by policy, pooled
@@ -204,8 +202,6 @@ def _add_panel(facts: Facts) -> None:
             _add_floor(facts, held, store)
             facts.recordings = _store_rows(store, "recordings")
             facts.logged = _store_rows(store, "logged")
-            facts.labels = _store_rows(store, "labels")
-            facts.reliability = _store_rows(store, "reliability")
     except RestockError as error:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
 

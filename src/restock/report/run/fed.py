@@ -1,16 +1,13 @@
-"""Sections on the feed: rows and weights, missions practised, actions, and the buffer's size."""
+"""Sections on the feed: rows and weights, missions practised, and actions."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import altair as alt
 
-from restock.errors import RestockError
 from restock.replay.plan.exclusions import DAY_NS
 from restock.replay.plan.source_plan import TOLERANCE
-from restock.replay.store.audit import capacity_of_rows
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Drawing,
@@ -423,60 +420,3 @@ def _action_table(rows: Rows) -> list[Table]:
     title = "Preferred more than twice as often as in the logs"
     lines = [row | {"logged_share": share} for _, share, row in gaps[:_LINES]]
     return [Table(shown(lines, columns), title=title)] if lines else []
-
-
-def capacity_section(facts: Facts) -> Section | None:
-    """Return the section on capacity; None if nothing says what the logs cover."""
-    chosen = facts.config.get("ring_capacity")
-    ring = facts.config.get("config", {}).get("replay", {}).get("ring_capacity")
-    capacity = chosen or _of_panel(facts)
-    if capacity is None:
-        return None
-    requested = capacity["recommended"]
-    how = (
-        "chosen by task diversity"
-        if chosen
-        else (f"by the panel's diversity, {requested:,} would be enough")
-    )
-    intro = f"The ring holds {ring or 0:,} rows; {how}: {capacity['reason']}."
-    columns = {
-        **{"capacity": "newest rows", "cells": "cells", "cells_share": "share of cells"},
-        **{"conditions": "conditions", "episodes": "episodes"},
-        "effective_episodes": "effective episodes",
-    }
-    rows = [point for point in capacity["curve"] if point["capacity"] >= 64]
-    return Section(
-        "capacity",
-        "How large must the buffer be?",
-        intro=f"{intro} A cell is a condition x zone x action. A smaller first-in-first-out "
-        "buffer forgets whole cells, which no sampling can bring back.",
-        figures=[Figure(_cells_kept(capacity), "Cells covered by the newest logged rows")],
-        two=True,
-        tables=[Table(shown(rows, columns))],
-    )
-
-
-def _of_panel(facts: Facts) -> dict[str, Any] | None:
-    if facts.panel is None:
-        return None
-    try:
-        capacity = capacity_of_rows(facts.panel.meta)
-    except (RestockError, KeyError):  # a panel of an earlier Restock has no such columns
-        return None
-    return {**asdict(capacity), "reason": capacity.reason}
-
-
-def _cells_kept(capacity: dict[str, Any]) -> Drawing:
-    return charts.lines(
-        [{**point, "what": "logged rows"} for point in capacity["curve"]],
-        x="capacity",
-        y="cells_share",
-        series="what",
-        y_title="share of the cells ever seen",
-        colours={"logged rows": "#0f766e"},
-        percent=True,
-        domain=(0, 1),
-        marker=capacity["recommended"],
-        marked="recommended",
-        log=True,
-    )

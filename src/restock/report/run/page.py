@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 from typing import Any
 
 from markupsafe import Markup
@@ -12,27 +11,21 @@ from restock.errors import RestockError, counted, policy_words
 from restock.files import read_json
 from restock.report.look import blocks, charts, floor_map
 from restock.report.look.blocks import (
-    Drawing,
     Figure,
     Rows,
     Section,
     Table,
     count,
-    measured,
-    percent,
     pretty,
     span,
     words,
 )
-from restock.report.look.charts import FONT
-from restock.report.look.floor_map import SCALE, Box, FloorMap
+from restock.report.look.floor_map import FloorMap
 from restock.report.run.facts import CELL_M, NO_GOAL, Facts
-from restock.report.run.fed import actions_section, capacity_section, practice_section, sampled
+from restock.report.run.fed import actions_section, practice_section, sampled
 from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
-from restock.stats import interval_text, wilson
 from restock.train.run.kept_evaluations import cell_name, measured_row
-from restock.train.twin.floors.floors import open_floors
 
 
 def page(facts: Facts) -> dict[str, Any]:
@@ -44,8 +37,6 @@ def page(facts: Facts) -> dict[str, Any]:
         sampled(facts),
         practice_section(facts),
         actions_section(facts),
-        labels_section(facts),
-        capacity_section(facts) if facts.twin else None,
         learning(facts),
         critic(facts),
         floor_section(facts),
@@ -315,46 +306,6 @@ def provenance(facts: Facts) -> Section:
     )
 
 
-def labels_section(facts: Facts) -> Section | None:
-    """Return the section on labels; None if no recording of the store knows the truth."""
-    if not facts.labels:
-        return None
-    rows = [_score(row) for row in facts.labels]
-    reliability = _reliability_rows(facts.reliability)
-    tables = [Table(rows)]
-    if reliability:
-        title = "Steps with probability p: the share that is true should be p"
-        tables.append(Table(reliability, title=title))
-    return Section(
-        "labels",
-        "How good are the labels?",
-        intro="Compared with the true conditions of the simulator, over all recordings of the "
-        "store. An event is a run of steps of an episode; it counts as found within .4 s. "
-        "Ranges are 95 % (Wilson). Uncertain: the share of all steps that are uncertain by "
-        "the condition's probability.",
-        tables=tables,
-    )
-
-
-def _score(row: dict[str, Any]) -> dict[str, str]:
-    return {
-        "condition": words(row["condition"]),
-        "true steps": count(row["support"]),
-        "precision": measured(row, "precision", ".2f"),
-        "recall": measured(row, "recall", ".2f"),
-        "true events": count(row["event_support"]),
-        "event precision": _with_range(row["event_precision"], row["event_labelled"]),
-        "event recall": _with_range(row["event_recall"], row["event_support"]),
-        "uncertain": percent(row["uncertain_share"] or 0.0),
-    }
-
-
-def _with_range(value: float | None, events: int | None) -> str:
-    if value is None or not events:
-        return ""
-    return interval_text(value, *wilson(round(value * events), events))
-
-
 OWN = "agent"
 
 
@@ -450,9 +401,6 @@ def floor_section(facts: Facts) -> Section | None:
 
 
 FILMS, FILMS_FILE = "eval/films", "films.json"
-BODY_M = (0.62, 0.44)  # length and width of the robot as drawn
-PALLET_M, FORKLIFT_M, PERSON_M = (1.2, 0.8), (1.6, 0.8), 0.22
-GAP = 24  # SVG units between the frames
 
 
 def films_section(facts: Facts) -> Section | None:
@@ -482,9 +430,6 @@ def films_section(facts: Facts) -> Section | None:
 
 
 def _film(facts: Facts, film: dict[str, Any]) -> Figure:
-    floor = next(f for f in open_floors(film["layouts"]) if f.name == film["layout"])
-    racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in floor.racks]
-    plan = FloorMap(floor.width_m, floor.depth_m, racks)
     data = base64.b64encode((facts.run / FILMS / str(film["file"])).read_bytes()).decode()
     other = film["rescued_from"]
     how = (
@@ -494,81 +439,9 @@ def _film(facts: Facts, film: dict[str, Any]) -> Figure:
         else f"{film['failure']} after {film['time_s']:.1f} s"
     )
     name = words(cell_name(film["condition"], film["block"]))
-    times = ", ".join(f"{frame['time_s']:.1f}" for frame in film["strip"])
     return Figure(
-        _strip(plan, film),
-        f"{name}: {film['kind']}",
-        f"Seed {film['episode_seed']}, policy {film['version']}: {how}; "
-        f"{counted(film['bumps'], 'bump')}. The frames are at {times} s.",
+        title=f"{name}: {film['kind']}",
+        caption=f"Seed {film['episode_seed']}, policy {film['version']}: {how}; "
+        f"{counted(film['bumps'], 'bump')}. The file is {FILMS}/{film['file']}.",
         moving=f"data:image/webp;base64,{data}",
     )
-
-
-def _strip(plan: FloorMap, film: dict[str, Any]) -> Drawing:
-    """Put frames side by side, two or three in a line."""
-    width, height = plan.width_m * SCALE + GAP, plan.depth_m * SCALE + GAP
-    frames = [_frame(plan, frame, film["track"][: frame["step"] + 1]) for frame in film["strip"]]
-    drawn: dict[int, str] = {}
-    for pixels, columns in ((300, 2), (470, 3)):
-        lines = math.ceil(len(frames) / columns)
-        placed = "".join(
-            f'<g transform="translate({i % columns * width:.0f} {i // columns * height:.0f})">'
-            f"{frame}</g>"
-            for i, frame in enumerate(frames)
-        )
-        box = columns * width - GAP + 4, lines * height - GAP + 4
-        drawn[pixels] = (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{pixels}"'
-            f' height="{pixels * box[1] / box[0]:.0f}" viewBox="-2 -2 {box[0]:.0f} {box[1]:.0f}"'
-            f' role="img" aria-label="frames of the episode" font-family="{FONT}">{placed}</svg>'
-        )
-    return Drawing(drawn)
-
-
-def _frame(plan: FloorMap, frame: dict[str, Any], track: list[list[float]]) -> str:
-    slippery = [
-        plan.box(_within(plan, x - hx, y - hy, x + hx, y + hy), 'fill="#56b4e9" fill-opacity="0.5"')
-        for x, y, hx, hy in frame["patches"]
-    ]
-    goal = plan.at(*frame["goal"])
-    parts = [f'<circle cx="{goal[0]:.1f}" cy="{goal[1]:.1f}" r="12" fill="#009e73"/>']
-    dashed = 'stroke="#009e73" stroke-width="4" stroke-dasharray="10 8"'
-    parts.append(_line(plan, frame["plan"], dashed))
-    parts.append(_line(plan, track, 'stroke="#d55e00" stroke-width="6"'))
-    parts += [_box(plan, p, PALLET_M, "#84643a") for p in frame["pallets"]]
-    parts += [_box(plan, p, FORKLIFT_M, "#e69f00") for p in frame["forklifts"]]
-    for x_m, y_m, _ in frame["people"]:
-        x, y = plan.at(x_m, y_m)
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{PERSON_M * SCALE}" fill="#0072b2"/>')
-    parts.append(_box(plan, frame["robot"], BODY_M, "#d55e00"))
-    return plan.plan(slippery, parts)
-
-
-def _within(plan: FloorMap, x0: float, y0: float, x1: float, y1: float) -> Box:
-    """Clip a box to the floor."""
-    return max(x0, 0.0), max(y0, 0.0), min(x1, plan.width_m), min(y1, plan.depth_m)
-
-
-def _line(plan: FloorMap, points: list[list[float]], style: str) -> str:
-    path = " ".join("{:.1f},{:.1f}".format(*plan.at(x, y)) for x, y in points)
-    return f'<polyline points="{path}" fill="none" {style}/>'
-
-
-def _box(plan: FloorMap, pose: list[float], size_m: tuple[float, float], colour: str) -> str:
-    x, y = plan.at(pose[0], pose[1])
-    length, breadth = (side * SCALE for side in size_m)
-    return (
-        f'<rect x="{-length / 2:.1f}" y="{-breadth / 2:.1f}" width="{length:.1f}"'
-        f' height="{breadth:.1f}" rx="4" fill="{colour}" stroke="#ffffff" stroke-width="2"'
-        f' transform="translate({x:.1f} {y:.1f}) rotate({-math.degrees(pose[2]):.1f})"/>'
-    )
-
-
-def _reliability_rows(bins: Rows) -> Rows:
-    """Return a row for each condition: the true share of steps by tenths of probability."""
-    rows: dict[str, dict[str, Any]] = {}
-    for one in bins:
-        row = rows.setdefault(one["condition"], {"condition": one["condition"]})
-        row |= {f"{tenth / 10:g}+": row.get(f"{tenth / 10:g}+", "") for tenth in range(10)}
-        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
-    return list(rows.values())

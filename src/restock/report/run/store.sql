@@ -32,23 +32,6 @@ SELECT source_file, format, duration_s, episodes, transitions, recording_id, pro
 FROM recordings
 ORDER BY source_file;
 
--- name: labels
--- How good the labels are, where a simulator knew what was true, and how many are uncertain.
-SELECT scores.*, uncertain.share AS uncertain_share
-FROM pooled_label_scores AS scores
-LEFT JOIN (
-    SELECT condition, count(*) / (SELECT count(*) FROM transitions) AS share
-    FROM (SELECT unnest(uncertain) AS condition FROM transitions)
-    GROUP BY condition
-) AS uncertain USING (condition)
-ORDER BY condition;
-
--- name: reliability
-SELECT condition, from_probability, true_share, known
-FROM label_reliability
-WHERE known > 0
-ORDER BY condition, from_probability;
-
 -- name: logged
 -- The conditions that logged episodes met: the nearest thing to deployment that there is. An
 -- episode that met several counts for each; one that met none is nominal.
