@@ -130,29 +130,6 @@ def test_a_failed_evaluation_does_not_end_well(tmp_path: Path, fails: str) -> No
     assert stopped.remedies[0] == "no room"
 
 
-def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path: Path) -> None:
-    others = {"b": ["a", "c", "d"], "c": ["a", "b"], "d": ["a"]}  # by the floor's recording
-    kinds = {"b": ["nominal", "wheel_slip"], "c": ["nominal"]}
-
-    def verb(command: list[str]) -> int:
-        name = command[command.index("--recording") + 1]
-        elsewhere, episodes = others[name], kinds.get(name, ["nominal", "wheel_slip"])
-        facts = {"made_from": "scans", "width_m": 5, "depth_m": 5, "goals": 3, "aisle_segments": 0}
-        sys.stdout.write(
-            json.dumps({**facts, "episodes": episodes, "elsewhere": elsewhere, "notes": []})
-        )
-        return 0
-
-    said: list[str] = []
-    way = Way(StartCommand(("bag",), out=tmp_path), Work(tmp_path, verb, said.append))
-    found = {"episodes": ["nominal", "wheel_slip"], "elsewhere": ["b", "c", "d"]}
-    floor = Ended("floor", "", "done", document=found)
-    # b has a floor; c has one without room for wheel slip, and d lies on it.
-    assert way._further_floors(floor) == (tmp_path / "floor-2.toml",)
-    assert any("floor-3.toml is not used: it has no room for wheel_slip" in line for line in said)
-    assert way._further_floors(Ended("floor", "", "planned")) == ()
-
-
 class Parked(Drive):
     """A bag without commands."""
 

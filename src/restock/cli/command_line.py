@@ -5,15 +5,12 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import io
 import os
-import re
 import shutil
 import sys
 import textwrap
 import typing
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Union
 
@@ -24,10 +21,8 @@ from restock.cli.words import Positional, Repeated, declared
 from restock.errors import ConfigError, ExitCode
 
 _PREPARED: list[type[Any]] = []
-MIN_PROSE = 80  # columns that prose may take above narrower boxes, where the window has them
+MAX_PROSE = 100  # columns of a line of prose
 MIN_COLUMNS = 30  # columns: in a few, tyro lays its boxes out without end
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_OPTIONS = re.compile(r"\[(?:OPTIONS|-(?:[^][]|\[[^][]*\])*)\] ?")  # in a line of usage
 _MARKS = {Positional: tyro.conf.Positional, Repeated: tyro.conf.UseAppendAction}
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
@@ -42,7 +37,7 @@ def prepared(command: type[Any]) -> type[Any]:
     if command not in _PREPARED:
         _PREPARED.append(command)
         hints, texts = typing.get_type_hints(command, include_extras=True), _texts(command)
-        command.__doc__ = _joined(inspect.getdoc(command) or "")
+        command.__doc__ = inspect.getdoc(command) or ""
         for field in dataclasses.fields(command):
             marked = _prepared(hints[field.name], field.default)
             field.type = Annotated[marked, tyro.conf.arg(help=texts.get(field.name))]
@@ -63,12 +58,6 @@ def _texts(command: type[Any]) -> dict[str, str]:
             ):
                 texts[name] = " ".join(text.split())
     return texts
-
-
-def _joined(text: str) -> str:
-    """Join each paragraph of a docstring into one line; indented examples stay."""
-    paragraphs = text.split("\n\n")
-    return "\n\n".join(one if one.startswith(" ") else " ".join(one.split()) for one in paragraphs)
 
 
 def _prepared(hint: Any, default: Any) -> Any:
@@ -101,78 +90,28 @@ def _metavar(kind: Any) -> str:
 def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
     """Parse a command line with tyro, which exits after printing its help or its complaint."""
     command = prepared(command)
-    with printed(help_asked=bool({"-h", "--help"} & set(words))):
-        return tyro.cli(
-            command,
-            prog=prog,
-            description=command.__doc__,
-            args=words,
-            use_underscores=False,
-            config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
-        )
-
-
-class _Held(io.TextIOWrapper):
-    """A stream that keeps what is printed, and answers tyro as the real stdout would."""
-
-    def __init__(self, instead_of: io.TextIOBase) -> None:
-        encoding = (instead_of.encoding or "utf-8").lower()  # as tyro compares it
-        super().__init__(io.BytesIO(), encoding=encoding, newline="")
-        self._is_terminal = instead_of.isatty()
-
-    def isatty(self) -> bool:
-        return self._is_terminal
-
-    def text(self) -> str:
-        self.seek(0)
-        return self.read()
-
-
-@contextmanager
-def printed(*, help_asked: bool) -> Iterator[None]:
-    """Fit the help, or the complaint, that tyro prints in this block to the window."""
-    if shutil.get_terminal_size().columns < MIN_COLUMNS:
-        os.environ["COLUMNS"] = str(MIN_COLUMNS)
+    columns = max(shutil.get_terminal_size().columns, MIN_COLUMNS)
+    os.environ["COLUMNS"] = str(columns)
+    help_asked = bool({"-h", "--help"} & set(words))
     if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
         tyro._experimental_options["ansi_codes"] = False
-    if not help_asked:
-        yield
-        return
-    held = _Held(sys.stdout)  # type: ignore[arg-type]
-    try:
-        with redirect_stdout(held):
-            yield
-    finally:
-        sys.stdout.write(fitted(held.text(), shutil.get_terminal_size().columns))
+    if help_asked:  # tyro would not wrap it
+        sys.stdout.write(_wrapped(command.__doc__ or "", min(columns, MAX_PROSE)) + "\n\n")
+    return tyro.cli(
+        command,
+        prog=prog,
+        description="",
+        args=words,
+        use_underscores=False,
+        config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
+    )
 
 
-def fitted(text: str, columns: int) -> str:
-    """Wrap the prose of a help to the width of its boxes, with single empty lines between.
-
-    Empty lines in boxes are left out: tyro adds one where an option's text fills its last line.
-    """
-    given = [(line, _COLOUR.sub("", line)) for line in text.splitlines()]
-    boxes = [len(bare) for _, bare in given if bare[:1] in "╭│╰"]
-    width = max(min(MIN_PROSE, columns), *boxes, 0)
-    lines: list[str] = []
-    for line, bare in given:
-        if bare.startswith("usage:"):  # the boxes below list the options
-            line = bare = f"{_OPTIONS.sub('', bare).rstrip()} [OPTIONS]"
-        empty_in_box = bare.startswith("│") and not bare.strip("│ ")
-        if empty_in_box or (not bare and lines and not lines[-1]):
-            continue
-        if line == bare and len(line) > width and not line.startswith(" "):  # not an example
-            hanging = "  " if line.startswith("usage:") else ""
-            lines += textwrap.wrap(
-                line,
-                width,
-                subsequent_indent=hanging,
-                break_on_hyphens=False,
-                break_long_words=False,
-            )
-        else:
-            lines.append(line)
-    return "\n".join([*lines, ""])
+def _wrapped(text: str, columns: int) -> str:
+    """Wrap each paragraph of a docstring; examples, which are indented, stay."""
+    wrapper = textwrap.TextWrapper(columns, break_on_hyphens=False, break_long_words=False)
+    parts = text.split("\n\n")
+    return "\n\n".join(part if part.startswith(" ") else wrapper.fill(part) for part in parts)
 
 
 SHELLS = ("bash", "zsh", "tcsh", "fish")

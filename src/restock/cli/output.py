@@ -256,13 +256,6 @@ def _wrapped(text: str, columns: int) -> list[str]:
     return textwrap.wrap(text, columns, break_on_hyphens=False, subsequent_indent="  ")
 
 
-def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:
-    """Return whether a table of these rows must be fitted into the window or a pipe."""
-    names = list(columns if columns is not None else rows[0] if rows else ())
-    widths = (max([len(name), *(len(cell(row[name])) for row in rows)]) + GAP for name in names)
-    return sum(widths) > table_width()
-
-
 def reported(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
     """Return the columns in which any row has a value."""
     names = list(columns if columns is not None else rows[0] if rows else ())

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 import shutil
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -20,7 +18,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from restock import native
 from restock.cli import output
 from restock.cli.data.night import info_total
-from restock.cli.failures import GL, NO_GL
 from restock.cli.words import Option, Positional
 from restock.errors import ExitCode, RecordingError, counted, quoted, visible
 from restock.process import cores, install_command, installed
@@ -329,19 +326,6 @@ def _print(entry: dict[str, Any]) -> None:
 
 EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 FOR_DEVELOPERS = {"dev", "test", "site", "fuzz", "bench"}
-# Drawn elsewhere: a driver that is broken ends its process.
-DRAWS = """
-import os
-os.environ.setdefault("MUJOCO_GL", "egl")
-import mujoco
-model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-with mujoco.Renderer(model, 48, 64) as renderer:
-    renderer.update_scene(data)
-    renderer.render()
-"""
-DRAWS_S = 60
 
 
 class Finding(NamedTuple):
@@ -356,7 +340,7 @@ class Finding(NamedTuple):
 
 def check_machine() -> list[Finding]:
     """Look at what is installed here and what works."""
-    return [*_machine(), *_packages(), _torch(), _native(), _drawing(), _disk(Path.cwd())]
+    return [*_machine(), *_packages(), _torch(), _native(), _disk(Path.cwd())]
 
 
 def _machine() -> list[Finding]:
@@ -417,25 +401,6 @@ def _native() -> Finding:
         "install a C compiler and reinstall restock from source; only training is slower without it"
     )
     return Finding("works", "native code", "missing", state, remedy)
-
-
-def _drawing() -> Finding:
-    """Check whether MuJoCo can draw off screen, which only its cameras need."""
-    if not installed("mujoco"):
-        return Finding("works", "pictures", "missing", "no MuJoCo", install_command("train"))
-    command = [sys.executable, "-c", DRAWS]
-    try:
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=DRAWS_S)
-    except subprocess.TimeoutExpired:
-        return Finding("works", "pictures", "missing", f"no image was rendered within {DRAWS_S} s")
-    if ended.returncode == 0:
-        backend = os.environ.get("MUJOCO_GL", "egl")
-        return Finding("works", "pictures", "ok", f"MuJoCo renders off screen ({backend})")
-    why = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1]
-    remedy = "install libegl1; only the twin's cameras need it"
-    if os.environ.get(GL):
-        remedy = f"{GL} is {os.environ[GL]!r}: {NO_GL}"
-    return Finding("works", "pictures", "missing", why, remedy)
 
 
 def _disk(folder: Path) -> Finding:

@@ -21,9 +21,8 @@ class ReportCommand:
     the logs' positions and the agent's failures, and the provenance of the data.
 
     A gap between twin and logs that `restock twin gap` wrote to RUN/gap, or to the folder `gap` of
-    the panel's store, is shown in a section. For a STORE, the page shows only its gap, and is
-    STORE/gap/index.html. For another FOLDER, the page shows the runs in it in the order in which
-    they began, what changed from each to the next, and its stores week by week.
+    the panel's store, is shown in a section. For a FOLDER, the page shows the runs in it in the
+    order in which they began, what changed from each to the next, and its stores week by week.
 
     With --card, it writes the replay card instead: what the critic was fed, on one page of
     Markdown, to stdout, RUN/replay_card.md and RUN/replay_card.json.
@@ -32,8 +31,8 @@ class ReportCommand:
     """
 
     run_directory: Annotated[Path, Positional("RUN")]
-    """The directory that `restock train --out` wrote; a folder of runs and stores, for a page about
-    all of them; or a store, for a page about its gap only."""
+    """The directory that `restock train --out` wrote; or a folder of runs and stores, for a page
+    about all of them."""
     out: Path | None = None
     """Where to write the page. Default: RUN/report.html. Replaces an existing file."""
     card: bool = False
@@ -43,11 +42,8 @@ class ReportCommand:
 
     def run(self) -> int | None:
         from restock.files import expect_file_place
-        from restock.ingest.store.location import Location
         from restock.replay.places import kind_beside
-        from restock.replay.store.store import is_store
-        from restock.report import build_report, gap_page, history_page, write_card, write_page
-        from restock.train.twin.calibration.twin_gap import FOLDER, read_gap
+        from restock.report import build_report, history_page, write_card, write_page
 
         if self.card:
             why = "applies only to the page: the card is written to the run's directory"
@@ -60,11 +56,9 @@ class ReportCommand:
             return None
         expect_file_place(self.out, "--out", run=self.run_directory)
         with progress("report", None):
-            if is_store(Location.of(self.run_directory)):
-                folder = self.run_directory / FOLDER
-                path = write_page(gap_page(read_gap(folder)), self.out or folder / "index.html")
-            elif self.run_directory.is_dir() and kind_beside(self.run_directory) is None:
+            if self.run_directory.is_dir() and kind_beside(self.run_directory) is None:
                 page = self.out or self.run_directory / "report.html"
+                expect_file_place(page, "--out")  # of a store alone it would be lost with it
                 path = write_page(history_page(self.run_directory), page)
             else:
                 path = build_report(self.run_directory, self.out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -57,13 +57,13 @@ def schema_of(name: str) -> str:
     """Return the schema of a config, as JSON text."""
     from restock.toml import json_schema
 
-    kind, changed = _kinds()[name]
-    schema = json.loads(json_schema(kind, f"Restock {name}"))
-    changed(schema)
+    schema = json.loads(json_schema(_kinds()[name], f"Restock {name}"))
+    if name == "profile":
+        _conditions_in_files(schema)
     return json.dumps(schema, indent=1) + "\n"
 
 
-def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
+def _kinds() -> dict[str, type]:
     from restock.ingest.profile.profile import Profile
     from restock.replay.fleet.missions_file import MissionsFile
     from restock.replay.mixture.mixture import Mixture
@@ -72,18 +72,15 @@ def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
     from restock.train.twin.floors.floor_files import FloorFile
     from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
-    def as_it_is(_: dict[str, Any]) -> None:
-        """Change nothing, if the file is read as it is written."""
-
     return {
-        "train": (TrainConfig, as_it_is),
-        "mixture": (Mixture, as_it_is),
-        "profile": (Profile, _conditions_in_files),
-        "study": (Study, as_it_is),
-        "layout": (FloorFile, as_it_is),
-        "perturbation": (Perturbation, as_it_is),
-        "schedule": (Schedule, as_it_is),
-        "missions": (MissionsFile, as_it_is),
+        "train": TrainConfig,
+        "mixture": Mixture,
+        "profile": Profile,
+        "study": Study,
+        "layout": FloorFile,
+        "perturbation": Perturbation,
+        "schedule": Schedule,
+        "missions": MissionsFile,
     }
 
 

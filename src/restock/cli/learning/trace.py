@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,11 +15,6 @@ if TYPE_CHECKING:
     from restock.replay.trace.origin import Origin
 
 _LONG = 6  # entries of a list that are printed
-# Columns of audited rows on a narrow terminal; `row` shows the others.
-_NARROW = (
-    *("row", "source", "novelty", "condition", "strange"),
-    *("age_days", "action", "reward", "q", "td"),
-)
 _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
 
 
@@ -67,12 +61,8 @@ class TraceCommand:
             if self.json:
                 output.print_json(listed)
                 return
-            narrow = sys.stdout.isatty() and output.too_wide(listed)
-            columns = [name for name in _NARROW if name in listed[0]] if narrow else None
             first = "strangest" if listed and "novelty" in listed[0] else "largest TD error"
-            output.print_parted(listed, columns, key=("row",), title=f"rows, {first} first")
-            if narrow:
-                output.say("more columns are shown in a wider terminal, a file or a pipe")
+            output.print_parted(listed, key=("row",), title=f"rows, {first} first")
             if listed:
                 output.say(
                     f"`restock trace {quoted(self.place)} {listed[0]['row']}` traces one of them"

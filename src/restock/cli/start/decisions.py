@@ -214,7 +214,7 @@ def no_ways(to: Settings) -> str | None:
     from restock.train.twin.floors.floors import open_floors
 
     try:
-        logged_missions(Panel.open(to.panel), open_floors(to.layouts), ("nominal",))
+        logged_missions(Panel.open(to.panel), open_floors(str(to.floor)), ("nominal",))
     except ConfigError as error:
         return error.what
     return None
@@ -244,11 +244,11 @@ def evidence_lines(to: Settings) -> list[str]:
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
-    """Train on the floors, on these kinds of episode; none: all."""
+    """Train on the floor, on these kinds of episode; none: all."""
     from restock.toml import toml_value
     from restock.train.twin.missions import DEFAULT_CONDITIONS
 
-    settings = [f"env.layouts={to.layouts}"]
+    settings = [f"env.layouts={to.floor}"]
     shares = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in kinds}
     if kinds and len(shares) < len(DEFAULT_CONDITIONS):
         settings.append(f"env.conditions={toml_value(shares)}")

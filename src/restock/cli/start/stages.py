@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,7 +55,6 @@ class Settings:
     salvage: bool = False
     tags: tuple[str, ...] = ()  # each KEY=VALUE
     map: Path | None = None
-    further_floors: tuple[Path, ...] = ()  # for recordings in other frames
     train: tuple[str, ...] = ()  # further settings, each key=value
 
     @property
@@ -77,11 +76,6 @@ class Settings:
     @property
     def floor(self) -> Path:
         return self.out / "floor.toml"
-
-    @property
-    def layouts(self) -> str:
-        """Return all floors, as a run's config and evaluations take them."""
-        return ",".join(map(str, (self.floor, *self.further_floors)))
 
     @property
     def of_each_kind(self) -> str:
@@ -195,23 +189,14 @@ def mix(to: Settings) -> Stage:
 def floor(to: Settings) -> Stage:
     """Make the twin's floor from the user's map, else from scans, else from the path driven."""
     given = () if to.map is None else ("--map", str(to.map))
-    return _floor(to, to.floor, "The floor, as the recordings show it", given)
-
-
-def further_floor(to: Settings, recording: str, made: Path) -> Stage:
-    """Make the floor of a recording whose poses are in a frame of their own."""
-    return _floor(to, made, "The floor of another frame", ("--recording", recording))
-
-
-def _floor(to: Settings, made: Path, title: str, given: Sequence[str]) -> Stage:
-    picture = made.with_suffix(".png")
+    picture = to.floor.with_suffix(".png")
     words = ("twin", "layout", "--from", str(to.store), *given, *to.with_definitions)
     return Stage(
-        made.stem,
-        title,
-        [*words, "--out", str(made), "--out", str(picture)],
+        "floor",
+        "The floor, as the recordings show it",
+        [*words, "--out", str(to.floor), "--out", str(picture)],
         reads=own_file(to.map),
-        writes=(made, picture),
+        writes=(to.floor, picture),
         outcome=outcomes.floor,
     )
 

@@ -19,7 +19,6 @@ from restock.errors import ConfigError, ExitCode, RecordingError, counted, quote
 
 HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
 ODOMETRY = "--odometry-as-command"
-MAX_FLOORS = 6
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
 
@@ -185,7 +184,11 @@ class Way:
                 "floor is then made from the recordings",
                 self.again,
             )
-        to = self.to = replace(to, further_floors=self._further_floors(floor))
+        if others := floor.document.get("elsewhere"):
+            self._warn(
+                f"{counted(len(others), 'recording')} in other frames: their routes are not on the"
+                " floor"
+            )
         settings = decisions.practice_settings(to.profile)
         if floor.good:
             kinds, unseen = decisions.possible_kinds(to, floor.document)
@@ -209,30 +212,6 @@ class Way:
             return None
         self.to = replace(to, train=tuple(settings))
         return floor
-
-    def _further_floors(self, floor: Ended) -> tuple[Path, ...]:
-        """Make floors for recordings in other frames, and keep those with room for the same."""
-        kinds, used = set(floor.document.get("episodes", [])), []
-        left = list(floor.document.get("elsewhere", [])) if kinds else []
-        for number in range(2, MAX_FLOORS + 1):
-            if not left:
-                break
-            made = self.to.out / f"floor-{number}.toml"
-            further = self.work.do(stages.further_floor(self.to, left[0], made))
-            if not further.good:
-                left = left[1:]
-                continue
-            left = [name for name in left[1:] if name in further.document.get("elsewhere", [])]
-            if lacking := kinds - set(further.document["episodes"]):
-                self._warn(
-                    f"{made.name} is not used: it has no room for {', '.join(sorted(lacking))}"
-                )
-            else:
-                used.append(made)
-        if left:
-            others = counted(len(left), "recording")
-            self._warn(f"{others} in other frames: their routes are on none of the floors")
-        return tuple(used)
 
     def _fit(self) -> tuple[Ended, bool]:
         """Return the gap of the twin that is used, and whether that is the fitted one."""
@@ -375,29 +354,19 @@ class StartCommand:
         """Return the first path, or file in a folder, whose first bytes are a recording's.
 
         Raises:
-            RecordingError: none is; what is wrong with the other paths is printed before.
+            RecordingError: a path is none, or no file is a recording.
         """
         from restock.ingest.containers.open_recording import recordings_in, refuse_no_recording
 
-        errors: list[RecordingError] = []
-        for name in self.paths:
+        wrong: list[RecordingError] = []
+        for path in [path for name in self.paths for path in recordings_in(name)]:
             try:
-                found = recordings_in(name)
+                refuse_no_recording(path)
             except RecordingError as error:
-                errors.append(error)
-                continue
-            for path in found:
-                try:
-                    refuse_no_recording(path)
-                except RecordingError as error:
-                    errors.append(error)
-                else:
-                    return str(path)
-        for other in errors[:-1]:
-            sys.stderr.write(f"restock: {other}\n")
-        last = errors[-1]
-        known = "give a file, a bag's folder, or a folder of bags"
-        raise RecordingError(last.what, where=last.where, remedy=last.remedy or known)
+                wrong.append(error)
+            else:
+                return str(path)
+        raise wrong[0]
 
     def _check(self) -> None:
         """Check what is given beside the recordings, before anything is written.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from restock.cli import output
 from restock.cli.output import cell
-from restock.cli.words import Option, Positional, Repeated
+from restock.cli.words import Option, Positional, Repeated, refuse
 from restock.errors import ConfigError, RestockError
 
 if TYPE_CHECKING:
@@ -129,7 +129,8 @@ class LayoutCommand:
                 remedy="such as `restock twin layout default`, or `restock twin layout --from BAG`",
             )
         if self.floor is not None:
-            self._refuse_without_from()
+            given = ("recording", "map", "by", "profile", "footprint", "definitions", "zones")
+            refuse(self, given, "applies only with --from", remedy="give --from, too")
             return open_floor(self.floor), None
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.propose.footprint import parse_footprint
@@ -145,23 +146,6 @@ class LayoutCommand:
             definitions=self.definitions,
         )
         return surveyed.floor, surveyed
-
-    def _refuse_without_from(self) -> None:
-        for name in (
-            "recording",
-            "map",
-            "by",
-            "profile",
-            "footprint",
-            "definitions",
-            "zones",
-        ):
-            if getattr(self, name) is not None:
-                raise ConfigError(
-                    f"--{name} applies only with --from",
-                    where="restock twin layout",
-                    remedy=f"leave out --{name}, or give --from STORE or BAG",
-                )
 
 
 def _show(name: str, facts: dict[str, Any]) -> None:

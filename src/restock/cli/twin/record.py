@@ -70,7 +70,7 @@ class RecordCommand:
     rates: str | None = None
     """Rates of topics in Hz, e.g. odom=20,scan=5."""
     dry_run: bool = False
-    """Print what would be driven and written; write nothing."""
+    """Print what would be driven and written, as JSON; write nothing."""
     json: bool = False
     """Print one JSON document: {"path", "format", "missions", "messages", "topics", …}."""
 
@@ -127,8 +127,7 @@ class RecordCommand:
         refuse_existing(self.out)
         expect_place(self.out, RecordingError)
         if self.dry_run:
-            wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
-            output.print_json(wanted) if self.json else _print_plan(wanted)
+            output.print_json({"path": str(self.out), "dry_run": True, **plan.describe()})
             return
         if (origin := getattr(policy, "origin", None)) is not None:
             output.say(f"{plan.policy}: {origin.text}")
@@ -223,19 +222,3 @@ def _print_recording(done: dict[str, Any]) -> None:
                 f" it, of {done['missions'].get(kind, 0)} driven; no more were driven"
             )
     output.say(f"{done['handovers']} handovers; took {done['work_s']:.1f} s")
-
-
-def _print_plan(values: dict[str, Any]) -> None:
-    rows = [
-        {"": key, "would be": _in_words(value)}
-        for key, value in values.items()
-        if value not in (None, [], {})
-    ]
-    output.print_table(rows, ["", "would be"])
-
-
-def _in_words(value: Any) -> str:
-    if isinstance(value, dict):
-        items = value.items()
-        return ", ".join(f"{n} {v if isinstance(v, str) else f'{v:g}'}" for n, v in items)
-    return ", ".join(map(_in_words, value)) if isinstance(value, list) else str(value)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import altair as alt
 
 from restock.errors import counted
-from restock.replay.fleet.drift import OWN, Drift
+from restock.replay.fleet.drift import Drift
 from restock.replay.store.definitions import UNITS
 from restock.replay.store.definitions import unit as unit_of
 from restock.report.look import charts
@@ -35,7 +34,6 @@ def drift_sections(drift: Drift) -> list[Section | None]:
         _findings_section(drift),
         _overview_section(drift, own),
         _conditions_section(drift, own),
-        _differences_section(drift),
         _comparisons_section(own),
     ]
 
@@ -240,36 +238,6 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
     )
 
 
-def _differences_section(drift: Drift) -> Section | None:
-    """Show what sets a robot apart from the others of its site, changed or not."""
-    newest: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in drift.tests:
-        if row["against"] != OWN and row["part"] not in _BESIDE and row["verdict"] == "differs":
-            newest[row["robot"], row["signal"]] = row
-    if not newest:
-        return None
-    rows = [
-        {
-            "robot": row["robot"],
-            "site": row["site"],
-            "signal": signal_name(row),
-            drift.every: str(row["period"]),
-            "the others": value_text(row["reference_value"]),
-            "this robot": value_text(row["value"]),
-            "difference": change_text(row),
-        }
-        for row in sorted(newest.values(), key=lambda row: -row["size"])
-    ]
-    return Section(
-        "differences",
-        "Robots that differ from the others",
-        intro="The newest difference of each signal from the mean of the other robots of the "
-        "site. Robots may differ since they were built: that alone is not drift. In a small "
-        "fleet, one robot that changed also moves the mean with which the others are compared.",
-        tables=[Table(rows[:40])],
-    )
-
-
 def _comparisons_section(own: Rows) -> Section | None:
     """Show the newest comparison of each hardware signal, with its sizes of effect."""
     newest: dict[tuple[str, str], dict[str, Any]] = {}
@@ -298,14 +266,14 @@ def _comparisons_section(own: Rows) -> Section | None:
         "The newest comparison of each signal",
         intro="Changed signals come first. Undecided: neither a change nor its absence is shown; "
         "more drives would decide. Samples: now / reference. Cliff's delta and the "
-        "Kolmogorov-Smirnov distance compare episodes: 0 is no difference, 1 no overlap.",
+        "Kolmogorov-Smirnov distance compare episodes: 0 is no difference, 1 no overlap. "
+        "docs/coverage.md says what each signal is.",
         tables=[
             Table(
                 rows[:120],
                 title=counted(min(len(rows), 120), "comparison"),
                 folded=len(rows) > MAX_ROWS,
             ),
-            Table(meanings(newest.values()), title="What the signals are", folded=True),
         ],
     )
 
@@ -319,22 +287,6 @@ def _newest(rows: Rows) -> Rows:
     """Return the rows of the newest periods."""
     kept = sorted({row["period"] for row in rows})[-MAX_PERIODS:]
     return [row for row in rows if row["period"] in kept]
-
-
-_MEANINGS = {  # what a signal measures; docs/coverage.md says how
-    "odometry_scale": "localised metres per metre that the wheels report, driving straight",
-    "wheel_yaw_scale": "yaw rate of the gyroscope divided by that of the wheels, when turning",
-    "wheel_pull_radpm": "turn that the wheels did not report, per metre of straight driving",
-    "command_gain": "wheel speed divided by the command, when the command is held",
-    "command_response": "share of a changed command that is reached within one step",
-    "gyro_bias_radps": "gyroscope minus the turn of the pose, driving straight",
-    "accel_bias_mps2": "acceleration at a steady speed: bias, or a slope of the floor",
-    "vibration_mps2": "spread of the acceleration at a steady speed",
-    "localiser_jitter_mps": "sideways speed of the poses, driving straight",
-    "localiser_age_s": "age of the pose at a step",
-    "lidar_noise_m": "noise of a sector's range over three steps, driving straight",
-    "silent_sectors": "lidar sectors with no return, or a constant one, for a whole episode",
-}
 
 
 def signal_name(row: dict[str, Any]) -> str:
@@ -351,16 +303,6 @@ def signal_name(row: dict[str, Any]) -> str:
 def by_part(row: dict[str, Any]) -> tuple[str, str]:
     """Return the key that sorts signals on a page."""
     return str(row["part"]), str(row["signal"])
-
-
-def meanings(rows: Iterable[dict[str, Any]]) -> Rows:
-    """Return what the signals of these rows mean, in the order of their parts."""
-    signals = {row["signal"]: row for row in sorted(rows, key=by_part)}
-    return [
-        {"signal": signal_name(row), "part": row["part"], "what it is": _MEANINGS[name]}
-        for name, row in signals.items()
-        if name in _MEANINGS
-    ]
 
 
 def change_text(row: dict[str, Any]) -> str:
