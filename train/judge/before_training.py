@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from restock.arrays import Ints
 from restock.errors import ConfigError, RestockError, RunError, StoreError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
+from restock.ingest.task.conditions import Condition, label, primary
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import STORED_SIGNALS, Task
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
-from restock.train.evaluation.ope import EssGate
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.judge.answers import Answer, TwinFits, answers, permuted_actions
 from restock.train.judge.beside import beside_others, signals_beside
@@ -45,14 +44,11 @@ from restock.train.judge.fed_rows import (
 from restock.train.judge.mission_checks import POSE, mission_checks, with_missions
 from restock.train.judge.row_checks import fed_labels, outcomes, row_order, stored, values
 from restock.train.run.run_profile import carried_profile, profile_of_panel
-from restock.train.twin.calibration.logged_steps import logged_steps
-from restock.train.twin.calibration.path_gap import overlapping_segments
 from restock.train.twin.calibration.twin_gap import (
     FOLDER,
     TRUSTED,
     UNDECIDED,
     UNTRUSTED,
-    GapConfig,
     gap_folder,
     read_gap,
 )
@@ -618,74 +614,3 @@ def _drive(
         return rows, ""
     except RestockError as error:  # no such robot in the twin: the other checks still say much
         return None, f"the twin cannot be driven with this profile: {error.what}"
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What one judgement needs, and how much of that a store holds."""
-
-    purpose: str  # "judge the twin in nominal driving"
-    needed: str  # "20 segments of 3 s in 5 episodes"
-    held: str  # "12 in 2"
-    more_h: float | None  # hours of drives like these that are missing; None: none is like this
-
-    def __str__(self) -> str:
-        missing = (
-            "no drive is long enough"
-            if self.more_h is None
-            else f"at least {self.more_h:.2g} h more of such drives"
-            if self.more_h
-            else "enough"
-        )
-        return f"to {self.purpose}: {self.needed}; these logs hold {self.held}: {missing}"
-
-
-def twin_evidence(store: Store, config: GapConfig) -> Evidence:
-    """Return what a store needs for `restock twin gap` to judge nominal driving.
-
-    Raises:
-        ConfigError: a horizon that is not some control periods, or a robot that the twin cannot
-            build.
-        StoreError: the store has rows of several tasks, or none.
-    """
-    limits, steps = config.limits, logged_steps(store)
-    cut, counted = overlapping_segments(steps, limits.horizon_s, config)
-    nominal = counted.get(NOMINAL, np.zeros(len(cut), np.bool_))
-    segments, with_one = int(nominal.sum()), len(np.unique(cut.episode_id[nominal]))
-    driven_h = len(steps) * steps.task.control_period_s / 3600
-    return Evidence(
-        "judge the twin in nominal driving",
-        f"{limits.segments} segments of {limits.horizon_s:g} s in {limits.episodes} episodes",
-        f"{segments:,} in {with_one:,}",
-        _more_h(driven_h, (segments, limits.segments), (with_one, limits.episodes)),
-    )
-
-
-def policy_evidence(store: Store, held_out_share: float, gate: EssGate) -> Evidence:
-    """Return what a store needs for an estimate by importance weights.
-
-    Args:
-        store: the logs.
-        held_out_share: of the rows, by the mixture's evaluation split; above 0.
-        gate: what the weights must be worth.
-
-    Raises:
-        StoreError: the store has rows of several tasks, or none.
-    """
-    ((rows, episodes),) = store.sql(
-        "SELECT count(*), count(DISTINCT episode_id) FROM transitions"
-    ).fetchall()
-    least = round(gate.episodes / held_out_share)
-    return Evidence(
-        "judge a policy by held-out logs",
-        f"{least} episodes, of which {gate.episodes:g} are held out",
-        f"{episodes:,}",
-        _more_h(rows * store.task().control_period_s / 3600, (episodes, least)),
-    )
-
-
-def _more_h(driven_h: float, *counts: tuple[int, int]) -> float | None:
-    """Return the missing hours, from pairs of existing and needed counts; None if one is 0."""
-    if not all(there for there, _ in counts):
-        return None
-    return driven_h * max(0.0, *(least / there - 1 for there, least in counts))

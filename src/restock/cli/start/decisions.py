@@ -6,14 +6,13 @@ import dataclasses
 import math
 import shlex
 from collections.abc import Collection
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.cli.start.outcomes import Document, of_nominal
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import FOLDER, Ended
-from restock.errors import ConfigError, StoreError, counted, quoted
+from restock.errors import ConfigError, counted
 from restock.files import read_json
 
 if TYPE_CHECKING:
@@ -218,29 +217,6 @@ def no_ways(to: Settings) -> str | None:
     except ConfigError as error:
         return error.what
     return None
-
-
-def evidence_lines(to: Settings) -> list[str]:
-    """Say what must be logged before the twin and a policy can be judged by the logs."""
-    from restock.replay.mixture.mixture import load_mixture
-    from restock.replay.store.store import Store
-    from restock.train.evaluation.ope import EssGate
-    from restock.train.judge.before_training import policy_evidence, twin_evidence
-    from restock.train.twin.calibration.twin_gap import GapConfig, TrustLimits
-
-    found, horizon_s = [], horizon(to.profile)
-    limits = TrustLimits(horizon_s=horizon_s)
-    with Store(to.store) as store:
-        # A robot that the twin cannot build, or rows of several tasks: later stages say so.
-        with suppress(ConfigError, StoreError):
-            found.append(twin_evidence(store, GapConfig((horizon_s,), limits=limits)))
-        share = load_mixture(to.mixture).evaluation_split.share
-        with suppress(StoreError):
-            found += [policy_evidence(store, share, EssGate())] if share else []
-    lines = [str(one) for one in found if one.more_h != 0]
-    if lines:
-        lines.append(f"which drives to record next: `restock coverage gaps {quoted(to.store)}`")
-    return lines
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:

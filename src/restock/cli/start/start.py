@@ -154,9 +154,6 @@ class Way:
         if not do(stages.ingest(to)).good:
             raise Stop("nothing could be ingested", f"edit {to.profile}", self.again)
         covered = do(stages.coverage(to))
-        if not self.work.plan:
-            for line in decisions.evidence_lines(to):
-                self._warn(line)
         do(stages.audit(to))
         mixed = do(stages.mix(to))
         if not mixed.good:

@@ -33,7 +33,6 @@ def drift_sections(drift: Drift) -> list[Section | None]:
     return [
         _findings_section(drift),
         _overview_section(drift, own),
-        _conditions_section(drift, own),
         _comparisons_section(own),
     ]
 
@@ -185,54 +184,6 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
             Figure(
                 charts.draw(chart, charts.FULL),
                 caption=f"{left_out} more robots are not shown." if left_out else "",
-            )
-        ],
-    )
-
-
-def _conditions_section(drift: Drift, own: Rows) -> Section | None:
-    found = {row["robot"] for row in drift.findings if row["part"] == "conditions"}
-    robots = _chosen({row["robot"] for row in drift.conditions}, found)
-    rows = _newest(
-        [
-            {**row, "period": str(row["period"]), "condition": words(row["condition"])}
-            for row in drift.conditions
-            if row["robot"] in robots
-        ]
-    )
-    never = {row["condition"] for row in rows} - {
-        row["condition"] for row in rows if row["events_per_h"]
-    }
-    rows = [row for row in rows if row["condition"] not in never]
-    if not rows:
-        return None
-
-    def chart(width: int) -> Any:
-        columns = max(width // 240, 1)
-        return (
-            charts.plot(rows)
-            .mark_line(point={"size": 40, "filled": True})
-            .encode(
-                x=alt.X("period:O", title=None, axis=_PERIODS),
-                y=alt.Y("events_per_h:Q", title="events per hour", scale=alt.Scale(zero=True)),
-                color=charts.coloured("robot", robots, {}, width),
-            )
-            .properties(width=width // columns - 70, height=150)
-            .facet(facet=alt.Facet("condition:N"), columns=columns)
-            .resolve_scale(y="independent")
-        )
-
-    compared = sum(row["part"] == "conditions" and row["p"] is not None for row in own)
-    return Section(
-        "conditions",
-        "How often each condition begins",
-        intro=f"Events per hour driven. {compared:,} comparisons by robot, zone and {drift.every} "
-        "had at least five events and were tested (a quasi-Poisson score test, with the "
-        "dispersion between the drives of a robot).",
-        figures=[
-            Figure(
-                charts.draw(chart, charts.FULL),
-                caption=f"Never seen: {listed(sorted(never))}." if never else "",
             )
         ],
     )

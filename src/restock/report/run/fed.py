@@ -7,7 +7,6 @@ from typing import Any
 import altair as alt
 
 from restock.replay.plan.exclusions import DAY_NS
-from restock.replay.plan.source_plan import TOLERANCE
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Drawing,
@@ -16,11 +15,9 @@ from restock.report.look.blocks import (
     Section,
     Table,
     shown,
-    span,
     words,
 )
 from restock.report.run.facts import Facts, evaluation_bias
-from restock.train.run.replay_audit import SHORT
 
 _YEARS_FROM_DAYS = 512  # ages are in years from there on
 
@@ -104,20 +101,12 @@ SHARE_COLOURS = {
 
 def shares_figure(facts: Facts) -> Figure | None:
     """Chart three bars per stratum; None for a run without a panel."""
-    rows = share_bars(facts)
-    if not rows:
-        return None
-    title = "All rows fed: natural, wanted and drawn shares"
-    return Figure(_share_chart(rows), title, " ".join(remarks(facts)))
-
-
-def share_bars(facts: Facts) -> Rows:
-    """Return stratum, kind and share of all rows that the critic was fed."""
-    return [
+    rows = [
         {"stratum": words(row["stratum"]), "kind": kind, "share": row[f"{kind}_share"]}
         for row in facts.fed
         for kind in SHARE_COLOURS
     ]
+    return Figure(_share_chart(rows), "All rows fed: natural, wanted and drawn") if rows else None
 
 
 def fed_table(facts: Facts) -> Table:
@@ -133,48 +122,6 @@ def fed_table(facts: Facts) -> Table:
         caption="Shares are of all rows fed, over the whole run. Natural: the share under uniform "
         "draws from the same sources.",
     )
-
-
-def remarks(facts: Facts) -> list[str]:
-    """Say which strata were short, which lose by weights, and what rows are missing."""
-    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
-    lost = []
-    for row in facts.sampled:
-        of_rows = natural.get(row["stratum"], row["available_share"])
-        weighted = row["effective_share"]
-        if row["source"] == "fresh" or of_rows is None or weighted is None:
-            continue
-        if row["drawn_share"] >= of_rows and weighted < (1 - TOLERANCE) * of_rows:
-            lost.append(
-                f"{words(row['stratum'])} ({of_rows:.2%} of the rows, {row['drawn_share']:.2%} of"
-                f" the draws, {weighted:.2%} of the gradient)"
-            )
-    short = [
-        f"{words(stratum.name)} {stratum.missing_rows:,} rows"
-        + (
-            ""
-            if stratum.missing_hours is None
-            else f" ({span(3600 * stratum.missing_hours)} of driving as logged)"
-        )
-        for stratum in facts.strata
-        if stratum.missing_rows
-    ]
-    texts = [
-        f"{words(row['stratum'])} was short by {row['short_share']:.1%} of the rows fed, of"
-        f" {row['wanted_share']:.1%} wanted: {row['reason'] or 'too few rows'}."
-        for row in facts.fed
-        if row["short_share"] >= SHORT
-    ]
-    if lost:
-        texts.append(
-            f"The share after weights is smaller than in the plain logs for {'; '.join(lost)}."
-        )
-    if short:
-        texts.append(
-            "At the draws that `restock mix` planned, the logs alone have too few rows; missing:"
-            f" {', '.join(short)}."
-        )
-    return texts
 
 
 def source_table(facts: Facts) -> Table:
@@ -297,99 +244,23 @@ def _wanted_shares(rows: Rows) -> Drawing:
     )
 
 
-KINDS = ("logs", "fresh", "wanted")
 _MIN_AUDITED = 20  # rows in which the policy was asked, for a line of the table
 _LINES = 12
-MIN_TILE_PX = 34  # for a number in it
 
 
 def actions_section(facts: Facts) -> Section | None:
     """Return the section on actions; None for a run that kept no such counts."""
     if not facts.actions:
         return None
-    cells = _action_cells(facts.actions)
     return Section(
         "actions",
-        "Which actions were in the data, and which ones does the policy prefer?",
-        intro="For each condition, the share of each action in sampled rows from logs and in "
-        "fresh rows, and the share of fresh rows in which the policy would take it (from "
-        "audited batches, in the last quarter of the updates). The logs do not show the "
-        "outcome of an action that is preferred but not in the logs; `restock diagnose` tells "
-        "whether that causes failures. Actions are named by their m/s and rad/s.",
-        figures=[Figure(_heatmap(cells), "Share of a condition's rows by action")],
+        "Which actions does the policy prefer that the logs lack?",
+        intro="The share of fresh rows in which the policy would take an action (from audited"
+        " batches, in the last quarter of the updates), beside its share in the sampled rows of the"
+        " condition. The logs do not show the outcome of an action that is not in them; `restock"
+        " diagnose` tells whether that causes failures. Actions are named by their m/s and rad/s.",
         tables=_action_table(facts.actions),
     )
-
-
-def _row_name(row: dict[str, Any]) -> str:
-    """Return the name of a condition, or of the stratum of logs that it belongs to."""
-    stratum, condition = words(row["stratum"]), words(row["condition"])
-    return condition if stratum == condition else f"{stratum}: {condition}"
-
-
-def _action_cells(rows: Rows) -> Rows:
-    """Return a cell for each source, condition and action; `wanted` is a source here."""
-    cells: Rows = []
-    for row in rows:
-        name = _row_name(row)
-        shares = {row["source"]: row["drawn_share"]}
-        if row["source"] == "fresh":
-            shares["wanted"] = row["wanted_share"]
-        cells += [
-            {
-                **{"row": name, "action": row["name"], "order": row["action"]},
-                **{"kind": kind, "share": share, "text": _tile_text(share)},
-            }
-            for kind, share in shares.items()
-            if share is not None
-        ]
-    return cells
-
-
-def _tile_text(share: float) -> str:
-    """Format a share for a tile, where never differs from seldom."""
-    if not share:
-        return "0"
-    return f"{share:.0%}" if share >= 0.01 else "<1%"
-
-
-def _heatmap(cells: Rows) -> Drawing:
-    kinds = [kind for kind in KINDS if any(cell["kind"] == kind for cell in cells)]
-    actions = [c["action"] for c in sorted(cells, key=lambda cell: int(cell["order"]))]
-    names = list(dict.fromkeys(cell["row"] for cell in cells))
-
-    def chart(width: int) -> Any:
-        # A small tile has no number: the pointer shows it, and the table has the largest.
-        labels_px = min(charts.label_px(names), 200 if width > charts.FULL[0] else 140)
-        tile = (width - labels_px - 12) // max(len(set(actions)), 1)
-        axis = alt.Axis(
-            grid=False, ticks=False, labelOverlap=False, labelAngle=-60 if tile >= 24 else -90
-        )
-        base = charts.plot(cells).encode(
-            x=alt.X("action:N", sort=list(dict.fromkeys(actions)), title=None, axis=axis),
-            y=alt.Y(
-                "row:N",
-                title=None,
-                axis=alt.Axis(grid=False, ticks=False, labelLimit=labels_px, labelOverlap=False),
-            ),
-        )
-        tiles = base.mark_rect(stroke="#ffffff").encode(
-            color=alt.Color(
-                "share:Q",
-                scale=alt.Scale(type="sqrt", domain=[0, 1], range=["#f1f5f9", "#0b5f58"]),
-                legend=None,
-            )
-        )
-        layers = [tiles]
-        if tile >= MIN_TILE_PX:
-            number = alt.condition("datum.share > 0.35", alt.value("#fdfdfd"), alt.value("#1f2937"))
-            layers.append(base.mark_text(fontSize=12).encode(text="text:N", color=number))
-        layered = alt.layer(*layers).properties(width=tile * len(set(actions)), height=alt.Step(24))
-        header = alt.Header(orient="top", labelAnchor="start", labelPadding=4)
-        rows = alt.Row("kind:N", sort=kinds, header=header)
-        return layered.facet(row=rows).resolve_scale(y="independent")
-
-    return charts.draw(chart, charts.FULL)
 
 
 def _action_table(rows: Rows) -> list[Table]:

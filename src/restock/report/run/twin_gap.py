@@ -10,7 +10,6 @@ from typing import Any
 from restock.errors import RestockError, counted
 from restock.report.look import charts
 from restock.report.look.blocks import (
-    MAX_ROWS,
     Drawing,
     Figure,
     Rows,
@@ -99,7 +98,6 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         "sections": [
             replace(gap_section(gap), callout=""),  # the headline says it
             _steps_section(gap),
-            _signals_section(gap),
         ],
         "source": f"{about['store']}, version {about['store_version']}",
     }
@@ -225,42 +223,6 @@ def _steps_section(gap: TwinGap) -> Section:
                 caption="As the policy sees them, scaled to about -1 to 1. The sectors of a lidar "
                 "are shown together; observations.parquet has each component and condition.",
             ),
-        ],
-    )
-
-
-def _signals_section(gap: TwinGap) -> Section | None:
-    """Show the gap of signals; None if no segment is as long as a horizon."""
-    sources = [source_name(name) for name in dict.fromkeys(row["source"] for row in gap.paths)]
-    keys = ("condition", "quantity", "horizon_s")
-    medians = _by_source(gap.paths, "median", *keys)
-    rows = [
-        {
-            "condition": words(row["condition"]),
-            "signal": words(row["quantity"].rsplit("_", 1)[0]),
-            "unit": row["unit"],
-            "horizon": f"{row['horizon_s']:g} s",
-            "segments": row["segments"],
-            **dict.fromkeys(sources, ""),
-            **medians[tuple(row[key] for key in keys)],
-        }
-        for row in gap.paths
-        if row["source"] == "floor" and row["segments"]
-    ]
-    if not rows:
-        return None
-    return Section(
-        "signals",
-        "Pose and signals, by horizon",
-        intro="Medians over segments: for a pose, its distance from the log at the end of the "
-        "horizon; for a signal, the root mean square of its difference over the segment. "
-        "Empty if a source has no such signal.",
-        tables=[
-            Table(
-                rows,
-                title=counted(len(rows), "median"),
-                folded=len(rows) > MAX_ROWS,
-            )
         ],
     )
 
