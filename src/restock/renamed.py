@@ -60,7 +60,6 @@ VERBS = {  # what to type instead
     "doctor": "it is `restock info` now, without a recording",
     "node": "it is a command of its own now: `restock-node`",
     "schema": "it is `restock profile schema` now",
-    "completion": "it is `restock --tyro-write-completion SHELL FILE` now",
 }
 
 OPTIONS = {  # of one command, or of all; what to type instead

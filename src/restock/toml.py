@@ -373,56 +373,21 @@ def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any)
     return [name for name in named if getattr(settings, name) != getattr(usual, name)]
 
 
-_FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
-
-
 def json_schema(kind: type, title: str) -> str:
     """Return the JSON Schema of a struct's TOML, for editors: `#:schema FILE` names it.
 
-    Types, ranges and defaults are those of the struct, descriptions the comments beside its fields.
-    Rules about several keys at once are not in it: they are checked when the file is read.
+    Types, ranges and defaults are those of the struct. Rules about several keys at once are not in
+    it: they are checked when the file is read.
     """
     schema = msgspec.json.schema(kind)
-    structs = {struct.__name__: struct for struct in _structs(kinds.type_info(kind), set())}
-    for name, definition in schema.get("$defs", {}).items():
+    for definition in schema.get("$defs", {}).values():
         definition["properties"] = {
             key: _without_null(value) for key, value in definition.get("properties", {}).items()
         }
         if "description" in definition:  # a docstring, which keeps its indent before Python 3.13
             definition["description"] = inspect.cleandoc(definition["description"])
-        if (struct := structs.get(name)) is None:
-            continue
-        names = {field.name: field.encode_name for field in msgspec.structs.fields(struct)}
-        for part in struct.__mro__:
-            if part is msgspec.Struct or not issubclass(part, msgspec.Struct):
-                break
-            for field, comment in _FIELD.findall(inspect.getsource(part)):
-                key = names.get(field)
-                if key in definition["properties"]:
-                    definition["properties"][key].setdefault("description", comment)
     draft = "https://json-schema.org/draft/2020-12/schema"
     return json.dumps({"$schema": draft, "title": title, **schema}, indent=1) + "\n"
-
-
-def _structs(kind: kinds.Type, seen: set[type]) -> Iterator[type]:
-    """Yield every struct that a type contains."""
-    if isinstance(kind, kinds.StructType):
-        if kind.cls in seen:
-            return
-        seen.add(kind.cls)
-        yield kind.cls
-        for field in kind.fields:
-            yield from _structs(field.type, seen)
-    elif isinstance(kind, kinds.UnionType):
-        for option in kind.types:
-            yield from _structs(option, seen)
-    elif isinstance(kind, kinds.TupleType):
-        for item in kind.item_types:
-            yield from _structs(item, seen)
-    elif isinstance(kind, kinds.DictType):
-        yield from _structs(kind.value_type, seen)
-    elif isinstance(kind, kinds.CollectionType):
-        yield from _structs(kind.item_type, seen)
 
 
 def _without_null(value: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from support.paths import ROOT
@@ -204,14 +203,3 @@ def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(verb, capsys, t
     said = "".join(capsys.readouterr())
     assert "***:***@bucket/logs" in said
     assert "hu/sh" not in said
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_a_script_has_every_verb(shell: str, tmp_path: Path) -> None:
-    script = tmp_path / "restock"
-    assert cli.main([cli.COMPLETION, shell, str(script)]) == 0
-    text = script.read_text(encoding="utf-8")
-    assert [verb for verb in cli.VERBS if verb not in text] == []
-    assert "--trust-position-m" in text  # of a job
-    if shell == "bash":
-        assert subprocess.run(["bash", "-n", str(script)], capture_output=True).stderr == b""

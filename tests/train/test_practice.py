@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from support.toy_run import config, session
 from support.toy_twin import ToyTwin
 
-from restock.cli.learning.train import unmoved
 from restock.errors import ConfigError, RunError
 from restock.replay.fleet.missions_file import MissionOrder
-from restock.train.dqn.config import PracticeConfig, load_config, parse_config
+from restock.train.dqn.config import PracticeConfig, load_config
 from restock.train.feed import practice as practice_module
 from restock.train.feed.collector import EndedEpisode
 from restock.train.feed.practice import (
@@ -139,19 +138,6 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
     natural = {arm.name: arm.share for arm in unordered([*whole, order])}
     assert natural["wheel_slip"] == pytest.approx(0.6)
     assert sum(natural.values()) == pytest.approx(1.0)
-
-
-def test_a_run_too_short_for_its_shares_to_move_says_so() -> None:
-    moving = parse_config({"practice": {"rule": "success"}}, where="here")
-    first = [{"arm": arm, "wanted_share": 0.5} for arm in ("nominal", "wheel_slip")]
-    for practised in ([], first, first * 2):
-        said = unmoved(practised, moving)
-        assert said is not None
-        assert "every 1,000 steps" in said
-        assert "5 missions have ended" in said
-    then = [{"arm": "nominal", "wanted_share": 0.4}, {"arm": "wheel_slip", "wanted_share": 0.6}]
-    assert unmoved(first + then, moving) is None
-    assert unmoved(first, parse_config({"practice": {"rule": "even"}}, where="here")) is None
 
 
 # -- refused by name ------------------------------------------------------------------------------

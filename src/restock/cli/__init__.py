@@ -89,7 +89,6 @@ WITH_THEIR_VERB = {
 }
 PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # goes on working if nobody reads it
 FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
-COMPLETION = "--tyro-write-completion"
 
 
 def usage() -> str:
@@ -175,10 +174,6 @@ def _dispatch(args: list[str]) -> int:
 
         sys.stdout.write(f"restock {__version__}\nnative code {native.state()}\n")
         return int(ExitCode.OK)
-    if args[0] == COMPLETION:
-        from restock.cli.command_line import write_completion
-
-        return write_completion(args)
     name, prog, rest = _named(args)
     if name in JOBS and name not in FOLDER_OF:  # a verb that has nothing but jobs
         return _say_jobs(name, rest)

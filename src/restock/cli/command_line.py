@@ -10,15 +10,13 @@ import shutil
 import sys
 import textwrap
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from restock.cli import COMPLETION, JOBS, VERBS, command_of
 from restock.cli.words import Positional, Repeated, declared
-from restock.errors import ConfigError, ExitCode
 
 _PREPARED: list[type[Any]] = []
 MAX_PROSE = 100  # columns of a line of prose
@@ -112,51 +110,3 @@ def _wrapped(text: str, columns: int) -> str:
     wrapper = textwrap.TextWrapper(columns, break_on_hyphens=False, break_long_words=False)
     parts = text.split("\n\n")
     return "\n\n".join(part if part.startswith(" ") else wrapper.fill(part) for part in parts)
-
-
-SHELLS = ("bash", "zsh", "tcsh", "fish")
-
-
-def write_completion(args: list[str]) -> int:
-    """Write the script that completes `restock` in a shell.
-
-    Raises:
-        ConfigError: a shell and a file are not given.
-    """
-    if len(args) != 3 or args[1] not in SHELLS:
-        raise ConfigError(
-            "takes the name of a shell, and a file to write to, or - for stdout",
-            where=COMPLETION,
-            remedy=f"choose one of {', '.join(SHELLS)}",
-        )
-    try:
-        tyro.cli(
-            _every_command(),
-            prog="restock",
-            args=args,
-            use_underscores=False,
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
-        )
-    except SystemExit as stop:
-        return int(stop.code or ExitCode.OK)
-    return int(ExitCode.OK)
-
-
-def _every_command() -> Any:
-    """Return a union of all verbs; a verb that has nothing but jobs is a union of these."""
-    kinds = {}
-    for verb in VERBS:
-        if verb in ("store", "twin"):
-            jobs = {job: prepared(command_of(f"{verb} {job}")) for job in JOBS[verb]}
-            kinds[verb] = dataclasses.make_dataclass(verb, [("job", _union(jobs))])
-        else:
-            kinds[verb] = prepared(command_of(verb))
-    return _union(kinds)
-
-
-def _union(kinds: Mapping[str, type[Any]]) -> Any:
-    named = [
-        Annotated[kind, tyro.conf.subcommand(name, prefix_name=False, description=None)]
-        for name, kind in kinds.items()
-    ]
-    return Union[tuple(named)]  # noqa: UP007

@@ -392,32 +392,19 @@ def clock_cells(clock: Row | None) -> dict[str, str]:
 
 
 class Advance:
-    """Moves a progress bar, and one below it of the part at hand; or nothing, without a bar."""
+    """Moves a progress bar, and says how far the part at hand is; or nothing, without a bar."""
 
     def __init__(self, bar: Progress | None = None, task: TaskID | None = None) -> None:
         self._bar, self._task = bar, task
-        self._part: tuple[str, TaskID] | None = None
 
     def __call__(self, amount: float = 1.0, note: str = "") -> None:
-        """Advance the whole, and end the part at hand."""
-        if self._bar is None or self._task is None:
-            return
-        self._bar.update(self._task, advance=amount, note=cell(visible(note)))
-        self._end_part()
+        """Advance the whole."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, advance=amount, note=cell(visible(note)))
 
     def part(self, doing: str, done: float, whole: float) -> None:
         """Show how far the part at hand is."""
-        if self._bar is None:
-            return
-        if self._part is None or self._part[0] != doing:
-            self._end_part()
-            self._part = doing, self._bar.add_task(doing, total=whole, note="")
-        self._bar.update(self._part[1], completed=done)
-
-    def _end_part(self) -> None:
-        if self._bar is not None and self._part is not None:
-            self._bar.remove_task(self._part[1])
-        self._part = None
+        self(0.0, f"{doing} {done / whole:.0%}" if whole else doing)
 
 
 @contextmanager

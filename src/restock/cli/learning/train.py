@@ -233,13 +233,8 @@ def _print(
     from restock.train.run.run import Run
 
     run = Run.open(prepared.path)
-    practised = run.table("practice").to_pylist() if outcome.env_steps else None
     fed = fed_shares(run)
-    for why in (
-        no_update(outcome, prepared.config),
-        None if practised is None else unmoved(practised, prepared.config),
-        *shortfalls(fed),
-    ):
+    for why in (no_update(outcome, prepared.config), *shortfalls(fed)):
         if why is not None:
             say(f"warning: {why}")
     path = str(prepared.path)
@@ -376,23 +371,6 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
         f" schedule.warmup_env_steps={config.schedule.warmup_env_steps:,}, once there are"
         f" replay.batch_size={config.replay.batch_size:,} rows: give more"
         f" {'--env-steps' if config.schedule.seconds is None else '--seconds'}"
-    )
-
-
-def unmoved(practised: list[dict[str, Any]], config: TrainConfig) -> str | None:
-    """Explain why success-based practice never changed its shares; None if it did, or was off.
-
-    `practised` are the rows of the run's table `practice`.
-    """
-    from restock.train.feed.practice import INTERVAL_STEPS, WARMUP_EPISODES
-
-    drawn = {(row["arm"], row["wanted_share"]) for row in practised}
-    if config.practice.rule != "success" or len(drawn) > len({arm for arm, _ in drawn}):
-        return None
-    return (
-        'practice.rule="success" never changed the shares of the missions: it may after'
-        f" every {INTERVAL_STEPS:,} steps, by arms or kinds of which {WARMUP_EPISODES} missions"
-        " have ended"
     )
 
 

@@ -289,21 +289,14 @@ def steps_line(to: Settings) -> str:
     """Say how far fine-tuning came, and how the other policy was fed."""
     most, uniform = steps_of(to.run), fed_uniformly(to)
     lines = [f"The agent is the fine-tuned policy: {most:,} steps in the twin here."]
-    if most < FULL_STEPS / 2:
-        lines += [
-            f"That is little: docs/evidence.md says what {FULL_STEPS:,} steps gave. Give more",
-            "--seconds, or run nothing else beside it.",
-        ]
     if not most:
         lines = ["The time was up before anything was driven: give more --seconds."]
     if uniform.is_dir():
         lines += [
-            "Fed uniformly has the same network, settings and seed"
-            + (", as many steps, and every" if most else ", and every"),
-            "row of the logs has the same probability. This compares feeds, not methods, so",
-            f"`restock compare {quoted(uniform)} {quoted(to.run)}` refuses",
-            "(unless --treatment mixture is given). One seed each is a sample of one:",
-            "docs/evidence.md has ten.",
+            "Fed uniformly has the same network, settings, seed and steps; every row of the logs"
+            " has the same probability.",
+            "One seed each is a sample of one: docs/evidence.md has ten, and says what"
+            f" {FULL_STEPS:,} steps gave.",
         ]
     return "\n".join(lines)
 

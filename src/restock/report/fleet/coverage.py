@@ -97,10 +97,7 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
         "headline": headline(found["shelves"], gaps),
         "lead": f"How much of each condition the logs hold, and what mixture {gaps['mixture']} "
         "and the audits require and do not find.",
-        "cards": [
-            *({"value": count(n), "label": plural(n, noun)} for noun, n in numbers.items()),
-            to_log(gaps),
-        ],
+        "cards": [{"value": count(n), "label": plural(n, noun)} for noun, n in numbers.items()],
         "sections": sections,
         "source": f"{gaps['store']}, version {gaps['store_version']}",
     }
@@ -342,38 +339,6 @@ def _drift(drift: Drift | str) -> list[Section | None]:
 
 
 MAX_GAPS = 20  # in the table
-
-
-def to_log(gaps: dict[str, Any]) -> dict[str, str]:
-    """Make the card of what to log next."""
-    plan, unit = gaps["plan"], gaps["unit"]
-    unknown = [gap for gap in gaps["gaps"] if gap["best"] is None]
-    if gaps["closed"]:
-        return {"value": "0", "label": f"{unit} to log next"}
-    if unknown and not plan["orders"]:
-        least = _to_see_one(unknown)
-        most = sum(least.values())
-        return {
-            "value": f"at least {most:,}",
-            "label": f"more {plural(most, 'episode')} of {' and '.join(least)}, to see what was"
-            " never logged (95 %)",
-        }
-    label = (
-        f"{unit} to log next (95 %: {figure(plan['total_low'])} to {figure(plan['total_high'])})"
-    )
-    if unknown:
-        verb = "has no rate and is" if len(unknown) == 1 else "have no rate and are"
-        label += f"; {counted(len(unknown), 'gap')} {verb} not in it"
-    return {"value": figure(plan["total"]), "label": label}
-
-
-def _to_see_one(gaps: Rows) -> dict[str, int]:
-    """Return, for gaps without a rate, how many episodes of each kind show one with 95 %."""
-    least: dict[str, int] = {}
-    for gap in gaps:
-        kind = words(gap["never_seen_in"])
-        least[kind] = min(gap["at_least"], least.get(kind, gap["at_least"]))
-    return least
 
 
 def shopping_section(gaps: dict[str, Any]) -> Section:

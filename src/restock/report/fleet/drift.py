@@ -16,7 +16,6 @@ from restock.report.look.blocks import MAX_ROWS, Figure, Rows, Section, Table, l
 MAX_ROBOTS = 12  # in a chart: those with findings first
 MAX_PERIODS = 26  # the newest
 MAX_FINDINGS = 8  # findings with a chart of their own
-_BEYOND = 3.0  # larger sizes look alike
 _BESIDE = ("driving", "conditions")  # parts about the use, not about the hardware
 _VERDICTS = ("changed", "undecided", "unchanged", "too few")
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
@@ -29,12 +28,7 @@ _SCOPE = {
 
 
 def drift_sections(drift: Drift) -> list[Section | None]:
-    own = drift.own
-    return [
-        _findings_section(drift),
-        _overview_section(drift, own),
-        _comparisons_section(own),
-    ]
+    return [_findings_section(drift), _comparisons_section(drift.own)]
 
 
 def headline(drift: Drift) -> str:
@@ -122,73 +116,6 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
     )
 
 
-def _overview_section(drift: Drift, own: Rows) -> Section | None:
-    """Chart the change of every hardware signal, by robot and period."""
-    found = {row["robot"] for row in drift.findings}
-    robots = _chosen({row["robot"] for row in own}, found)
-    rows = _newest(
-        [
-            {
-                "robot": row["robot"],
-                "signal": signal_name(row),
-                "part": row["part"],
-                "period": str(row["period"]),
-                "size": max(-_BEYOND, min(_BEYOND, signed_size(row))),
-                "mark": "●" if row["verdict"] == "changed" else "",
-            }
-            for row in own
-            if row["part"] not in _BESIDE and row["p"] is not None and row["robot"] in robots
-        ]
-    )
-    if not rows:
-        return None
-    signals = list(dict.fromkeys(row["signal"] for row in sorted(rows, key=by_part)))
-    periods = len({row["period"] for row in rows})
-    robots = sorted({row["robot"] for row in rows})
-
-    def chart(width: int) -> Any:
-        labels_px = min(charts.label_px(signals), 240 if width > charts.HALF[0] else 150)
-        base = charts.plot(rows).encode(
-            x=alt.X("period:O", title=None, axis=_PERIODS),
-            y=alt.Y(
-                "signal:N",
-                sort=signals,
-                title=None,
-                axis=alt.Axis(ticks=False, labelLimit=labels_px, labelOverlap=False),
-            ),
-        )
-        cells = base.mark_rect().encode(
-            color=alt.Color(
-                "size:Q",
-                scale=alt.Scale(scheme="blueorange", domain=[-_BEYOND, _BEYOND]),
-                legend=alt.Legend(
-                    title="change, in units of the least change that matters", titleLimit=280
-                ),
-            )
-        )
-        marks = base.mark_text(color="#1f2937").encode(text="mark:N")
-        layered = alt.layer(cells, marks).properties(height=20 * len(signals))
-        room = max(width - labels_px, 30 * periods)
-        across = max(room // (max(30 * periods, 150) + 20), 1)
-        each = layered.properties(width=min(room // min(across, len(robots)) - 24, 60 * periods))
-        header = alt.Header(labelAnchor="start")
-        return each.facet(facet=alt.Facet("robot:N", sort=robots, header=header), columns=across)
-
-    left_out = len({row["robot"] for row in own}) - len(robots)
-    return Section(
-        "overview",
-        "Every signal of the hardware",
-        intro="Compared with the robot's own reference. One unit is the least change that "
-        "matters; a dot marks a reported change.",
-        figures=[
-            Figure(
-                charts.draw(chart, charts.FULL),
-                caption=f"{left_out} more robots are not shown." if left_out else "",
-            )
-        ],
-    )
-
-
 def _comparisons_section(own: Rows) -> Section | None:
     """Show the newest comparison of each hardware signal, with its sizes of effect."""
     newest: dict[tuple[str, str], dict[str, Any]] = {}
@@ -251,11 +178,6 @@ def signal_name(row: dict[str, Any]) -> str:
     return f"{name} in {zone}" if zone else name
 
 
-def by_part(row: dict[str, Any]) -> tuple[str, str]:
-    """Return the key that sorts signals on a page."""
-    return str(row["part"]), str(row["signal"])
-
-
 def change_text(row: dict[str, Any]) -> str:
     """Format a ratio as `× 0.942 [0.935, 0.950]`, or a difference with its sign."""
     if row["change"] is None:
@@ -268,12 +190,6 @@ def change_text(row: dict[str, Any]) -> str:
     )
     unit = " sd" if row["compared"] == "spread" else ""
     return f"{'× ' if ratio else ''}{value}{unit} [{low}, {high}]"
-
-
-def signed_size(row: dict[str, Any]) -> float:
-    """Return the size of a change in least changes that matter, negative for a fall."""
-    neutral = 1.0 if row["compared"] == "ratio" else 0.0
-    return float(row["size"]) * (1 if row["change"] >= neutral else -1)
 
 
 def value_text(value: float | None) -> str:

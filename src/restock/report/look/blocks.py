@@ -18,7 +18,7 @@ from restock.train.twin.missions import MISSIONS
 
 Rows = list[dict[str, Any]]
 MAX_ROWS = 24  # rows of a table that need not be folded
-BROAD, WIDE = 4, 6  # columns: with more, a phone and a tablet show rows as lists
+BROAD = 4  # columns: with more, a phone shows rows as lists
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,9 @@ class Table:
         return {name for name in self.columns if all(_is_number(row[name]) for row in self.rows)}
 
     @property
-    def stacks(self) -> str:
-        """Return CSS classes that turn rows into lists of column and value on narrow screens.
-
-        On a phone that is every table, on a tablet only wide ones.
-        """
-        if len(self.columns) > WIDE:
-            return "broad wide"
-        return "broad" if len(self.columns) > BROAD else ""
+    def broad(self) -> bool:
+        """Return whether a phone shows each row as a list of column and value."""
+        return len(self.columns) > BROAD
 
 
 @dataclass(frozen=True)
@@ -164,15 +159,6 @@ def estimate(row: dict[str, Any]) -> str:
     if row["value"] is None:
         return f"refused: {row['refused']}"
     return interval_text(row["value"], row["low"], row["high"])
-
-
-def measured(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
-    """Format a value of a row with its unit and interval; nothing if it is unknown."""
-    if row[name] is None:
-        return ""
-    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
-    ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
-    return f"{row[name]:{form}}{unit}{ends}"
 
 
 def percent(value: float | None) -> str:

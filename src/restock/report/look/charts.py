@@ -159,7 +159,6 @@ def coloured(
     return alt.Color(
         f"{field}:N",
         scale=scale(names, colours),
-        sort=list(names),
         legend=legend(names, width, labels_px),
     )
 
@@ -273,17 +272,16 @@ def lines(
     percent: bool = False,
     domain: tuple[float, float] | None = None,
     points: bool = False,
-    steps: bool = False,
     marker: float | None = None,
 ) -> Drawing:
     """Draw lines over training, by `env_steps` or `gradient_steps`.
 
-    With `steps`, values hold until the next one. `marker` is the step of the kept checkpoint.
+    `marker` is the step of the kept checkpoint.
     """
     names = ordered(rows, series, colours)
     # A line of a single point would not be seen.
     points = points or len({row[x] for row in rows}) < FEW_POINTS
-    axis = alt.Axis(format="%") if percent else alt.Axis(format="~g")
+    axis = alt.Axis(format=".1~%") if percent else alt.Axis(format="~g")
     y_scale = alt.Scale(domain=domain or alt.Undefined)
 
     def chart(width: int) -> Any:
@@ -298,7 +296,6 @@ def lines(
         line = base.mark_line(
             strokeWidth=2,
             point={"size": 28, "filled": True} if points else False,
-            interpolate="step-before" if steps else alt.Undefined,
         ).encode(y=alt.Y(f"{y}:Q", title=y_title, axis=axis, scale=y_scale))
         layers = [line]
         if marker is not None:
@@ -337,7 +334,7 @@ def ages(rows: Sequence[Row]) -> Drawing:
             .mark_bar(cornerRadiusEnd=2)
             .encode(
                 x=alt.X("bucket:N", sort=list(dict.fromkeys(buckets)), title=None, axis=axis),
-                y=alt.Y("share:Q", title="share of sampled rows", axis=alt.Axis(format="%")),
+                y=alt.Y("share:Q", title="share of sampled rows", axis=alt.Axis(format=".1~%")),
                 color=coloured("source", sources, SOURCE_COLOURS, width),
             )
             .properties(height=200)
@@ -355,7 +352,7 @@ def stacked(
 
     def chart(width: int) -> Any:
         quiet = alt.Axis(grid=False, ticks=False)
-        percent = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
+        percent = alt.Axis(format=".1~%", values=[0, 0.25, 0.5, 0.75, 1])
         return (
             plot(rows)
             .mark_bar()
@@ -372,7 +369,7 @@ def stacked(
 
 # None is a reference's: planner and operator have their colours of every report.
 ARM_COLOURS = ("#0f766e", "#7c3aed", "#cc79a7", "#84643a", "#56b4e9", "#b58900", "#6b7280")
-_PERCENT = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
+_PERCENT = alt.Axis(format=".1~%", values=[0, 0.25, 0.5, 0.75, 1])
 _SHARE = alt.Scale(domain=[0, 1])
 _QUIET = alt.Axis(grid=False, ticks=False)
 
@@ -450,7 +447,7 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
             x=alt.X("env_steps:Q", title="environment steps", axis=x_axis(width // across)),
             color=coloured("arm", arms, colours(arms), width),
         )
-        axis, domain = alt.Axis(format="%"), alt.Scale(domain=[0, 1], padding=4)
+        axis, domain = alt.Axis(format=".1~%"), alt.Scale(domain=[0, 1], padding=4)
         band = (
             base.transform_filter("isValid(datum.low)")
             .mark_area(opacity=0.18)

@@ -35,13 +35,6 @@ class FloorMap:
     def at(self, x_m: float, y_m: float) -> tuple[float, float]:
         return x_m * SCALE, (self.depth_m - y_m) * SCALE
 
-    def plan(self, marks: Sequence[str], above: Sequence[str]) -> str:
-        """Return the ground and the racks, with marks above each of them."""
-        size = f'width="{self.width_m * SCALE:.0f}" height="{self.depth_m * SCALE:.0f}"'
-        racks = [self.box(rack, 'fill="#cbd5e1" stroke="#94a3b8"') for rack in self.racks]
-        frame = f'<rect {size} fill="none" stroke="#94a3b8" stroke-width="3"/>'
-        return "".join([f'<rect {size} fill="#f8fafc"/>', *marks, *racks, frame, *above])
-
     def draw(self, marks: Sequence[str], label: str, above: Sequence[str] = ()) -> Drawing:
         """Draw the floor with marks above the ground and above the racks.
 
@@ -52,7 +45,11 @@ class FloorMap:
             f'<path d="M2 {height + 10:.0f} v10 m0 -5 h{SCALE * BAR_M} m0 -5 v10" fill="none"'
             ' stroke="#475569" stroke-width="2.5"/>'
         )
-        body = self.plan(marks, [*above, bar])
+        size = f'width="{self.width_m * SCALE:.0f}" height="{self.depth_m * SCALE:.0f}"'
+        racks = [self.box(rack, 'fill="#cbd5e1" stroke="#94a3b8"') for rack in self.racks]
+        frame = f'<rect {size} fill="none" stroke="#94a3b8" stroke-width="3"/>'
+        ground = f'<rect {size} fill="#f8fafc"/>'
+        body = "".join([ground, *marks, *racks, frame, *above, bar])
         box = self.width_m * SCALE + 4, height + 26
         svg = (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{MAP_PX}"'

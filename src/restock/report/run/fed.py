@@ -174,7 +174,7 @@ def _share_chart(rows: Rows) -> Drawing:
                     "share:Q",
                     title="share of rows (square-root axis)",
                     scale=alt.Scale(type="sqrt"),
-                    axis=alt.Axis(format="%", values=marks),
+                    axis=alt.Axis(format=".1~%", values=marks),
                 ),
                 color=charts.coloured("kind", kinds, SHARE_COLOURS, width, charts.label_px(strata)),
             )
@@ -200,12 +200,8 @@ def practice_section(facts: Facts) -> Section | None:
         "What did it practise?",
         intro=f"Missions in the twin, by the rule “{rule}”. Shares are of missions that ended "
         "while the agent explored; its success is lower there than in evaluations.",
-        figures=[] if rule in FIXED else [Figure(_wanted_shares(facts.practice), "Wanted shares")],
         tables=[Table(shown(rows, columns))],
     )
-
-
-FIXED = ("natural", "even")
 
 
 def by_arm(facts: Facts) -> Rows:
@@ -230,18 +226,6 @@ def by_arm(facts: Facts) -> Rows:
         arm["given_share"] = ended / total if total else None
         arm["success"] = successes / ended if ended else None
     return list(arms.values())
-
-
-def _wanted_shares(rows: Rows) -> Drawing:
-    return charts.lines(
-        charts.in_words(rows, "arm"),
-        x="env_steps",
-        y="wanted_share",
-        series="arm",
-        y_title="share of missions",
-        percent=True,
-        steps=True,
-    )
 
 
 _MIN_AUDITED = 20  # rows in which the policy was asked, for a line of the table

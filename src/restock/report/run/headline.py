@@ -14,10 +14,7 @@ from restock.report.look.blocks import (
     Section,
     Table,
     estimate,
-    listed,
-    measured,
     named,
-    points,
     points_text,
     span,
     words,
@@ -120,37 +117,20 @@ def _against_baseline(facts: Facts) -> str:
         each = " and ".join(f"{_alone(row)} in {words(row['cell'])}" for row in shown)
         return f"No baseline drove the same episodes: success {each}"
     who = BASELINES[baseline(facts) or ""].removesuffix(",")
-    by = {
-        verdict: [row for row in rows if row["verdict"] == verdict]
-        for verdict in ("worse", "better")
-    }
-    parts = [
-        f"{verdict} than {who} in {named(by[verdict])}"
-        for verdict in ("better", "worse")
-        if by[verdict]
-    ]
-    same = [row for row in rows if row["verdict"] == "no difference shown"]
-    few = [row for row in rows if row["verdict"] == "inconclusive"]
-    apart = [words(row["condition"]) for row in rows if row["verdict"] == "refused"]
-    if same:
-        against = "" if parts else f" from {who}"
-        names = listed([words(row["condition"]) for row in same])
-        alone = not parts and len(same) == len(rows) > 1
-        parts.append(f"no difference{against} is shown in {'any condition' if alone else names}")
-        if against and len(same) == 1:
-            parts[-1] += f" ({points_text(same[0])})"
-        elif against:
-            lowest = min(same, key=lambda row: row["difference"])
-            parts[-1] += f"; the lowest is {points_text(lowest)} in {words(lowest['condition'])}"
-    if few:
-        against = "" if parts else f" from {who}"
-        some = [f"{words(row['condition'])} ({points(row['difference'])} points)" for row in few]
-        parts.append(f"too few episodes to tell a difference{against} in {listed(some)}")
-    if apart:
-        as_who = "" if parts else f" as {who}"
-        parts.append(f"not on the same episodes{as_who} in {listed(apart)}")
-    text = "; ".join(parts)
-    return text[0].upper() + text[1:]
+    by: dict[str, Rows] = {}
+    for row in rows:
+        by.setdefault(row["verdict"], []).append(row)
+    differ = [verdict for verdict in ("better", "worse") if verdict in by]
+    if differ:
+        text = "; ".join(f"{verdict} than {who} in {named(by[verdict])}" for verdict in differ)
+        rest = len(rows) - sum(len(by[verdict]) for verdict in differ)
+        text += f"; no difference shown in {rest} more" if rest else ""
+        return text[0].upper() + text[1:]
+    if same := by.get("no difference shown"):
+        lowest = min(same, key=lambda row: row["difference"])
+        where = words(lowest["condition"])
+        return f"No difference from {who} is shown; the lowest is {points_text(lowest)} in {where}"
+    return f"Too few of the same episodes to tell a difference from {who}"
 
 
 def _alone(row: dict[str, Any]) -> str:
@@ -184,31 +164,12 @@ def lead(facts: Facts) -> str:
     )
     if not facts.clean_cells() or facts.no_goal:
         return text
-    name = baseline(facts)
-    if name is None:
+    if baseline(facts) is None:
         return f"{text} Without a baseline, the success is hard to interpret: {_WITHOUT}."
-    text += f" {_safety(facts, name)}" + (
-        " Differences are in success, paired by episode, with 95 % intervals over episodes; they "
-        "do not include the variation between training seeds."
+    return (
+        f"{text} Differences are in success, paired by episode, with 95 % intervals over episodes;"
+        " they do not include the variation between training seeds."
     )
-    return text.replace("  ", " ")
-
-
-def _safety(facts: Facts, name: str) -> str:
-    """Say what the clean episodes cost in bumps and time, beside the baseline's."""
-    own, other = facts.clean.get("agent", {}), facts.clean.get(name, {})
-    if own.get("bumps_per_km") is None or other.get("bumps_per_km") is None:
-        return ""
-    who = BASELINES[name].removesuffix(",")
-    text = (
-        f"It bumped {measured(own, 'bumps_per_km', '.0f')} times per km, {who} "
-        f"{measured(other, 'bumps_per_km', '.0f')}"
-    )
-    if name == "planner" and own.get("time_lost_s") is not None:
-        text += (
-            f"; on missions that both completed it took {measured(own, 'time_lost_s', '+.1f')} s"
-        )
-    return text.replace("-", "−") + "."
 
 
 _ESTIMATORS = {
