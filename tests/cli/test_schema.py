@@ -8,7 +8,6 @@ from typing import Any
 import msgspec
 import pytest
 from jsonschema import Draft202012Validator
-from support.pages import PAGES, blocks
 from support.paths import ROOT
 
 from restock import cli
@@ -17,12 +16,6 @@ from restock.train.dqn.config import TrainConfig
 from restock.train.twin.physics.perturbation import PERTURBATIONS
 
 SCHEMAS = {name: json.loads(schema_of(name)) for name in CONFIGS}
-# Of a page's blocks of TOML that are whole files: what they are.
-WRITTEN = {
-    ("docs/compare.md", "study.toml"): "study",
-    ("docs/profile.md", "recipe.toml"): "train",
-    ("docs/twin.md", "next.toml"): "missions",
-}
 
 
 def problems(name: str, document: dict[str, Any]) -> list[str]:
@@ -61,17 +54,6 @@ def test_a_schema_is_one(name: str) -> None:
 @pytest.mark.parametrize(("path", "kind"), shipped())
 def test_every_shipped_file_is_accepted(path: str, kind: str) -> None:
     assert problems(kind, tomllib.loads((ROOT / path).read_text())) == []
-
-
-def test_what_the_docs_write_is_accepted() -> None:
-    seen = set()
-    for page in PAGES:
-        for block in blocks(page):
-            if (block.page, block.marks.get("file")) in WRITTEN:
-                kind = WRITTEN[block.page, block.marks["file"]]
-                assert problems(kind, tomllib.loads(block.text)) == [], block.place
-                seen.add(kind)
-    assert seen == set(WRITTEN.values())
 
 
 def test_what_restock_itself_writes_is_accepted() -> None:

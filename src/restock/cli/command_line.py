@@ -88,8 +88,9 @@ def _metavar(kind: Any) -> str:
 def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
     """Parse a command line with tyro, which exits after printing its help or its complaint."""
     command = prepared(command)
-    columns = max(shutil.get_terminal_size().columns, MIN_COLUMNS)
-    os.environ["COLUMNS"] = str(columns)
+    columns = shutil.get_terminal_size().columns
+    if columns < MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(MIN_COLUMNS)
     help_asked = bool({"-h", "--help"} & set(words))
     if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
         tyro._experimental_options["ansi_codes"] = False

@@ -57,14 +57,7 @@ def check(document: Document) -> list[str]:
     return lines
 
 
-_TELLING = (
-    "scan",
-    "imu",
-    "bumper",
-    "goal",
-    "plan",
-    "wheels",
-)  # named if missing
+_TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # named if missing
 
 
 def ingest(document: Document) -> list[str]:

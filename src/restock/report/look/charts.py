@@ -115,19 +115,8 @@ def _fitted(chart: Any, width: int) -> dict[str, Any]:
 
 
 def _svg(spec: dict[str, Any]) -> str:
-    text: str = vl_convert.vegalite_to_svg(spec)
-    # What a mark stands for, shown where the pointer rests on it.
-    text = re.sub(
-        r'<(path|rect|line)\b([^<>]*?\baria-label="([^"]*)"[^<>]*?)/>',
-        r"<\1\2><title>\3</title></\1>",
-        text,
-    )
-    return own_names(text)
-
-
-def own_names(svg: str) -> str:
-    """Rename the ids of a drawing, so that no other drawing of the page has them."""
-    number = next(_numbers)
+    """Draw a chart; no other drawing of the page has its ids."""
+    svg, number = str(vl_convert.vegalite_to_svg(spec)), next(_numbers)
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>d{number}-", svg)
 
 

@@ -72,7 +72,6 @@ class Facts:
     logged: Rows = field(default_factory=list)  # share of logged rows per condition
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     clones: list[CloneQuality] = field(default_factory=list)  # clones of the logs' drivers
-    clean: dict[str, dict[str, Any]] = field(default_factory=dict)  # measures by policy, pooled
     practice: Rows = field(default_factory=list)  # per interval and arm of missions
     teacher: Rows = field(default_factory=list)  # what its filter did in the last interval
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
@@ -135,12 +134,8 @@ def gather(path: Path) -> Facts:
             where=str(path),
             remedy="let it train past its first logging interval",
         )
-    clean: dict[str, Rows] = {}  # of each policy all unperturbed episodes
     for row in rows["cells"]:
-        driven = row.pop("driven")
-        if row["perturbation"] == "none":
-            clean.setdefault(row["policy"], []).extend(driven)
-        row |= measures(driven)
+        row |= measures(row.pop("driven"))
         row["low"], row["high"] = row["success_low"], row["success_high"]
     for row in rows["ways"]:
         row |= measures(row.pop("driven"))
@@ -155,7 +150,6 @@ def gather(path: Path) -> Facts:
     )
     facts.policy, facts.driven_step = kept_policy(run), trained_step(evaluated)
     facts.evaluation, facts.evaluation_on_ways = shown, ways
-    facts.clean = {name: measures(driven) for name, driven in clean.items()}
     facts.clones = read_clones(path)
     facts.fed = fed_shares(run)
     facts.off_policy = _off_policy(run, facts.twin)

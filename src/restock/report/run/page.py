@@ -55,41 +55,22 @@ def page(facts: Facts) -> dict[str, Any]:
 
 
 def _cards(facts: Facts) -> list[dict[str, str]]:
-    config = facts.config.get("config", {})
-    replay, policy = config.get("replay", {}), facts.policy
     cards = []
     if facts.panel is not None:
         header = facts.panel.header
         cards.append({"value": f"{header.rows:,}", "label": f"logged rows in panel {header.id}"})
-    if not facts.twin:
-        return [
-            *cards,
-            {"value": f"{facts.trained['gradient_steps']:,}", "label": "updates"},
-            {"value": facts.target_rule, "label": "target rule"},
+    if facts.twin:
+        ring = facts.config.get("config", {}).get("replay", {}).get("ring_capacity", 0)
+        cards += [
+            {"value": f"{ring:,}", "label": "capacity of the fresh ring, rows"},
+            {"value": _sampling(facts), "label": "of the rows fed from logs"},
+            {"value": f"{facts.trained['env_steps']:,}", "label": "environment steps"},
         ]
-    cards += [
-        {
-            "value": f"{replay.get('ring_capacity', 0):,}",
-            "label": "capacity of the fresh ring, rows",
-        },
-        {"value": _sampling(facts), "label": "of the rows fed from logs"},
+    return [
+        *cards,
+        {"value": f"{facts.trained['gradient_steps']:,}", "label": "updates"},
         {"value": facts.target_rule, "label": "target rule"},
-        {"value": f"{facts.trained['env_steps']:,}", "label": "environment steps"},
     ]
-    if policy is not None:
-        made = counted(len({row["env_steps"] for row in facts.learning}), "evaluation")
-        cards.append(
-            {
-                "value": f"{policy.env_steps:,}",
-                "label": "environment step of the "
-                + (
-                    f"kept policy, the best of {made} in training"
-                    if policy.chosen == "best"
-                    else "latest policy; not evaluated in training"
-                ),
-            }
-        )
-    return cards
 
 
 def _sampling(facts: Facts) -> str:
