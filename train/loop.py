@@ -156,8 +156,6 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             acting_step=acting_step,
         )
         progress.env_steps += session.env.num_envs
-        if learner.behaviour is not None:
-            learner.behaviour.move_to(progress.env_steps)
         for episode in ended:
             session.interval.episodes += 1
             session.interval.successes += bool(episode.success)

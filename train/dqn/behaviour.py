@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from restock.arrays import F32, F64, Bools
-from restock.replay.mixture.mixture import value_at
 from restock.state import Stateful
 from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import PLANNER, TeacherConfig, TrainConfig
@@ -159,13 +158,13 @@ def make_policy(
 
 
 class Behaviour(Stateful):
-    """G with its optimizer and the current ratio. `average` is the G that is evaluated and kept.
+    """G with its optimizer and the ratio. `average` is the G that is evaluated and kept.
 
     Args:
         path: how its network is differentiated.
     """
 
-    STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates", "in_force")
+    STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates")
 
     def __init__(
         self,
@@ -177,7 +176,6 @@ class Behaviour(Stateful):
         device: torch.device,
         path: UpdatePath,
     ) -> None:
-        self.config = config
         generator = torch.Generator().manual_seed(_SEED + seed)
         self.network = make_behaviour(observation_size, actions, generator).to(device)
         self.average = clone(self.network)
@@ -186,22 +184,8 @@ class Behaviour(Stateful):
         learns = self.optimizer
         (self._logits,) = differentiable(path, self.network, learns.values, learns.gradient)
         self.updates = 0
-        self.ratio = torch.zeros((), device=device)  # shared with the networks that it filters
-        self.move_to(0)
-
-    def move_to(self, env_steps: int) -> None:
-        """Set the ratio for the time after `env_steps` environment steps."""
-        self.in_force = value_at(self.config.ratio, env_steps)
-
-    @property
-    def in_force(self) -> float:
-        """Return the current ratio as a number."""
-        return float(self.ratio)
-
-    @in_force.setter
-    def in_force(self, ratio: float) -> None:
-        self.ratio.fill_(ratio)
-        self._floor = np.float32(torch.tensor(ratio).log())  # of plausible logits, from the best on
+        self.ratio = torch.tensor(config.ratio, device=device)
+        self._floor = np.float32(self.ratio.log().cpu())  # of plausible logits, from the best on
 
     def learn(self, labelled: Labelled) -> None:
         """Make one gradient step."""

@@ -19,7 +19,6 @@ from msgspec import Meta
 from restock.errors import ConfigError
 from restock.renamed import TRAINING_KEYS
 from restock.replay.fleet.missions_file import MissionOrder
-from restock.replay.mixture.mixture import Portion
 from restock.toml import Checked, changed, read_toml, toml_value, typed
 from restock.train.twin.env.interface import LinearEpsilon
 from restock.train.twin.missions import DEFAULT_CONDITIONS
@@ -135,7 +134,7 @@ class TeacherConfig(Checked, frozen=True):
     # None: the operator where the task has a goal, else none.
     source: str | None = None
     margin: NonNegative = 0.2  # reward by which another action must be better than the planner's
-    ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; or a schedule
+    ratio: Share = 0.3  # plausible: G(a|s) >= ratio * max G
     policies: tuple[str, ...] = ("operator",)  # whose logged rows are cloned, or have `loss.margin`
     # And rows of other drivers' episodes that reached their goal without one of `policies`: before
     # the first environment step, and for good where nobody is asked. None: where goals are logged
@@ -298,8 +297,8 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Return nested settings as `key.path=value`, which `apply_overrides` takes."""
     overrides = []
     for key, value in document.items():
-        # A target rule or a schedule is one value: half of one and half of another is invalid.
-        if isinstance(value, Mapping) and prefix + key not in ("target", "teacher.ratio"):
+        # A target rule is one value: half of one and half of another is invalid.
+        if isinstance(value, Mapping) and prefix + key != "target":
             overrides += as_overrides(value, f"{prefix}{key}.")
         elif value is not None:
             overrides.append(f"{prefix}{key}={toml_value(value)}")

@@ -436,7 +436,7 @@ def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, 
         return float(of[requested].float().mean()) if bool(requested.any()) else None
 
     return {
-        "ratio": learner.behaviour.in_force,
+        "ratio": float(learner.behaviour.ratio),
         "rows": len(action),
         "asked_rows": int(requested.sum()),
         "loss": float(imitation_loss(logits, answer)) if bool(requested.any()) else None,
