@@ -134,6 +134,14 @@ FROM episode_pairs
 WHERE change <> 'same'
 ORDER BY change, recording_id, number;
 
+CREATE TEMP VIEW episode_counts AS
+SELECT
+    count(*) FILTER (change = 'in') AS "in",
+    count(*) FILTER (change = 'out') AS "out",
+    count(*) FILTER (change = 'changed') AS changed,
+    count(*) FILTER (change = 'same') AS same
+FROM episode_pairs;
+
 CREATE TEMP VIEW label_changes AS
 SELECT condition_a AS "from", condition_b AS "to", count(*) AS rows,
     count(DISTINCT episode_id) AS episodes
@@ -141,6 +149,35 @@ FROM row_pairs
 WHERE condition_a IS DISTINCT FROM condition_b
 GROUP BY ALL
 ORDER BY rows DESC, condition_a, condition_b;
+
+CREATE TEMP VIEW label_counts AS
+SELECT
+    count(*) AS rows_compared,
+    count(*) FILTER (condition_a IS DISTINCT FROM condition_b) AS rows_changed,
+    count(*) FILTER (
+        condition_a IS NOT DISTINCT FROM condition_b
+        AND list_sort(conditions_a) IS DISTINCT FROM list_sort(conditions_b)
+    ) AS rows_with_other_changes
+FROM row_pairs;
+
+-- Of `share_values` (made in store_difference.py): the value of each column that is compared, a row a step.
+CREATE TEMP VIEW share_changes AS
+WITH counted AS (
+    SELECT place, "of", value, count(*) FILTER (side = 'a') AS rows_a, count(*) FILTER (side = 'b') AS rows_b
+    FROM share_values
+    GROUP BY ALL
+), shared AS (
+    SELECT
+        *,
+        rows_a / nullif(sum(rows_a) OVER column_rows, 0) AS share_a,
+        rows_b / nullif(sum(rows_b) OVER column_rows, 0) AS share_b
+    FROM counted
+    WINDOW column_rows AS (PARTITION BY "of")
+)
+SELECT * EXCLUDE (place), share_b - share_a AS difference
+FROM shared
+QUALIFY count(*) OVER (PARTITION BY "of") > 1 OR value <> '(none)'
+ORDER BY place, value;
 
 -- Conditions whose definition differs, and labels, profiles and software of the rows.
 CREATE TEMP VIEW definition_changes AS

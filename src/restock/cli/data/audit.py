@@ -17,7 +17,7 @@ from restock.errors import ConfigError, ExitCode, RestockError, RunError, quoted
 from restock.files import expect_file_place, read_json, write_text
 from restock.ingest.store.location import Location
 from restock.process import interrupts_raised
-from restock.replay.fleet.store_difference import diff_stores, shifted
+from restock.replay.fleet.store_difference import diff_stores
 from restock.replay.places import RUN_CONFIG, beside_of, open_place
 from restock.replay.store.audit import (
     OFFENDED,
@@ -191,7 +191,7 @@ class AuditCommand:
         try:
             with Store(old) as first, Store(self.store) as second:
                 first.verify()
-                return of_difference(diff_stores(first, second).document(), old=old)
+                return of_difference(diff_stores(first, second), old=old)
         except RestockError as error:
             return refused("comparable", error, option=f"--against {old}")
 
@@ -331,7 +331,7 @@ class Part(NamedTuple):
 
 
 def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
-    """Return the difference of two stores (`StoreDifference.document`) as findings.
+    """Return the difference of two stores (`diff_stores`) as findings.
 
     What the new store lost is a failure. Changed definitions and labels are a warning, because they
     may be intended. New recordings are for information.
@@ -358,10 +358,6 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
         ("labels_changed", "warning", "Rows whose condition changed",
          "`restock coverage diff` shows all of them; `restock review STORE` lets a person"
          " check labels", document["labels"]["changes"]),
-        ("signals_shifted", "warning",
-         "Signals whose mean over episodes shifted (false discovery rate 5 %)",
-         "`restock coverage drift` shows which robot, week and part",
-         shifted(document["signals"]["shifts"])),
         ("recordings_new", "info", "Recordings that were added, or written again",
          "nothing to do: these recordings explain the differences",
          [row for row in recordings if row["change"] != "out"]),

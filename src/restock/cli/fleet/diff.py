@@ -22,11 +22,10 @@ class DiffCommand:
         restock coverage diff panels/a panels/b
         restock coverage diff runs/a runs/b
 
-    Stores: recordings and episodes that were added or removed, rows whose labels changed, the
-    shares of conditions, zones and policies, and signals that shifted, with 95 % intervals over
-    episodes. Panels: mixture, rows, shares and weights. Runs: settings, what their critics were
-    fed, and their evaluations side by side. Sources of different tasks are refused, as their rows
-    have different meanings. The command only reads.
+    Stores: recordings and episodes that were added or removed, rows whose labels changed, and the
+    shares of conditions, zones and policies. Panels: mixture, rows, shares and weights. Runs:
+    settings, what their critics were fed, and their evaluations side by side. Sources of different
+    tasks are refused, as their rows have different meanings. The command only reads.
     """
 
     first: Annotated[str, Positional("A")]
@@ -72,7 +71,7 @@ def _difference(first: str, second: str) -> dict[str, Any]:
     with Store(first) as one, Store(second) as other:
         output.say_unverified(one)
         output.say_unverified(other)
-        return diff_stores(one, other).document()
+        return diff_stores(one, other)
 
 
 def _kind_of(place: str) -> str:
@@ -93,10 +92,6 @@ _RECORDINGS = {
     "rows_relabelled": "relabelled",
 }
 _SHARES = {"of": "of", "value": "value", "rows": "rows", "share": "%", "difference": "difference"}
-_SIGNALS = {
-    **{"signal": "signal", "mean": "mean", "standardised": "in units of its spread"},
-    **{"ks": "KS distance", "p_adjusted": "p (of all signals)"},
-}
 _STRATA = {
     **{"stratum": "stratum", "rows": "rows", "natural_share": "natural", "wanted_share": "wanted"},
     **{"share": "drawn", "effective_share": "weighted"},
@@ -118,8 +113,6 @@ def show(document: dict[str, Any]) -> None:
 
 
 def _print_stores(document: dict[str, Any]) -> None:
-    from restock.replay.fleet.store_difference import shifted
-
     a, b = document["a"], document["b"]
     names = [f"a: {a['path']} version {a['version']}", f"b: {b['path']} version {b['version']}"]
     output.print_table(
@@ -140,23 +133,11 @@ def _print_stores(document: dict[str, Any]) -> None:
     )
     _print_labels(document["labels"])
     shares = [
-        row | {f"difference{end}": 100 * row[f"difference{end}"] for end in ("", "_low", "_high")}
+        row | {"difference": _value("share", row["difference"])}
         for row in document["shares"]
         if row["rows_a"] != row["rows_b"]
     ]
-    title = "shares (difference b - a in points, 95 % interval over episodes)"
-    section(title, _lines(shares, _SHARES))
-    signals = document["signals"]
-    if signals["compared"]:
-        moved = shifted(signals["shifts"])
-        title = (
-            f"signals that shifted: {signals['compared']} ({signals['episodes_b']:,} and"
-            f" {signals['episodes_a']:,}), means of episodes"
-        )
-        if moved:
-            section(title, _lines(moved, _SIGNALS))
-        else:
-            output.print_text(f"\nno signal shifted: {signals['compared']}")
+    section("shares (difference b - a in points)", _lines(shares, _SHARES))
 
 
 def _print_panels(document: dict[str, Any]) -> None:
