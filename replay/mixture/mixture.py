@@ -2,16 +2,10 @@
 
 Only what the file says happens: unknown keys are refused with their path, and every default is
 visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.
-
-A share is a number or a schedule over a run's environment steps; `value_at` reads either. Before
-the first environment step (offline) and after a schedule's end its value stays where it began and
-where it ended.
 """
 
 from __future__ import annotations
 
-import itertools
-from bisect import bisect_right
 from datetime import UTC, datetime, timedelta
 from importlib.resources import files
 from pathlib import Path
@@ -25,88 +19,6 @@ from restock.replay.sampling.rules import RULES, Prioritised
 from restock.toml import Checked, parse_toml, read_toml, typed
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
-EnvSteps = Annotated[int, Meta(ge=0)]
-
-
-class Linear(Checked, frozen=True, tag_field="schedule", tag="linear"):
-    """From `start` to `end` in a straight line."""
-
-    start: Fraction
-    end: Fraction
-    to_env_steps: EnvSteps  # step at which it ends
-    from_env_steps: EnvSteps = 0  # step at which it begins
-
-    def check(self) -> None:
-        _check_span(self)
-
-    def at(self, env_steps: float) -> float:
-        return self.start + (self.end - self.start) * _part(self, env_steps)
-
-
-class Piecewise(Checked, frozen=True, tag_field="schedule", tag="piecewise"):
-    """Through points `[env_steps, share]`, in order, joined by lines."""
-
-    points: tuple[tuple[EnvSteps, Fraction], ...]
-
-    def check(self) -> None:
-        steps = [step for step, _ in self.points]
-        if not steps or any(b <= a for a, b in itertools.pairwise(steps)):
-            raise ValueError(
-                f"points must be [env_steps, share] with rising env_steps, got {steps}"
-            )
-
-    def at(self, env_steps: float) -> float:
-        after = bisect_right([step for step, _ in self.points], env_steps)
-        if after == 0:
-            return self.points[0][1]
-        step, share = self.points[after - 1]
-        if after == len(self.points):
-            return share
-        next_step, next_share = self.points[after]
-        return share + (next_share - share) * (env_steps - step) / (next_step - step)
-
-
-Schedule = Linear | Piecewise
-Portion = Fraction | Schedule
-
-
-def value_at(portion: Portion, env_steps: float) -> float:
-    """Return the share at a step."""
-    return portion if isinstance(portion, int | float) else portion.at(env_steps)
-
-
-def knots(portion: Portion) -> list[int]:
-    """Return the steps where a schedule begins, bends or ends; none for a number."""
-    if isinstance(portion, int | float):
-        return []
-    if isinstance(portion, Piecewise):
-        return [step for step, _ in portion.points]
-    return [portion.from_env_steps, portion.to_env_steps]
-
-
-def mean_over(portion: Portion, begin: float, end: float) -> float:
-    """Return the mean share over [begin, end] environment steps, by a fine rule of midpoints."""
-    if isinstance(portion, int | float) or end <= begin:
-        return value_at(portion, begin)
-    edges = sorted({begin, end, *(k for k in knots(portion) if begin < k < end)})
-    total = 0.0
-    for low, high in itertools.pairwise(edges):
-        width = (high - low) / 64
-        total += sum(value_at(portion, low + (i + 0.5) * width) for i in range(64)) * width
-    return total / (end - begin)
-
-
-def _part(ramp: Linear, env_steps: float) -> float:
-    length = ramp.to_env_steps - ramp.from_env_steps
-    return min(max((env_steps - ramp.from_env_steps) / length, 0.0), 1.0)
-
-
-def _check_span(ramp: Linear) -> None:
-    if ramp.from_env_steps >= ramp.to_env_steps:
-        raise ValueError(
-            f"to_env_steps must be above from_env_steps, which is {ramp.from_env_steps:,}, got"
-            f" {ramp.to_env_steps:,}"
-        )
 
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
@@ -116,7 +28,7 @@ Count = Annotated[int, Meta(ge=0)]
 FromOne = Annotated[float, Meta(ge=1)]
 Positive = Annotated[float, Meta(gt=0)]
 Timing = Literal["pre", "post"]
-Share = Fraction | Literal["natural", "equal"] | Schedule
+Share = Fraction | Literal["natural", "equal"]
 Correction = Literal["none", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
@@ -130,7 +42,7 @@ class OtherStore(Checked, frozen=True):
 
     name: str  # its strata are named `name/stratum`
     path: str  # absolute, or relative to the mixture's file; PATH@VERSION: not the newest
-    share: Portion  # share of a batch
+    share: Fraction  # share of a batch
     # What its rows stand for: how often things occur, the main store's rates, or these.
     represents: Represents | None = None
 
@@ -145,9 +57,9 @@ class OtherStore(Checked, frozen=True):
 
 
 class SourceShares(Checked, frozen=True):
-    """Shares of an online batch by source, numbers or schedules; what is left is fresh."""
+    """Shares of an online batch by source; what is left is fresh."""
 
-    logs: Portion = 0.5
+    logs: Fraction = 0.5
     stores: tuple[OtherStore, ...] = ()
     represents: Represents | None = None  # rates of the main store, if its rows are a selection
 
@@ -158,19 +70,14 @@ class SourceShares(Checked, frozen=True):
             'sources.represents: an "archive" stands for the main store\'s rates, and this is the '
             "main store: give the rates as a table",
         )
-        portions = [self.logs, *(store.share for store in self.stores)]
         names = [store.name for store in self.stores]
         _require(len(set(names)) == len(names), f"stores named twice: {sorted(names)}")
-        bends = sorted({0, *(step for portion in portions for step in knots(portion))})
-        totals = [sum(value_at(portion, step) for portion in portions) for step in bends]
-        _require(max(totals) <= 1 + 1e-6, f"sources sum to {max(totals):g} at some step, above 1")
-        _require(
-            value_at(self.logs, 0) > 0,
-            "sources.logs must be above 0 at step 0: the offline phase draws from it",
-        )
+        total = sum(self.parts.values())
+        _require(total <= 1 + 1e-6, f"sources sum to {total:g}, above 1")
+        _require(self.logs > 0, "sources.logs must be above 0: the offline phase draws from it")
 
     @property
-    def parts(self) -> dict[str, Portion]:
+    def parts(self) -> dict[str, float]:
         """Return the share of a batch of each source except fresh rows."""
         return {"logs": self.logs, **{store.name: store.share for store in self.stores}}
 
@@ -182,11 +89,6 @@ class SourceShares(Checked, frozen=True):
     def chosen(self, name: str) -> bool:
         """Return whether a source's rows stand for other rates than their own."""
         return self.said[name] not in (None, "natural")
-
-    @property
-    def last_bend(self) -> int:
-        """Return the environment step at which the last schedule ends, 0 without one."""
-        return max((step for part in self.parts.values() for step in knots(part)), default=0)
 
 
 def _check_rates(represents: Represents | None) -> None:

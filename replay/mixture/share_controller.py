@@ -1,9 +1,8 @@
 """The shares of a run: which part of a batch each stratum gets now, and what was drawn of each.
 
 A panel's shares are a plan for the mixture's `planned_draws`. A run knows how much it will draw,
-at which environment step, and where its TD errors are: the controller plans the mixture for that
-run, follows its schedules, and counts what is drawn, so that no stratum
-gives more than its rows may give under `max_replays_per_row`.
+and at which environment step: the controller plans the mixture for that run, and counts what is
+drawn, so that no stratum gives more than its rows may give under `max_replays_per_row`.
 
 A quota is a stratum's share of the batch, whether its rows are logged or fresh. Logged rows give
 what the mixture asks of the logs, as far as `max_replays_per_row` lets them, spread evenly over the
@@ -28,16 +27,12 @@ from restock.replay.mixture.mixture import (
     Shortfall,
     SourceShares,
     StratumRule,
-    knots,
-    mean_over,
-    value_at,
 )
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # shares that move are worked out again after so many
 _SAME = 0.01  # of a share: a smaller change waits
-_MOMENTS = 17  # of a run, at which a forecast looks
 _SHORT = 1e-3  # of the rows fed: less is rounding
 
 
@@ -77,7 +72,7 @@ class _SourceDraws:
     online: float
     got: F64  # shares of its strata now
     natural: Ints | F64  # what divides "natural" shares: rows, or how often strata occur
-    wanted: F64 | None = None  # the shares asked for, if they never change
+    wanted: F64  # the shares asked for
 
 
 class ShareController(Stateful):
@@ -122,17 +117,17 @@ class ShareController(Stateful):
         self.wanted: F64 = np.zeros(size)
         self.fresh_shares: F64 = np.append(np.zeros(size), 1.0)
         self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in batches
-        self._share_given = logs_share
         self.drawn: Ints = np.zeros(len(strata), np.int64)
         self.batches = 0  # drawn
         self.env_steps = 0.0
         self.shares: F64 = np.zeros(len(strata))
         self.logs_share = 0.0
-        self.sources = [self._source(name) for name in mixture.sources.parts]
+        self.parts = dict(mixture.sources.parts)  # of an online batch, whatever rows there are
+        if logs_share is not None:
+            total = max(sum(self.parts.values()), 1e-12)
+            self.parts = {name: part * logs_share / total for name, part in self.parts.items()}
+        self.sources = [self._source(name) for name in self.parts]
         shares = [stratum.rule.share for stratum in strata]
-        portions = [p for p in shares if not isinstance(p, str)]
-        portions += mixture.sources.parts.values()
-        self._moves = any(knots(portion) for portion in portions)
         # Where no stratum has a quota, a ring is drawn from as it is.
         self._steers = any(share != "natural" for share in shares)
         self._work_out(mixture.shortfall)
@@ -157,36 +152,25 @@ class ShareController(Stateful):
         places = [i for i, stratum in enumerate(self.strata) if stratum.source == name]
         of_source = slice(places[0], places[-1] + 1)
         strata = self.strata[of_source]
+        rules = [stratum.rule for stratum in strata]
+        natural = np.array([s.rows if s.occurs is None else s.occurs for s in strata])
         return _SourceDraws(
             name,
             of_source,
-            [stratum.rule for stratum in strata],
+            rules,
             np.array([stratum.rows for stratum in strata], np.int64),
             np.array([stratum.rule.cap for stratum in strata]),
             *self._draws_of(name),
             np.zeros(len(strata)),
-            np.array([s.rows if s.occurs is None else s.occurs for s in strata]),
+            natural,
+            wanted_shares(rules, natural),
         )
 
     def _draws_of(self, name: str) -> tuple[float, float]:
         """Return the rows that a source is to give offline, and online."""
-        planned, sources = self.planned, self.mixture.sources
-        parts = self.parts_at(0)
-        span = (planned.begin_env_steps, planned.end_env_steps)
-        mean = self._scaled({n: mean_over(part, *span) for n, part in sources.parts.items()})
-        offline = planned.offline * parts[name] / max(sum(parts.values()), 1e-12)
-        return offline, planned.online * mean[name]
-
-    def parts_at(self, env_steps: float) -> dict[str, float]:
-        """Return the share of an online batch that each source should get, whatever rows it has."""
-        sources = self.mixture.sources
-        return self._scaled({n: value_at(part, env_steps) for n, part in sources.parts.items()})
-
-    def _scaled(self, parts: dict[str, float]) -> dict[str, float]:
-        if self._share_given is None:
-            return parts
-        total = max(sum(parts.values()), 1e-12)
-        return {name: part * self._share_given / total for name, part in parts.items()}
+        part = self.parts[name]
+        offline = self.planned.offline * part / max(sum(self.parts.values()), 1e-12)
+        return offline, self.planned.online * part
 
     def at(self, env_steps: float, stock: F64 | None = None) -> bool:
         """Advance to the next online batch; return whether the shares changed.
@@ -194,12 +178,11 @@ class ShareController(Stateful):
         `stock` (S,) is how many fresh rows of each stratum may be drawn, in batches.
         """
         self.env_steps = env_steps
-        if self.fresh is None and not self._moves:
+        if self.fresh is None:
             return False
-        began = self.fresh is not None and not self.online
-        if self.batches % REFRESH_BATCHES and not began:
+        if self.batches % REFRESH_BATCHES and self.online:
             return False
-        self.online = self.fresh is not None
+        self.online = True
         if stock is not None:
             self.stock = stock
         return self._work_out("redistribute")
@@ -229,27 +212,23 @@ class ShareController(Stateful):
             return self._beside_ring()
         if self.mixture.shortfall == "shrink" and self.fresh is None:
             shortfall = "shrink"
-        parts, shares, logs_share = self.parts_at(self.env_steps), np.zeros(len(self.strata)), 0.0
+        shares, logs_share = np.zeros(len(self.strata)), 0.0
         for source in self.sources:
             source.got, filled, online_filled = self._plan(source, shortfall)
-            part = value_at(self.mixture.sources.parts[source.name], self.env_steps)
+            part = self.mixture.sources.parts[source.name]
             shares[source.strata] = source.got * part * filled
-            logs_share += parts[source.name] * online_filled
+            logs_share += self.parts[source.name] * online_filled
         total = shares.sum()
         shares = shares / total if total > 0 else self.shares
-        requested = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
-        self.wanted = np.bincount(self._of, requested) / max(sum(parts.values()), 1e-12)
+        self.wanted = np.bincount(self._of, self._requested) / max(sum(self.parts.values()), 1e-12)
         changed = logs_share != self.logs_share or not np.array_equal(shares, self.shares)
         self.shares, self.logs_share = shares, logs_share
         return changed
 
-    def _wanted(self, source: _SourceDraws) -> F64:
-        """Return the shares (S,) of a source's rows that the mixture asks for now."""
-        if self._moves:
-            return wanted_shares(source.rules, source.natural, self.env_steps)
-        if source.wanted is None:
-            source.wanted = wanted_shares(source.rules, source.natural)
-        return source.wanted
+    @property
+    def _requested(self) -> F64:
+        """Return the shares (K * S,) of an online batch that the mixture asks of the logs."""
+        return np.concatenate([self.parts[source.name] * source.wanted for source in self.sources])
 
     def _beside_ring(self) -> bool:
         """Compute the shares of logged and fresh rows in an online batch; tell if they moved."""
@@ -271,9 +250,7 @@ class ShareController(Stateful):
 
         `stock` (S,) bounds what the ring gives, `limit` (K * S,) what logged rows bear.
         """
-        parts = self.parts_at(self.env_steps)
-        requested = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
-        logged = sum(parts.values())
+        requested, logged = self._requested, sum(self.parts.values())
         wanted = np.bincount(self._of, requested) + max(1.0 - logged, 0.0) * self._wanted_fresh(
             stock
         )
@@ -309,9 +286,9 @@ class ShareController(Stateful):
         """Return the shares (S,) of fresh rows: natural strata as often as the ring has them."""
         source = self.sources[0]
         if all(rule.share != "natural" for rule in source.rules):
-            return self._wanted(source)  # whatever the rows
+            return source.wanted  # whatever the rows
         have = stock if np.isfinite(stock).all() and stock.sum() > 0 else source.natural
-        return wanted_shares(source.rules, have, self.env_steps)
+        return wanted_shares(source.rules, have)
 
     def _limits(self, *, from_start: bool = False) -> F64:
         """Return the largest share of an online batch that each stratum allows, (K * S,)."""
@@ -340,22 +317,18 @@ class ShareController(Stateful):
         total = max(planned.offline + online, 1e-12)
         logs = planned.offline / total * np.bincount(self._of, self.planned_shares)
         wanted, fresh = planned.offline / total * self._wanted_offline, np.zeros(size)
-        now = self.env_steps
-        moments = np.linspace(planned.begin_env_steps, planned.end_env_steps, _MOMENTS)
-        for moment in moments if online else ():
-            self.env_steps = float(moment)
+        if online:
             limits = self._limits(from_start=True)
             of_logs, of_ring, requested = self._split(np.full(size, np.inf), limits)
             by_stratum = np.bincount(self._of, of_logs)
             if not self._steers:  # the ring as it is: nothing is asked of it
                 of_ring = np.maximum(requested - by_stratum, 0.0)
-            part = online / total / _MOMENTS
+            part = online / total
             logs, fresh, wanted = (
                 logs + part * by_stratum,
-                fresh + part * of_ring,
+                part * of_ring,
                 wanted + part * requested,
             )
-        self.env_steps = now
         natural = self.natural
         short = np.maximum(wanted - logs - fresh, 0.0)
         short[short < 1e-6] = 0.0
@@ -406,8 +379,7 @@ class ShareController(Stateful):
 
     def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
         """Plan a source: its shares, and how much of its remaining and online draws it can fill."""
-        wanted = self._wanted(source)
-        drawn = self.drawn[source.strata]
+        wanted, drawn = source.wanted, self.drawn[source.strata]
         ahead = max(self._ahead(source, float(drawn.sum())), 1.0)
         limit = np.where(source.rows > 0, 1.0, 0.0)
         if self.max_replays is not None:
@@ -450,10 +422,7 @@ class ShareController(Stateful):
         begin, end = self.planned.begin_env_steps, self.planned.end_env_steps
         if drawn < source.offline or self.env_steps <= begin or end <= begin:
             return by_draws
-        part = self.mixture.sources.parts[source.name]
-        now = min(self.env_steps, end)
-        whole = mean_over(part, begin, end) * (end - begin)
-        left = mean_over(part, now, end) * (end - now) / max(whole, 1e-12)
+        left = (end - min(self.env_steps, end)) / (end - begin)
         return min(by_draws, source.online * left)
 
     def describe(self) -> list[dict[str, Any]]:

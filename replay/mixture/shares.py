@@ -26,7 +26,6 @@ from restock.replay.mixture.mixture import (
     Share,
     Shortfall,
     StratumRule,
-    value_at,
 )
 
 # How many times the others' odds of a condition, by episode, are reason to warn, and to refuse an
@@ -213,21 +212,20 @@ def plan_shares(
     episodes: Ints,
     *,
     draws: float,
-    env_steps: float = 0,
     natural: F64 | None = None,
     unknown: Mapping[str, str] | None = None,
     lacking: Mapping[str, str] | None = None,
 ) -> SharePlan:
     """Plan shares from the mixture's rules and the number of rows (S,) and episodes (S,).
 
-    `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule,
-    `natural` (S,) the shares that the rows stand for, where that is not their own. `unknown` are
+    `draws` is how many rows will be drawn in all, `natural` (S,) the shares that the rows stand
+    for, where that is not their own. `unknown` are
     strata that no row could be in, and why; `lacking` others with too few rows, and what to change.
 
     Raises:
         MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
     """
-    wanted = wanted_shares(rules, rows if natural is None else natural, env_steps)
+    wanted = wanted_shares(rules, rows if natural is None else natural)
     limit = row_limits(mixture, rows, draws)
     untold, too_few = unknown or {}, lacking or {}
     caps = np.array([rule.cap for rule in rules])
@@ -292,7 +290,7 @@ def within_limits(
     return SharePlan(wanted, got, 1.0, tuple(np.where(more, "took the surplus", notes).tolist()))
 
 
-def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: float = 0) -> F64:
+def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64) -> F64:
     """Keep given shares; divide the rest among "equal" and "natural" strata, in floor and cap.
 
     "natural" strata are divided by their rows (S,), or by what is in their place.
@@ -300,9 +298,7 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: flo
     Raises:
         MixtureError: shares that cannot sum to 1 within their floors and caps.
     """
-    given = np.array(
-        [0.0 if isinstance(rule.share, str) else value_at(rule.share, env_steps) for rule in rules]
-    )
+    given = np.array([0.0 if isinstance(rule.share, str) else rule.share for rule in rules])
     flexible = np.array([isinstance(rule.share, str) for rule in rules], np.bool_)
     rest = 1.0 - float(given.sum())
     if rest < -1e-6 or (rest > 1e-6 and not flexible.any()):

@@ -5,8 +5,8 @@
     sampler.gather(batch.rows, out)                  # (B, W) float32
     sampler.update(batch.rows, td_abs)               # once it was learnt from
 
-The shares follow the mixture's schedules, a stratum's rows are drawn by its `within`, weights are
-those of the shares in force, and no row comes more often than `max_replays_per_row`.
+A stratum's rows are drawn by its `within`, weights are those of the shares in force, and no row
+comes more often than `max_replays_per_row`.
 """
 
 from __future__ import annotations
@@ -294,9 +294,7 @@ def sampler_by_shares(
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
     """Return the draws that a mixture was planned for."""
-    return PlannedDraws(
-        online=float(mixture.planned_draws), end_env_steps=mixture.sources.last_bend
-    )
+    return PlannedDraws(online=float(mixture.planned_draws))
 
 
 def controller_for(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
-from restock.replay.mixture.mixture import Mixture, OtherStore, mean_over, nanoseconds
+from restock.replay.mixture.mixture import Mixture, OtherStore, nanoseconds
 from restock.replay.mixture.shares import look_for_archives, represented_shares
 from restock.replay.plan.candidates import (
     META_COLUMNS,
@@ -378,7 +378,7 @@ def _sources(
         sources.append(
             SourceRows(
                 name,
-                mean_over(part, 0, mixture.sources.last_bend),
+                part,
                 table,
                 at,
                 stratum[at],

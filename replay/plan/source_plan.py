@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError, counted
 from restock.ingest.task.conditions import NOMINAL
-from restock.replay.mixture.mixture import Mixture, StratumRule, knots
+from restock.replay.mixture.mixture import Mixture, StratumRule
 from restock.replay.mixture.shares import (
     SharePlan,
     missing_rows,
     plan_shares,
-    wanted_shares,
 )
 from restock.replay.plan.candidates import bools, codes
 from restock.replay.plan.exclusions import scramble
@@ -348,11 +347,7 @@ def plan_source(
     warnings = tuple(
         f"{name} {lacking[name]}" for name in wanted if name in lacking and name not in untold
     )
-    _refuse_later_shares(rules, rows if natural is None else natural)
-    # A share with a schedule may begin at 0; others that are 0 are never drawn.
-    scheduled = np.array([not isinstance(rule.share, int | float | str) for rule in rules])
-    drawn = (shares.got > 0) | scheduled
-    kept = np.asarray(drawn[source.code], np.bool_)
+    kept = np.asarray((shares.got > 0)[source.code], np.bool_)
     code, state = source.code[kept], source.state_code[kept]
     outcome, fit = _outcomes(connection, mixture, strata, source, kept, natural)
     weight = importance_weights(
@@ -403,19 +398,6 @@ def _hours(driving: Forecast | None) -> dict[str, float]:
         return {}
     ends = {"missing_hours": 0.5, "missing_hours_low": 0.025, "missing_hours_high": 0.975}
     return {name: driving.quantile(share) for name, share in ends.items()}
-
-
-def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> None:
-    """Raise MixtureError where schedules leave the other strata no way to share out the rest."""
-    portions = [rule.share for rule in rules if not isinstance(rule.share, str)]
-    bends = sorted({step for portion in portions for step in knots(portion)})
-    for step in bends:
-        try:
-            wanted_shares(rules, natural, step)
-        except MixtureError as error:
-            raise MixtureError(
-                f"at environment step {step:,.0f}: {error.what}", remedy=error.remedy
-            ) from error
 
 
 def below_natural(line: Stratum) -> bool:

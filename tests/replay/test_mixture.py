@@ -6,7 +6,7 @@ import re
 import msgspec
 import numpy as np
 import pytest
-from support.panels import EVERY, NO_SPLIT, planned
+from support.panels import EVERY, planned
 from support.paths import ROOT
 
 from restock import cli
@@ -16,10 +16,8 @@ from restock.replay.mixture.mixture import (
     CorrectionRule,
     EachCondition,
     EvaluationSplit,
-    Linear,
     Mixture,
     OtherStore,
-    Piecewise,
     Prioritised,
     Safety,
     SourceShares,
@@ -41,16 +39,11 @@ def shares(plan: PanelPlan) -> dict[str, float]:
     [
         (EVERY + "sahre = 1", "sahre"),
         (
-            EVERY + "[sources]\nlogs = {schedule = 'linear', start = 0.2, end = 0.9,"
-            " to_env_steps = 10}\n[[sources.stores]]\nname = 'b'\npath = 'b'\nshare = 0.5",
+            EVERY
+            + "[sources]\nlogs = 0.9\n[[sources.stores]]\nname = 'b'\npath = 'b'\nshare = 0.5",
             "sources sum to 1.4",
         ),
-        (EVERY + "[sources]\nlogs = {schedule = 'step', start = 1}", "sources.logs.schedule"),
-        (EVERY + "[sources]\nlogs = {schedule = 'piecewise', points = [[9, 1], [2, 0]]}", "rising"),
-        (
-            EVERY + "[sources]\nlogs = {schedule='linear', start=0, end=1, to_env_steps=0}",
-            r"sources\.logs\.to_env_steps must be above from_env_steps, which is 0, got 0",
-        ),
+        (EVERY + "[sources]\nlogs = 0.0", "sources.logs must be above 0"),
         (EVERY + "[adaptive]\nfloor = 0.7", "unknown key `adaptive`"),
         ('[[strata]]\nname = "nominal"\nmin_rows = 9', "give it a smaller share"),
         ('[[sources.stores]]\nname = "a"\npath = "b"\nversion = 1', "as in STORE@12"),
@@ -84,7 +77,6 @@ def test_what_a_mixture_may_not_say_is_refused(text, message):
 
 
 SLIPS_ALONE = "[[strata]]\nname = 'nominal'\n[[strata]]\nname = 'wheel_slip'\n"
-LATER_HALF = "share = { schedule = 'linear', start = 0.5, end = 0.3, to_env_steps = 1000 }\n"
 
 
 @pytest.mark.parametrize(
@@ -103,13 +95,6 @@ LATER_HALF = "share = { schedule = 'linear', start = 0.5, end = 0.3, to_env_step
         ("where = 'step_index > 3; SELECT 1'\n" + EVERY, ConfigError, "`where`"),
         (EVERY + "[safety]\nunsafe = 'true'", MixtureError, "unsafe"),  # no row is left
         (SLIPS_ALONE, MixtureError, "recovery"),  # whose rows belong to no stratum
-        (
-            f"unlisted = 'drop'\n{NO_SPLIT}{SLIPS_ALONE}{LATER_HALF}".replace(
-                "'nominal'", "'nominal'\ncap = 0.6"
-            ),
-            MixtureError,
-            "at environment step 1,000",  # then the shares leave no room
-        ),
     ],
 )
 def test_what_rows_cannot_be_planned_by_is_refused(transitions, text, error, named):
@@ -370,7 +355,7 @@ def test_the_page_explains_every_key():
     page = (ROOT / "docs" / "mixture.md").read_text(encoding="utf-8")
     structs = (
         *(Mixture, StratumRule, EachCondition, EvaluationSplit, SourceShares, CorrectionRule),
-        *(OtherStore, Safety, Prioritised, Linear, Piecewise),
+        *(OtherStore, Safety, Prioritised),
     )
     for struct in structs:
         for field in msgspec.structs.fields(struct):

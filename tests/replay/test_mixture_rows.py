@@ -198,17 +198,11 @@ def test_another_store_is_drawn_from_at_its_pinned_version(two_stores, store_pat
     np.testing.assert_allclose(rows[:20], [by_id[i] for i in ids[:20].tolist()], rtol=1e-6)
 
 
-def test_a_run_draws_from_both_stores_by_their_schedules(two_stores, store_path):
-    share = "{schedule = 'linear', start = 0.0, end = 0.4, to_env_steps = 1000}"
-    text = OTHERS.replace("share = 0.2", f"share = {share}").replace(
-        '"other@1"', f'"{two_stores}/other@1"'
-    )
+def test_a_run_draws_from_both_stores_by_their_shares(two_stores, store_path):
+    text = OTHERS.replace('"other@1"', f'"{two_stores}/other@1"')
     panel = panel_of(store_path, text + EVERY, two_stores / "p")
     controller = controller_for(panel, PlannedDraws(640, 6400, 0, 1000), None)
     twin = np.array([stratum.source == "twin" for stratum in panel.strata])
-    assert controller.shares[twin].sum() == 0
-    assert controller.logs_share == pytest.approx(0.4)
-    controller.at(500)
     assert controller.logs_share == pytest.approx(0.6)
     assert controller.shares[twin].sum() == pytest.approx(1 / 3)
 

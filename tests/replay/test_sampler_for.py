@@ -35,8 +35,6 @@ MIXTURES = {
     "once": "max_replays_per_row = 1\nwithin = 'uniform'\n" + EVERY,
     "per": "within = 'per'\n" + EVERY,
     "limited per": "max_replays_per_row = 3\nwithin = 'per'\n" + EVERY,
-    "scheduled": EVERY + "[[strata]]\nname = 'nominal'\n"
-    "share = {schedule = 'linear', start = 0.8, end = 0.2, to_env_steps = 1000}\n",
     "quota": EVERY + "[[strata]]\nname = 'wheel_slip'\nshare = 0.25\n",
 }
 FOLLOW_TD = {"per", "limited per"}
@@ -165,7 +163,7 @@ def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(panels, name, way)
         return
     assert not refusal
     _check_within(panel, name, batches, counted)
-    _check_shares(panel, name, way, batches)
+    _check_shares(panel, batches)
 
 
 def _check_within(panel: Panel, name: str, batches: list[Drawn], counted: np.ndarray) -> None:
@@ -183,18 +181,13 @@ def _check_within(panel: Panel, name: str, batches: list[Drawn], counted: np.nda
             assert errs_alike or of_even > 1.5 * of_odd, stratum.name
 
 
-def _check_shares(panel: Panel, name: str, way: str, batches: list[Drawn]) -> None:
+def _check_shares(panel: Panel, batches: list[Drawn]) -> None:
     """Every batch has the quota of every stratum, the rounding carried on."""
     size = len(panel.strata)
     quotas = np.array([np.bincount(batch.strata, minlength=size) for batch in batches])
-    if name == "scheduled":
-        nominal = [stratum.name for stratum in panel.strata].index("nominal")
-        assert quotas[0, nominal] == 32
-        assert quotas[-1, nominal] == (32 if way.startswith("a library") else 8)
-    else:
-        shares = np.array([stratum.share for stratum in panel.strata])
-        owed = np.cumsum(quotas - shares * BATCH, axis=0)
-        assert np.abs(owed).max() < 2
+    shares = np.array([stratum.share for stratum in panel.strata])
+    owed = np.cumsum(quotas - shares * BATCH, axis=0)
+    assert np.abs(owed).max() < 2
 
 
 def test_draws_of_a_panel_go_on_where_they_were_saved(panels):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Linear, Piecewise, StratumRule, mean_over, value_at
+from restock.replay.mixture.mixture import StratumRule
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.replay.plan.strata import ResolvedStratum, assign
 
@@ -99,30 +99,3 @@ def test_priorities_part_the_rows(data):
     for row in range(count):
         holds = [(priority[i], i) for i in range(size) if member[row, i]]
         assert code[row] == (min(holds)[1] if holds else -1)
-
-
-def test_schedules_pass_through_their_points():
-    linear = Linear(start=0.8, end=0.2, from_env_steps=100, to_env_steps=300)
-    assert [linear.at(step) for step in (0, 100, 200, 300, 900)] == pytest.approx(
-        [0.8, 0.8, 0.5, 0.2, 0.2]
-    )
-    points = ((10, 0.5), (20, 1.0), (40, 0.0))
-    line = Piecewise(points=points)
-    assert [line.at(step) for step in (0, 10, 15, 20, 30, 50)] == pytest.approx(
-        [0.5, 0.5, 0.75, 1.0, 0.5, 0.0]
-    )
-    assert value_at(0.3, 7) == 0.3
-
-
-@pytest.mark.parametrize(
-    "portion",
-    [
-        0.25,
-        Linear(start=0.9, end=0.1, from_env_steps=50, to_env_steps=150),
-        Piecewise(points=((0, 0.2), (30, 0.8), (31, 0.1))),
-    ],
-)
-def test_the_mean_of_a_schedule_is_the_mean_of_its_values(portion):
-    steps = (np.arange(200_000) + 0.5) / 1000
-    values = np.mean([value_at(portion, step) for step in steps])  # type: ignore[arg-type]
-    assert mean_over(portion, 0, 200) == pytest.approx(values, abs=2e-4)  # type: ignore[arg-type]

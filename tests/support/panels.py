@@ -17,17 +17,17 @@ from support.stores import CONDITIONS, TASK
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 NO_SPLIT = "[evaluation_split]\nby = 'none'\n"
-# Schedules, priorities, a cap a row, corrections and an age limit at once.
-SCHEDULED = """
+# Priorities, a cap a row, corrections and an age limit at once.
+LIMITED = """
 max_replays_per_row = 40
 max_age_env_steps = 900
 [sources]
-logs = { schedule = "linear", start = 0.75, end = 0.25, to_env_steps = 1200 }
+logs = 0.75
 [correction]
 post = "density_ratio"
 [[strata]]
 name = "nominal"
-share = { schedule = "linear", start = 0.4, end = 0.5, to_env_steps = 1200 }
+share = 0.4
 [[strata]]
 name = "wheel_slip"
 within = "per"

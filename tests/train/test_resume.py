@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.long import one_in
-from support.panels import SCHEDULED
+from support.panels import LIMITED
 from support.stores import CONDITIONS, recording_transitions
 from support.toy_run import assert_same_run, config, run_to_end, session, tables
 from support.toy_twin import CONDITIONS as TOY_CONDITIONS
@@ -62,7 +62,6 @@ def logs_by(text: str, conditions: Iterable[Condition]) -> Callable[[Path], Logs
     return made
 
 
-RATIO = {"schedule": "linear", "start": 0.9, "end": 0.1, "to_env_steps": 480}
 CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[], Any]]] = {
     # Each batch is audited, so rows wait for the labels of episodes under way.
     "network, ring, twin, tables": ({"record": {"audit_share": 1.0}}, None, lambda: None),
@@ -72,14 +71,14 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
         lambda: None,
     ),
     "a teacher and its filter": (
-        {"teacher": {"source": "given", "ratio": RATIO, "offline_updates": 40}},
+        {"teacher": {"source": "given", "ratio": 0.5, "offline_updates": 40}},
         None,
         Walker,
     ),
     "practice": ({"practice": {"rule": "success"}}, None, lambda: None),
     "shares of logged rows": (
         {"replay": {"logs_share": None}},
-        logs_by(SCHEDULED, CONDITIONS),
+        logs_by(LIMITED, CONDITIONS),
         lambda: None,
     ),
     "quotas that fresh rows fill": (

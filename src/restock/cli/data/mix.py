@@ -115,11 +115,6 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         "warnings": list(plan.warnings),
         "planned_draws": plan.mixture.planned_draws,
         "max_replays_per_row": plan.mixture.max_replays_per_row,
-        "schedules": {
-            name: msgspec.to_builtins(part)
-            for name, part in plan.mixture.sources.parts.items()
-            if not isinstance(part, int | float)
-        },
         "task_hash": plan.task_hash,
         "n_step": plan.mixture.n_step,
         "discount": plan.mixture.discount,
@@ -229,11 +224,10 @@ def _summary(document: dict[str, Any]) -> list[str]:
         draws += _in_training(document, most)
     version = document["store_version"]
     source = "the table" if version < 0 else f"store version {version}"
-    moving = " on average" if document["schedules"] else ""
     lines += [
         *draws,
         f"{document['rows']:,} rows of {source}{others}; not in the panel: {left_out or 'none'}",
-        f"{document['logs_share']:.1%} of a batch{moving} from the logs, worth"
+        f"{document['logs_share']:.1%} of a batch from the logs, worth"
         f" {document['effective_rows']:,.0f} equally weighted rows; largest weight"
         f" {document['largest_weight']:.3g}",
     ]
