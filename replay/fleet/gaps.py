@@ -29,7 +29,6 @@ from restock.process import interrupts_raised
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
 from restock.replay.plan.plan import LOGS, PanelPlan, plan_panel
-from restock.replay.plan.source_plan import episode_hours
 from restock.replay.store.audit import Thresholds, check_thresholds, shipped_audits
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
@@ -100,6 +99,12 @@ class Yields:
     def _sum(self, kept: Bools) -> F64:
         number, rows = (self.cells[name].to_numpy()[kept] for name in ("number", "rows"))
         return np.bincount(number, rows, len(self)).astype(np.float64)
+
+
+def episode_hours(first_ns: Ints, last_ns: Ints, rows: Ints) -> F64:
+    """Return the hours that episodes (E,) took; the last step takes as long as the others."""
+    steps = np.maximum(rows - 1, 1)
+    return np.asarray((last_ns - first_ns) / 3.6e12 * rows / steps, np.float64)
 
 
 def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> Yields:

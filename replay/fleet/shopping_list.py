@@ -18,15 +18,15 @@ import pyarrow as pa
 
 from restock.arrays import F64
 from restock.errors import figure, plural
-from restock.replay.fleet.gaps import Gap, Unit, Yields, find_gaps
-from restock.replay.mixture.mixture import load_mixture
-from restock.replay.panel.mixture_tables import install_planned
-from restock.replay.plan.source_plan import (
+from restock.replay.fleet.forecast import (
     Forecast,
     forecast,
     missions_to_see_one,
     probability_to_close,
 )
+from restock.replay.fleet.gaps import Gap, Unit, Yields, find_gaps
+from restock.replay.mixture.mixture import load_mixture
+from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.store.audit import load_thresholds
 from restock.replay.store.store import Store
 

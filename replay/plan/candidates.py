@@ -1,18 +1,16 @@
 """The rows a mixture may choose from: what DuckDB says of each transition, as columns, in order.
 
 DuckDB would sort whole rows, text and all. Batches of a store come as the threads that read them
-finish, but the rows of one batch lie in order already, recording by recording. So stretches are put
-in order and not rows, a column at a time; rows are sorted only where stretches overlap. Numbers are
-kept as they come, text as codes in as few bytes as its dictionary needs.
+finish, and are put in order here, a column at a time. Numbers are kept as they come, text as codes
+in as few bytes as its dictionary needs.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import duckdb
 import numpy as np
@@ -41,198 +39,71 @@ def stretches(rows: int) -> Iterator[tuple[int, int]]:
 
 
 class Places:
-    """Finds ids (N,) in their order: they rise within each recording, so runs are searched.
-
-    Where the runs of two recordings overlap (ids that `restock ingest` did not give), the ids are
-    sorted in memory.
-    """
+    """Finds ids (N,) in their order."""
 
     def __init__(self, ids: Ints) -> None:
-        self._ids = ids
-        self._order: Ints | None = None
-        starts = [0]
-        for begin, end in stretches(len(ids) - 1):
-            falls = np.flatnonzero(ids[begin + 1 : end + 1] <= ids[begin:end]) + begin + 1
-            starts += falls.tolist()
-        begins = np.array(starts, np.int64)
-        ends = np.append(begins[1:], len(ids))
-        order = np.argsort(ids[begins])
-        self._begins, self._ends = begins[order], ends[order]
-        self._first = ids[self._begins]
-        if (ids[self._ends - 1][:-1] >= self._first[1:]).any():
-            self._order = np.argsort(ids, kind="stable")
-            self._ids = ids[self._order]
-            self._begins, self._ends = np.array([0]), np.array([len(ids)])
-            self._first = self._ids[:1]
+        self._order = np.argsort(ids, kind="stable")  # fast: they rise within each recording
+        self._ids = ids[self._order]
 
     @property
     def twice(self) -> int:
         """Count the ids that occurred before."""
-        if self._order is None:  # each run rises, and ends before the next begins
-            return 0
         return int((self._ids[1:] == self._ids[:-1]).sum())
 
     def of(self, ids: Ints) -> Ints:
         """Return the place of each of these ids (n,); -1 of one that is not there."""
-        place = np.empty(len(ids), np.int64)
-        run = np.maximum(np.searchsorted(self._first, ids, "right") - 1, 0)
-        # Ids that come together are mostly of one run.
-        cuts = np.flatnonzero(run[1:] != run[:-1]) + 1
-        if len(cuts) > len(self._first):  # they come in no order: each run is searched once
-            order = np.argsort(run, kind="stable")
-            place[order] = self.of(ids[order])
-            return place
-        for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(ids)], strict=True):
-            if begin < end:
-                here = slice(int(self._begins[run[begin]]), int(self._ends[run[begin]]))
-                place[begin:end] = here.start + np.searchsorted(self._ids[here], ids[begin:end])
-        place = np.minimum(place, len(self._ids) - 1)
-        there = self._ids[place] == ids
-        return np.where(there, place if self._order is None else self._order[place], -1)
+        place = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
+        return np.where(self._ids[place] == ids, self._order[place], -1)
 
 
 KEYS = ("episode_index", "step_index", "transition_id")  # the id where all others are the same
-# Stretches that are more, and shorter on average, take longer than sorting rows.
-MAX_STRETCHES, STRETCH_ROWS = 1_000, 256
 COLUMNS_AT_A_TIME = 2  # put in order: each holds memory
 _LOOKED_AT = 1 << 20  # codes at a time
 
 
-class RowsInOrder:
-    """Collects batches of one schema: `add` each, then take the `table` of all, once.
+def rows_in_order(
+    batches: Iterable[pa.RecordBatch],
+    schema: pa.Schema,
+    *,
+    text: Collection[str],
+    dropped: Collection[str] = (),
+) -> pa.Table:
+    """Return the rows of batches by recording and KEYS.
 
     The schema has `recording_id` and KEYS. Columns named in `text` become dictionaries, whose codes
     are in the order of the first rows that have them; those in `dropped` are no columns of the
     table.
     """
-
-    def __init__(
-        self, schema: pa.Schema, *, text: Collection[str], dropped: Collection[str] = ()
-    ) -> None:
-        self._schema, self._dropped = schema, dropped
-        self._parts: dict[str, list[pa.Array]] = {name: [] for name in schema.names}
-        self._codes: dict[str, dict[str, int]] = {name: {} for name in schema.names if name in text}
-        self._stretches: list[_Stretches] = []  # of each batch
-
-    def add(self, batch: pa.RecordBatch) -> None:
-        """Add one batch; nothing of its memory is kept."""
-        if not len(batch):
-            return
-        for name, column in zip(batch.schema.names, batch.columns, strict=True):
-            if (known := self._codes.get(name)) is not None:
-                kept = _encoded(column, known)
+    parts: dict[str, list[pa.Array]] = {name: [] for name in schema.names}
+    texts: dict[str, dict[str, int]] = {name: {} for name in schema.names if name in text}
+    for batch in batches:
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            if (known := texts.get(name)) is not None:
+                parts[name].append(_encoded(values, known))
             else:  # a copy: any column of DuckDB's batch holds all of it, text too
-                kept = pa.concat_arrays([column, column[:0]])
-            self._parts[name].append(kept)
-        recording, *keys = (
-            np.asarray(self._parts[name][-1].to_numpy(), np.int64)
-            for name in ("recording_id", *KEYS)
-        )
-        self._stretches.append(_Stretches.of(recording, keys))
+                parts[name].append(pa.concat_arrays([values, values[:0]]))
 
-    def table(self) -> pa.Table:
-        """Return all rows in order, and free the batches on the way."""
-        rank = self._ranks()
-        stretches = _in_order(self._stretches, rank)
-        order = self._sorted_rows(rank) if stretches is None else None
+    def whole(name: str) -> pa.Array:
+        known = texts.get(name)
+        kind = schema.field(name).type if known is None else _code_type(len(known))
+        # Later batches may have needed wider codes.
+        return pa.concat_arrays([pa.array([], kind), *(part.cast(kind) for part in parts[name])])
 
-        def column(name: str) -> pa.Array:
-            parts, codes = self._parts.pop(name), self._codes.get(name)
-            kind = self._schema.field(name).type if codes is None else _code_type(len(codes))
-            if codes is not None:  # later batches may have needed wider codes
-                parts = [part.cast(kind) for part in parts]
-            if stretches is not None:
-                parts = [parts[batch].slice(begin, size) for batch, begin, size in stretches]
-            together = pa.concat_arrays([pa.array([], kind), *parts])
-            del parts
-            if order is not None:
-                together = together.take(order)
-            return together if codes is None else _by_appearance(together, list(codes))
+    ids = pa.array(list(texts["recording_id"]), pa.string())
+    rank = np.empty(len(ids), np.int64)
+    rank[pc.array_sort_indices(ids).to_numpy()] = np.arange(len(ids))
+    keys = [whole(key).to_numpy() for key in reversed(KEYS)]
+    order = pa.array(np.lexsort([*keys, rank[whole("recording_id").to_numpy()]]))
+    del keys
 
-        for name in self._dropped:
-            del self._parts[name]
-        names = list(self._parts)
-        with ThreadPoolExecutor(COLUMNS_AT_A_TIME, "restock-columns") as pool:
-            return pa.table(list(pool.map(column, names)), names)
+    def column(name: str) -> pa.Array:
+        in_order, known = whole(name).take(order), texts.get(name)
+        del parts[name]
+        return in_order if known is None else _by_appearance(in_order, list(known))
 
-    def _ranks(self) -> Ints:
-        """Return the place of each recording's code in the order of their ids."""
-        ids = pa.array(list(self._codes["recording_id"]), pa.string())
-        rank = np.empty(len(ids), np.int64)
-        rank[pc.array_sort_indices(ids).to_numpy()] = np.arange(len(ids))
-        return rank
-
-    def _sorted_rows(self, rank: Ints) -> pa.Array:
-        """Return the order of single rows, (N,)."""
-        keys = [pa.concat_arrays(self._parts[key]).to_numpy() for key in reversed(KEYS)]
-        of_batches = [part.cast(pa.int32()) for part in self._parts["recording_id"]]
-        return pa.array(np.lexsort([*keys, rank[pa.concat_arrays(of_batches).to_numpy()]]))
-
-
-@dataclass(frozen=True)
-class _Stretches:
-    """The stretches of one batch: consecutive rows of one recording, (n,) each."""
-
-    recording: Ints  # its code
-    begin: Ints
-    size: Ints
-    first: list[Ints]  # KEYS of their first rows
-    last: list[Ints]
-    in_order: bool  # the rows of each
-
-    @classmethod
-    def of(cls, recording: Ints, keys: list[Ints]) -> _Stretches:
-        begin = np.append(0, np.flatnonzero(recording[1:] != recording[:-1]) + 1)
-        size = np.diff(begin, append=len(recording))
-        in_order = _before([key[:-1] for key in keys], [key[1:] for key in keys])
-        in_order[begin[1:] - 1] = True
-        last = begin + size - 1
-        return cls(
-            recording[begin],
-            begin,
-            size,
-            [key[begin] for key in keys],
-            [key[last] for key in keys],
-            bool(in_order.all()),
-        )
-
-
-def _in_order(batches: list[_Stretches], rank: Ints) -> list[tuple[int, int, int]] | None:
-    """Return batch, begin and size of each stretch, in order; None if rows must be sorted.
-
-    They must if a stretch is not in order, if two overlap, or if stretches are so short that
-    sorting is faster.
-    """
-    if not all(one.in_order for one in batches):
-        return None
-    none = np.empty(0, np.int64)
-    begin = np.concatenate([none, *(one.begin for one in batches)])
-    size = np.concatenate([none, *(one.size for one in batches)])
-    if len(size) > MAX_STRETCHES and size.sum() < len(size) * STRETCH_ROWS:
-        return None
-    batch = np.repeat(np.arange(len(batches)), [len(one.begin) for one in batches])
-    recording = rank[np.concatenate([none, *(one.recording for one in batches)])]
-    first, last = (
-        [np.concatenate([none, *(of[key] for of in ends)]) for key in range(len(KEYS))]
-        for ends in ([one.first for one in batches], [one.last for one in batches])
-    )
-    order = np.lexsort((*reversed(first), recording))
-    one, behind = order[:-1], order[1:]
-    alike = recording[one] == recording[behind]
-    one, behind = one[alike], behind[alike]
-    if not _before([key[one] for key in last], [key[behind] for key in first]).all():
-        return None
-    return list(
-        zip(batch[order].tolist(), begin[order].tolist(), size[order].tolist(), strict=True)
-    )
-
-
-def _before(one: list[Ints], other: list[Ints]) -> Bools:
-    """Return whether the keys of one come before those of the other, or are the same, (n,)."""
-    result = one[-1] <= other[-1]
-    for here, there in zip(one[-2::-1], other[-2::-1], strict=True):
-        result = (here < there) | ((here == there) & result)
-    return result
+    names = [name for name in schema.names if name not in dropped]
+    with ThreadPoolExecutor(COLUMNS_AT_A_TIME, "restock-columns") as pool:
+        return pa.table(list(pool.map(column, names)), names)
 
 
 def _code_type(size: int) -> pa.DataType:
@@ -356,15 +227,13 @@ def read_candidates(
     try:
         with any_order(connection):
             reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
-            rows = RowsInOrder(reader.schema, text=_TEXT, dropped=("episode_index",))
-            for batch in reader:
-                rows.add(batch)
+            rows = rows_in_order(reader, reader.schema, text=_TEXT, dropped=("episode_index",))
     except duckdb.Error as error:
         if damaged := damage(error):
             raise damaged from error
         _blame(connection, source, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
-    return rows.table()
+    return rows
 
 
 def as_stored(connection: duckdb.DuckDBPyConnection) -> str:

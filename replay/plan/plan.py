@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Codes, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, OtherStore, nanoseconds
@@ -52,7 +52,6 @@ from restock.replay.plan.exclusions import (
 from restock.replay.plan.source_plan import (
     SourcePlan,
     SourceRows,
-    episode_hours,
     plan_source,
     taken_by_others,
 )
@@ -366,14 +365,13 @@ def _sources(
     A recording of which the mixture admits none of the rows (`logged`) is no logging of its kind.
     """
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
-    recording, stamp_ns = codes(table, "recording_id"), table["stamp_ns"].to_numpy()
+    recording = codes(table, "recording_id")
     logged = np.isin(recording, np.unique(recording[logged]))
-    names = table["episode_id"].combine_chunks().dictionary
-    hours = _hours(episode, stamp_ns, len(names))
+    episodes = len(table["episode_id"].combine_chunks().dictionary)
     sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
         admitted = (stratum != NO_STRATUM) & (store == number)
-        seen = np.bincount(episode[logged & (store == number)], minlength=len(hours)) > 0
+        seen = np.bincount(episode[logged & (store == number)], minlength=episodes) > 0
         at = np.flatnonzero(admitted & ~beyond_cap)
         sources.append(
             SourceRows(
@@ -384,20 +382,11 @@ def _sources(
                 stratum[at],
                 state_code[at],
                 episode[at],
-                np.where(seen, hours, np.nan),
+                seen,
                 np.bincount(stratum[admitted], minlength=size),
             )
         )
     return sources
-
-
-def _hours(episode: Codes, stamp_ns: Ints, episodes: int) -> F64:
-    """Compute the length of each episode (E,) from the codes and stamps of its rows (N,)."""
-    rows = np.bincount(episode, minlength=episodes)
-    first, last = np.full(episodes, np.iinfo(np.int64).max), np.zeros(episodes, np.int64)
-    np.minimum.at(first, episode, stamp_ns)
-    np.maximum.at(last, episode, stamp_ns)
-    return np.where(rows > 0, episode_hours(first, last, rows), np.nan)
 
 
 def _joined(

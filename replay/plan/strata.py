@@ -49,10 +49,6 @@ class Stratum(msgspec.Struct, frozen=True):
     effective_share: float  # after weights
     note: str
     missing_rows: int = 0  # more of them, and its rows would bear the wanted share
-    # Hours of driving as logged until they are there: the median; None where none brought any.
-    missing_hours: float | None = None
-    missing_hours_low: float | None = None  # 95 % interval
-    missing_hours_high: float | None = None
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,9 @@ WORKS = (
     "sql STORE 'FROM coverage'",
     "coverage STORE",
     "coverage drift STORE",
+    "coverage diff STORE STORE",
     "audit STORE",
+    "audit STORE --against STORE",
     "mix STORE --mixture uniform --out panel",
     "export panel --to npz --out a.npz",
     "export panel --to lerobot --out set",
@@ -54,9 +56,7 @@ WORKS = (
 )
 NEEDS = {  # command line -> the extra that it names
     "coverage gaps STORE": "pages",
-    "coverage diff STORE STORE": "pages",
     "coverage STORE --out page.html": "pages",
-    "audit STORE --against STORE": "pages",
     "export panel --to minari --out minari": "libraries",
     "export panel --to lerobot-video --out film": "libraries",
     "export RUN --to onnx --out policy.onnx": "train",

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from restock.replay.plan import candidates
-from restock.replay.plan.candidates import KEYS, RowsInOrder
+from restock.replay.plan.candidates import KEYS, rows_in_order
 
 TEXT = ("recording_id", "episode_id", "zone")
 BY = [("recording_id", "ascending"), *((key, "ascending") for key in KEYS)]
@@ -38,10 +37,7 @@ def rows_of(recordings: int, episodes: int, steps: int) -> pa.Table:
 
 
 def in_order(batches: list[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
-    rows = RowsInOrder(schema, text=TEXT, dropped=("episode_index",))
-    for batch in batches:
-        rows.add(batch)
-    return rows.table()
+    return rows_in_order(batches, schema, text=TEXT, dropped=("episode_index",))
 
 
 def expected(table: pa.Table) -> pa.Table:
@@ -66,10 +62,9 @@ def check(found: pa.Table, table: pa.Table) -> None:
     st.lists(st.integers(1, 60), max_size=6),
     st.randoms(use_true_random=False),
     st.sampled_from(["files", "batches", "rows"]),
-    st.booleans(),
 )
 def test_any_batches_in_any_order_give_the_same_table(
-    recordings, episodes, steps, cuts, random, mixed, few
+    recordings, episodes, steps, cuts, random, mixed
 ):
     table = rows_of(recordings, episodes, steps)
     if mixed == "rows":
@@ -84,16 +79,6 @@ def test_any_batches_in_any_order_give_the_same_table(
     ]
     if mixed == "batches":
         random.shuffle(batches)  # type: ignore[attr-defined]
-    with pytest.MonkeyPatch.context() as patch:
-        if few:  # short stretches: rows are sorted
-            patch.setattr(candidates, "MAX_STRETCHES", 0)
-        check(in_order(batches, table.schema), table)
-
-
-def test_stretches_that_overlap_are_sorted():
-    table = rows_of(2, 2, 6)
-    odd, even = (table.take(pa.array(range(begin, len(table), 2))) for begin in (1, 0))
-    batches = [part.combine_chunks().to_batches()[0] for part in (odd, even)]
     check(in_order(batches, table.schema), table)
 
 

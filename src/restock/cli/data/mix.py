@@ -10,7 +10,7 @@ import msgspec
 
 from restock.cli import output
 from restock.cli.words import Option, Positional
-from restock.errors import MixtureError, counted, figure
+from restock.errors import MixtureError, counted
 
 if TYPE_CHECKING:
     from restock.replay.plan.plan import PanelPlan
@@ -158,15 +158,10 @@ def _percent(share: float) -> float:
 
 
 def _missing(line: dict[str, Any]) -> str:
-    """Say what would fill a stratum, in rows and in hours of driving."""
+    """Say how many rows would fill a stratum."""
     if not line["missing_rows"]:
         return ""
-    text = f"; {counted(line['missing_rows'], 'more row')} would fill it"
-    if line["missing_hours"] is None:
-        return f"{text}, and these logs have none: no rate is known"
-    ends = ("missing_hours", "missing_hours_low", "missing_hours_high")
-    hours, low, high = (figure(line[name]) for name in ends)
-    return f"{text}: {hours} h of driving ({low} to {high})"
+    return f"; {counted(line['missing_rows'], 'more row')} would fill it"
 
 
 def _in_training(document: dict[str, Any], most: float) -> list[str]:
@@ -194,11 +189,8 @@ def _summary(document: dict[str, Any]) -> list[str]:
     lines = [
         f"{line['stratum']}: {line['note']}{_missing(line)}" for line in strata if line["note"]
     ]
-    if any(line["missing_hours"] is not None for line in strata):
-        lines.append(
-            "hours: driving like that in these logs, not chosen for a stratum, until its rows "
-            "are recorded: median (95 %); `restock coverage gaps` plans what to log"
-        )
+    if any(line["missing_rows"] for line in strata):
+        lines.append("`restock coverage gaps` says how much driving that takes")
     if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
         lines.append(
             f"logged rows fill {document['logs_share']:.1%} of a batch, not"
