@@ -7,5 +7,4 @@ FORMATS: dict[str, tuple[str, str, str]] = {
     "lerobot": ("lerobot_v3", "", ""),
     "lerobot-video": ("lerobot_v3", "av", ""),
     "parquet": ("one_file", "", ".parquet"),
-    "npz": ("one_file", "", ".npz"),
 }

@@ -245,6 +245,6 @@ def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[
                 f"its disk is nearly full: {free / 2**20:,.0f} MiB are free, and HDF5 needs"
                 f" {ROOM_BYTES >> 20} MiB to spare",
                 where=str(out),
-                remedy="free some space, choose another place, or export to parquet or npz",
+                remedy="free some space, choose another place, or export to parquet",
             )
         yield trajectory

@@ -1,4 +1,4 @@
-"""Data sets of one file: Parquet, arrays in an `.npz`, and d3rlpy's own dump of episodes (HDF5).
+"""Data sets of one file: Parquet, and d3rlpy's own dump of episodes (HDF5).
 
     with open("OUT.h5", "rb") as file:
         dataset = d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from restock.replay.export.selection import Selection
 from restock.replay.export.trajectory import Counts, Trajectory, fixed_lists
@@ -77,38 +76,6 @@ def as_table(trajectory: Trajectory, number: int) -> pa.Table:
         text = column.dtype == object
         columns[name] = pa.array(column, pa.string() if text else pa.from_numpy_dtype(column.dtype))
     return pa.table(columns)
-
-
-def write_npz(
-    selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
-) -> list[str]:
-    """Write arrays under the names of D4RL's data sets; they are in memory while written."""
-    all_of_them = list(trajectories)
-    lengths = np.array([len(t) for t in all_of_them])
-    last = np.zeros(lengths.sum(), np.bool_)
-    last[np.cumsum(lengths) - 1] = True
-
-    def each(name: str) -> NDArray[Any]:
-        return np.repeat([getattr(t, name) for t in all_of_them], lengths)
-
-    arrays: dict[str, Any] = {
-        "observations": np.concatenate([t.observations[:-1] for t in all_of_them]),
-        "actions": np.concatenate([t.actions for t in all_of_them]),
-        "rewards": np.concatenate([t.rewards for t in all_of_them]),
-        "next_observations": np.concatenate([t.observations[1:] for t in all_of_them]),
-        "terminals": last & each("terminated"),
-        "timeouts": last & each("truncated"),
-        "trajectory": np.repeat(np.arange(len(lengths)), lengths),
-        "episode_id": each("episode_id"),
-    }
-    for name in all_of_them[0].carried:
-        column = np.concatenate([t.carried[name] for t in all_of_them])
-        if column.dtype == object:  # as fixed-width text: no pickles
-            column = np.array(["" if value is None else str(value) for value in column])
-        arrays[name] = column
-    about = selection.provenance | {"counts": counts.describe()}
-    np.savez_compressed(out, **arrays, restock=np.array(json.dumps(about)))
-    return []
 
 
 def write_d3rlpy(

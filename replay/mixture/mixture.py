@@ -217,7 +217,6 @@ class Mixture(Checked, frozen=True):
     odometry_as_command: bool = False  # use rows whose action is measured motion
     max_age_days: Annotated[float, Meta(ge=0)] | None = None  # age of a logged row at `as_of`
     as_of: Annotated[datetime, Meta(tz=True)] | None = None  # date for ages; None: now
-    max_versions_behind: Count | None = None  # behind its policy's newest version; 0: only that
     max_age_env_steps: Count | None = None  # largest age of fresh rows
     max_rows_per_episode: AtLeastOne | None = None  # per stratum
     max_rows_per_recording: AtLeastOne | None = None

@@ -3,8 +3,8 @@
 Whatever the size of the store, memory holds the plan, a batch and some blocks of packed rows.
 Observations are read in the order of the files and put at their places, because sorting rows this
 wide would first spill all of them to disk. A recording's rows are together in both orders, so a
-block is full soon after it was begun. A block that is full is hashed and written by other threads,
-while the next ones are filled.
+block is full soon after it was begun. A block that is full is written by other threads, while the
+next ones are filled.
 
 An n-step return of step t uses the rewards of [t, t + n) and bootstraps from the state at t + n. It
 is cut where the episode ends, where a step is missing, and before an off-policy action: step j's
@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, Bools, Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.panel.panel import FileRecord, Leaves
+from restock.replay.panel.panel import FileRecord
 from restock.replay.plan.candidates import Places, any_order, as_stored, codes, matrix, stretches
 from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
@@ -74,7 +74,6 @@ class PackedFile:
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts of rows, of each block
         self._held: dict[int, F32] = {}
-        self._leaves = Leaves(4 * rows * width, 4 * BLOCK_ROWS * width)
         self._writers = ThreadPoolExecutor(WRITERS, "restock-pack")
         self._writing: dict[int, Future[None]] = {}  # by block, the oldest first
 
@@ -94,7 +93,7 @@ class PackedFile:
         self._wait(at_most=0)
         if int(self._put.sum()) != self._rows * self._parts:
             raise PanelError("the source changed while it was read", where=str(self._path.parent))
-        return self._leaves.record(self._path)
+        return FileRecord.of(self._path)
 
     def put(self, rows: Ints, *values: Values) -> None:
         """Write some columns of some rows (m,).
@@ -145,19 +144,15 @@ class PackedFile:
     def _write(self, number: int) -> None:
         held = self._held.pop(number)
         self._wait(at_most=max(WAITING_BYTES // self._block_bytes, WRITERS))
-        whole = bool(self._put[number] == len(held) * self._parts)
-        self._writing[number] = self._writers.submit(self._store, number, held, whole)
+        self._writing[number] = self._writers.submit(self._store, number, held)
 
     def _wait(self, at_most: int) -> None:
         """Wait until all writes have ended, and raise their errors."""
         while len(self._writing) > at_most:
             self._writing.pop(next(iter(self._writing))).result()
 
-    def _store(self, number: int, held: F32, whole: bool) -> None:
-        rest = held.data.cast("B")
-        if whole:
-            self._leaves.add(number, rest)
-        place = number * self._block_bytes
+    def _store(self, number: int, held: F32) -> None:
+        rest, place = held.data.cast("B"), number * self._block_bytes
         while rest:  # a full disk is an OSError; what is written short goes on
             written = os.pwrite(self._file, rest, place)
             rest, place = rest[written:], place + written

@@ -11,10 +11,8 @@ A directory that never changes once it is there:
 from __future__ import annotations
 
 import hashlib
-import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,23 +35,20 @@ from restock.replay.sampling.packed_rows import PACKING_VERSION, row_columns, ro
 AGAIN = "make it again with `restock mix`"
 SAMPLED_BLOCKS, BLOCK_BYTES = 16, 4096
 DIGEST_BYTES = 16
-LEAF_BYTES = 1 << 20
-MAX_THREADS = 8
+READ_BYTES = 4 << 20
 
 
 class FileRecord(msgspec.Struct, frozen=True):
     """Size and checksums of one file, when it was written."""
 
     bytes: int
-    blake3: str  # of all of it, by leaves
+    blake3: str  # of all of it
     sample: str  # of some blocks of it
-    leaf_bytes: int  # of each leaf
 
     @classmethod
     def of(cls, path: Path) -> FileRecord:
         """Return the record of a file as it is now."""
-        size = path.stat().st_size
-        return cls(size, checksum(path, LEAF_BYTES), sample_checksum(path), LEAF_BYTES)
+        return cls(path.stat().st_size, checksum(path), sample_checksum(path))
 
     def check(self, path: Path, *, verify: bool) -> None:
         """Raise PanelError where the file is not as it was written."""
@@ -70,7 +65,7 @@ class FileRecord(msgspec.Struct, frozen=True):
             )
         actual, expected = sample_checksum(path), self.sample
         if verify and actual == expected:
-            actual, expected = checksum(path, self.leaf_bytes), self.blake3
+            actual, expected = checksum(path), self.blake3
         if actual != expected:
             raise PanelError(
                 f"its checksum is {actual}, not {expected}: it was changed or damaged",
@@ -79,51 +74,13 @@ class FileRecord(msgspec.Struct, frozen=True):
             )
 
 
-class Leaves:
-    """The leaves of a file's checksum, hashed in any order, by several threads.
-
-    Args:
-        size: bytes of the file.
-        leaf_bytes: of each leaf; the last has the rest.
-    """
-
-    def __init__(self, size: int, leaf_bytes: int) -> None:
-        self._leaf_bytes = leaf_bytes
-        self.count = max(-(-size // leaf_bytes), 1)
-        self._digests = [b""] * self.count
-
-    def add(self, number: int, content: bytes | memoryview) -> None:
-        """Hash the content of one leaf."""
-        self._digests[number] = blake3(content).digest(DIGEST_BYTES)
-
-    def root(self) -> str:
-        """Return the checksum, 32 hex digits, of leaves that were all added."""
-        return blake3(b"".join(self._digests)).hexdigest(DIGEST_BYTES)
-
-    def record(self, path: Path) -> FileRecord:
-        """Return the record of a file whose leaves were all added."""
-        size, sample = path.stat().st_size, sample_checksum(path)
-        return FileRecord(size, self.root(), sample, self._leaf_bytes)
-
-
-def checksum(path: Path, leaf_bytes: int) -> str:
-    """Compute the BLAKE3 of a file from its leaves of `leaf_bytes`, 32 hex digits."""
-    leaves = Leaves(path.stat().st_size, leaf_bytes)
-    descriptor = os.open(path, os.O_RDONLY)
-
-    threads = min(os.cpu_count() or 1, MAX_THREADS)
-
-    def add_from(first: int) -> None:
-        for number in range(first, leaves.count, threads):
-            # Short where the file was cut meanwhile: then the checksum is another.
-            leaves.add(number, os.pread(descriptor, leaf_bytes, number * leaf_bytes))
-
-    try:
-        with ThreadPoolExecutor(threads, "restock-checksum") as pool:
-            list(pool.map(add_from, range(threads)))
-    finally:
-        os.close(descriptor)
-    return leaves.root()
+def checksum(path: Path) -> str:
+    """Compute the BLAKE3 of a file, 32 hex digits, by as many threads as there are processors."""
+    digest = blake3(max_threads=blake3.AUTO)
+    with path.open("rb") as file:
+        while content := file.read(READ_BYTES):
+            digest.update(content)
+    return digest.hexdigest(DIGEST_BYTES)
 
 
 def sample_checksum(path: Path) -> str:

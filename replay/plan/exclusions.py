@@ -78,9 +78,6 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
                 " as_of = 2026-01-31T00:00:00Z",
             )
         out.add("too old", too_old)
-    if mixture.max_versions_behind is not None:
-        behind = versions_behind(table)
-        out.add("from an old version of its policy", behind > mixture.max_versions_behind)
     out.admitted = ~out.gone
     out.add("evaluation split", split.held)
     out.add("gap before the evaluation split", split.gap)
@@ -214,25 +211,6 @@ def beyond_cap(
     beyond = np.zeros(len(table), np.bool_)
     beyond[rows[order]] = place >= cap
     return beyond
-
-
-def versions_behind(table: pa.Table) -> Ints:
-    """Return how many newer versions of a row's behaviour policy the table has, (N,).
-
-    Versions of a policy are in order of when each was first logged. A row without a version is of
-    the version "" of its policy.
-    """
-    policy, version = codes(table, "behaviour_policy"), codes(table, "behaviour_version")
-    pair = (policy + 1) * (version.max(initial=0) + 2) + version + 1
-    pairs, row_pair = np.unique(pair, return_inverse=True)
-    first = np.full(len(pairs), np.iinfo(np.int64).max)
-    np.minimum.at(first, row_pair, table["logged_ns"].to_numpy())
-    of_policy = pairs // (version.max(initial=0) + 2)
-    behind = np.array(
-        [np.sum((of_policy == of_policy[i]) & (first > first[i])) for i in range(len(pairs))],
-        np.int64,
-    )
-    return behind[row_pair]
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ def store_verbs(store: Path, out: Path) -> list[list[str]]:
         ["audit", path],
         ["audit", path, "--capacity"],
         ["mix", path, "--mixture", "coverage", "--out", str(out / "panel")],
-        ["export", path, "--to", "npz", "--out", str(out / "x.npz")],
+        ["export", path, "--to", "parquet", "--out", str(out / "x.parquet")],
         ["trace", path, str(1 << 32)],
     ]
 
@@ -213,7 +213,7 @@ def writers(root: Path, out: Path) -> list[list[str]]:
     return [
         ["sql", store, "--export", str(out / "views.sql")],
         ["sql", store, "--export", str(out / "views.duckdb")],
-        ["export", store, "--to", "npz", "--out", str(out / "x.npz")],
+        ["export", store, "--to", "parquet", "--out", str(out / "x.parquet")],
         ["export", run, "--to", "onnx", "--out", str(out / "x.onnx")],
         ["mix", store, "--mixture", "coverage", "--out", str(out / "panel")],
         ["report", run, "--out", str(out / "r.html")],

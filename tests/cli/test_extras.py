@@ -48,7 +48,7 @@ WORKS = (
     "audit STORE",
     "audit STORE --against STORE",
     "mix STORE --mixture uniform --out panel",
-    "export panel --to npz --out a.npz",
+    "export panel --to parquet --out a.parquet",
     "export panel --to lerobot --out set",
     "trace STORE",
     "store verify STORE",
@@ -86,7 +86,7 @@ def ended(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
     command = [sys.executable, "-c", LEAN, json.dumps([list(EXTRAS), given])]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
     assert done.returncode == 0, done.stderr[-2000:]
-    made = {"sample_logs", "run", "panel", "a.npz", "set"}
+    made = {"sample_logs", "run", "panel", "a.parquet", "set"}
     assert {path.name for path in folder.iterdir()} == made  # by those that work
     said = done.stdout.splitlines()[-1]  # with -c, DuckDB prints how far a slow query is before it
     return dict(zip(lines, map(tuple, json.loads(said)), strict=True))

@@ -76,13 +76,13 @@ def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
     "verb",
     [
         ["mix", "STORE", "--out", "OUT"],
-        ["export", "STORE", "--to", "npz", "--out", "OUT"],
+        ["export", "STORE", "--to", "parquet", "--out", "OUT"],
         ["audit", "STORE"],
     ],
     ids=" ".join,
 )
 def test_verbs_refuse_damaged_rows(verb, store, tmp_path, capsys):
-    file, out = rows_file(store), tmp_path / "out.npz"
+    file, out = rows_file(store), tmp_path / "out.parquet"
     flip(file, 1000)
     argv = [{"STORE": str(store), "OUT": str(out)}.get(word, word) for word in verb]
     assert cli.main(argv) == 2

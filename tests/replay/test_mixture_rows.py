@@ -12,7 +12,6 @@ from support.stores import CONDITIONS, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import MixtureError, StoreError
-from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.build import build_panel
@@ -78,21 +77,6 @@ def test_unsafe_rows_go_alone_or_with_their_episode(transitions):
     assert not hit & set(taken(whole)["episode_id"].to_pylist())
     assert whole.left_out["unsafe"] > len(bumped)
     # A return may still span an unsafe step: what it cost is what is to be learnt.
-
-
-def test_old_versions_of_a_policy_are_left_out(transitions):
-    recording = np.array([int(name, 16) for name in transitions["recording_id"].to_pylist()])
-    policy = np.array(transitions["behaviour_policy"].to_pylist())
-    # The planner was changed twice, the operator has no version at all.
-    version = np.where(policy == "planner", np.char.add("v", recording.astype(str)), None)
-    changed = replaced(transitions, {"behaviour_version": version.tolist()})
-    newest = planned(changed, "max_versions_behind = 0\n" + NO_SPLIT + EVERY)
-    kept = taken(newest)
-    assert set(kept["behaviour_version"].to_pylist()) == {"v3", None}
-    gone = int(((policy == "planner") & (recording < 3)).sum())
-    assert newest.left_out == {"from an old version of its policy": gone}
-    one_back = planned(changed, "max_versions_behind = 1\n" + NO_SPLIT + EVERY)
-    assert set(taken(one_back)["behaviour_version"].to_pylist()) == {"v2", "v3", None}
 
 
 @pytest.mark.parametrize("name", ["episode", "recording"])

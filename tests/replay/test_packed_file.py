@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from restock.errors import PanelError
 from restock.replay.panel import pack
 from restock.replay.panel.pack import PackedFile, Values
-from restock.replay.panel.panel import FileRecord, Leaves, checksum, sample_checksum
+from restock.replay.panel.panel import FileRecord
 
 WIDTH = 5
 HALVES = (slice(0, 2), slice(2, WIDTH))
@@ -45,7 +45,7 @@ def test_parts_in_any_order_make_the_same_file(tmp_path_factory, count, held, se
             record = file.finish()
     assert path.read_bytes() == rows.tobytes()
     assert record.bytes == rows.nbytes
-    assert record.leaf_bytes == 8 * WIDTH * 4
+    assert record.blake3 == blake3(rows.tobytes()).hexdigest(16)
     record.check(path, verify=True)
 
 
@@ -53,24 +53,12 @@ def test_every_changed_byte_is_found(tmp_path):
     content = np.random.default_rng(0).bytes(4 * 100 + 7)
     path = tmp_path / "file"
     path.write_bytes(content)
-    record = FileRecord(len(content), checksum(path, 100), sample_checksum(path), 100)
+    record = FileRecord.of(path)
     record.check(path, verify=True)
     for place in range(0, len(content), 13):
         path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
         with pytest.raises(PanelError, match="checksum"):
             record.check(path, verify=True)
-
-
-def test_the_checksum_is_that_of_its_leaves(tmp_path):
-    path, content = tmp_path / "file", bytes(range(250))
-    path.write_bytes(content)
-    leaves = [blake3(content[at : at + 100]).digest(16) for at in (0, 100, 200)]
-    root = blake3(b"".join(leaves)).hexdigest(16)
-    assert checksum(path, 100) == root
-    found = Leaves(len(content), 100)
-    for n in (2, 0, 1):
-        found.add(n, memoryview(content)[100 * n : 100 * n + 100])
-    assert found.root() == root
 
 
 def test_a_row_that_never_came_is_an_error(tmp_path):

@@ -62,10 +62,10 @@ def test_each_reads_what_was(versions, tmp_path, capsys):
 def test_what_has_no_versions_says_so(versions, tmp_path, capsys):
     path, first = versions
     assert main(["mix", str(path), "--out", str(tmp_path / "panel")]) == 0
-    panel, out = f"{tmp_path / 'panel'}@1", str(tmp_path / "x.npz")
+    panel, out = f"{tmp_path / 'panel'}@1", str(tmp_path / "x.parquet")
     for args, said in (
         (["sql", panel, "FROM rows"], "only a store has versions"),
-        (["export", panel, "--to", "npz", "--out", out], "is a panel, not a store"),
+        (["export", panel, "--to", "parquet", "--out", out], "is a panel, not a store"),
         (["store", "label", f"{path}@{first}"], "only the newest version can be changed"),
         (["store", "compact", f"{path}@{first}"], "only the newest version can be changed"),
         (["store", "verify", f"{path}@{first}"], "only the newest version can be changed"),
