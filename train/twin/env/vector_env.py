@@ -43,7 +43,7 @@ from restock.state import Stateful, saved
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
 from restock.train.twin.env.interface import Info, MadeAgain, Step
 from restock.train.twin.env.navigation import Navigation, Truth, info_after, info_now
-from restock.train.twin.env.render import Renderer, View
+from restock.train.twin.env.render import draw_map
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS
@@ -176,7 +176,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         nav_command: bool = True,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: ActionKind = "discrete",
-        camera: View | None = None,
     ) -> None:
         """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
 
@@ -195,8 +194,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
 
         Of the drawn episodes `missions_share` are of the ordered `missions`, where there are some.
 
-        `render()` draws a top-down map, or with a `camera` ("chase", "overhead") renders over EGL.
-
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
                 a condition's episodes, a robot that cannot be built or is wider than an aisle, an
@@ -209,7 +206,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
                 f"unknown render_mode {render_mode!r}", where="the twin", remedy="give rgb_array"
             )
         self.num_envs = num_envs
-        self.render_mode, self._renderer = render_mode, Renderer(camera)
+        self.render_mode = render_mode
         self.task = task or load_profile("warehouse_amr").task
         self.floors = floors_of(layouts) if warehouse is None else (warehouse,)
         self.layout_names = np.array([floor.name for floor in self.floors])
@@ -429,16 +426,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         return self.observation.copy(), earned, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
-
-        Raises:
-            ConfigError: it is a camera's, and EGL is unavailable.
-        """
-        return None if self.render_mode is None else self._renderer.frames(self)
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Release the camera's context; Gymnasium's `close` calls it."""
-        self._renderer.close()
+        """Return a map of every environment from above, (H, W, 3) uint8 each."""
+        if self.render_mode is None:
+            return None
+        return tuple(draw_map(self, env) for env in range(self.num_envs))
 
     # -- recorders ------------------------------------------------------------------------------
 
@@ -534,13 +525,9 @@ class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
         )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a top-down map, or a frame of the requested `camera`, (H, W, 3) uint8."""
+        """Return a map from above, (H, W, 3) uint8."""
         frames = self.vector.render()
         return frames[0] if frames else None
-
-    def close(self) -> None:
-        """Release the resources of `render`."""
-        self.vector.close()
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:
