@@ -35,7 +35,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Signals
 from restock.train.judge.before_training import RowDiagnosis, diagnose_rows, drive_twin, open_rows
 from restock.train.judge.fed_rows import FedRows
-from restock.train.twin.floors.floors import floors_of
+from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT
 
 PROFILE = load_profile("warehouse_amr")
@@ -146,7 +146,7 @@ def twin() -> FedRows:
 def judged(store: Path) -> RowDiagnosis:
     opened = open_rows(store)
     return diagnose_rows(
-        opened.rows, twin(), more=opened.checks, files=opened.files, floors=floors_of(DEFAULT)
+        opened.rows, twin(), more=opened.checks, files=opened.files, floors=open_floors(DEFAULT)
     )
 
 

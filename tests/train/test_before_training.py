@@ -46,7 +46,7 @@ from restock.train.twin.calibration.twin_gap import (
     write_gap,
 )
 from restock.train.twin.env.drivers import RandomPolicy
-from restock.train.twin.floors.floors import floors_of
+from restock.train.twin.floors.floors import open_floors
 
 Plant = Callable[[FedRows], FedRows]
 
@@ -296,7 +296,7 @@ OF_ONE: dict[str | None, tuple[Plant, str]] = {
 @pytest.mark.parametrize("fault", OF_ONE)
 def test_a_fault_of_one_robot_is_named_and_nothing_else(logs, twin, fault):
     plant, said = OF_ONE[fault]
-    fleet, floors = _of_one(logs, plant), floors_of("default")
+    fleet, floors = _of_one(logs, plant), open_floors("default")
     found = diagnose_rows(fleet, twin, files={"r1": "monday.mcap"}, floors=floors)
     texts = [one.text for one in found.findings]
     start = "in 1 of 3 robots (robot r1: monday.mcap): "
@@ -399,7 +399,7 @@ def test_racks_elsewhere_than_on_the_twins_floor_are_named(tuesday):
     def judged_on(floor: str, east_m: float) -> RowDiagnosis:
         assert tuesday.rows.pose is not None
         moved = replace(tuesday.rows, pose=tuesday.rows.pose + np.array([east_m, 0.0, 0.0]))
-        return diagnose_rows(moved, None, floors=floors_of(floor))
+        return diagnose_rows(moved, None, floors=open_floors(floor))
 
     assert judged_on("default", 0.0).findings == []
     (found,) = judged_on("default", 1.0).findings

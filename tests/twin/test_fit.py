@@ -147,11 +147,9 @@ def recovered(store: Path, names: tuple[str, ...], **options: object) -> FittedT
 
 @pytest.mark.long
 def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path) -> None:
-    base = Perturbation(name="before", timestep_s=0.01)
     found = recovered(
         known,
         ("latency_s", "gain", "wheel_radius_scale"),
-        base=base,
         horizon_s=2.0,
         search_points=4,
         max_segments=12,
@@ -183,7 +181,7 @@ def test_friction_under_standing_wheels_is_not_identified(log: LoggedSegments) -
         signals={name: np.zeros_like(values) for name, values in some.signals.items()},
     )
     residuals = ReplayResiduals(standing)
-    coordinates = Coordinates(("friction_scale",), Perturbation(), log.task)
+    coordinates = Coordinates(("friction_scale",), log.task)
     solution = _least_squares(residuals, coordinates, np.array([0.5]), lambda text: None)
     uncertainty = measure_uncertainty(solution, standing.episode_id, seed=0)
     lost = unidentified(residuals, solution, uncertainty)
@@ -198,8 +196,6 @@ def test_a_schedule_of_several_fits_spans_what_all_identified(tmp_path: Path) ->
         perturbation = Perturbation(name="one", gain=gain, friction_scale=0.5)
         return FittedTwin(
             perturbation=perturbation,
-            base=Perturbation(),
-            timestep_s=0.01,
             recordings=("r",),
             estimates=(
                 ParameterEstimate("gain", "", gain, gain - 0.01, gain + 0.01, True),

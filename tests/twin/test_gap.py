@@ -21,6 +21,7 @@ from restock.train.twin.calibration.gap import (
     AFTER,
     AGREES,
     BEFORE,
+    ROUTE,
     agreement,
     measure_gap,
     one_step,
@@ -158,6 +159,9 @@ def test_what_is_rebuilt_from_a_store_is_what_was_logged(stored: Path) -> None:
     plans = rebuild_plans(steps)
     assert plans.error_m < 0.01
     rows = np.arange(len(steps))
+    seen = plans._view(plans.routing.plan, steps.now)
+    for name in ROUTE:
+        assert np.median(np.abs(seen[name] - steps.now[name])) < 0.02, name
     # From the logged poses themselves the rebuilt plans show what the robot saw.
     route = plans.seen_after(steps, rows, steps.after)
     np.testing.assert_allclose(route["waypoint_near_x_m"], steps.after["waypoint_near_x_m"])
@@ -224,6 +228,7 @@ def test_turtlebot3_sim_humble(tmp_path: Path) -> None:
         gap = measure_gap(store)
     assert {found.verdict for found in gap.verdicts} == {UNKNOWN}  # one episode of half a minute
     said = " ".join(gap.not_done)
+    assert "{" not in said
     for not_there in ("another floor", "no goal and no plan", "wheel odometry", "no fitted"):
         assert not_there in said, not_there
     assert position(gap, "nominal", BEFORE, 1.0)["median"] < 0.02

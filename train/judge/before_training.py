@@ -54,7 +54,7 @@ from restock.train.twin.calibration.twin_gap import (
 )
 from restock.train.twin.env.drivers import Handover, Operator, PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.floors import floors_of
+from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.perturbation import Perturbation
@@ -413,7 +413,7 @@ def diagnose_before_training(
     begun = time.perf_counter()
     opened = open_rows(Path(path), profile, task_hash)
     own = opened.profile
-    floors = floors_of(layouts)
+    floors = open_floors(layouts)
     fresh, reason = (
         _drive(own, perturbation, layouts, seed) if twin else (None, "it was not requested")
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -19,10 +19,10 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError, StoreError, counted
-from restock.ingest.task.robot import Robot
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
 from restock.train.twin.calibration.fit_solver import (
+    BASE,
     CHANNELS,
     DEFAULT,
     PARAMETERS,
@@ -69,16 +69,11 @@ HELD_OUT_HORIZONS_S = (1.0, 3.0, 6.0)
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Settings of a fit. The same values give the same result. Raises ConfigError if invalid.
-
-    `base` holds the parameters that are not fitted, and is the twin "before" the fit.
-    """
+    """Settings of a fit. The same values give the same result. Raises ConfigError if invalid."""
 
     parameters: tuple[str, ...] = DEFAULT
-    base: Perturbation = field(default_factory=Perturbation)
     recordings: tuple[str, ...] = ()  # of the store; none: all
     task_hash: str | None = None  # whose rows, where the store has several tasks
-    robot: Robot | None = None  # whose logs they are; None: that of the store's own profile
     horizon_s: float = 3.0  # of the segments that are fitted
     held_out: float = 0.25  # share of the log, to measure the gap on
     search_points: int = 64  # of the coarse search
@@ -128,30 +123,24 @@ def fit(
     config, report = config or FitConfig(), on_progress or (lambda text: None)
     rng = np.random.Generator(np.random.PCG64(config.seed))
     task = store.task(config.task_hash)
-    robot = config.robot or robot_of_store(store, task.hash)
+    robot = robot_of_store(store, task.hash)
     scope = fit_scope(store, task, config.parameters, config.recordings, robot)
     data = _fit_data(store, config, rng)
     few = data.segments.take(rng.permutation(len(data.segments))[:COARSE_SEGMENTS])
     coarse, fine = (
-        ReplayResiduals(
-            segments, scope.channels, timestep_s=config.base.timestep_s, nthread=config.nthread
-        )
+        ReplayResiduals(segments, scope.channels, nthread=config.nthread)
         for segments in (few, data.segments)
     )
-    coordinates = Coordinates(scope.names, config.base, task)
+    coordinates = Coordinates(scope.names, task)
     start = _search(coarse, coordinates, config, report)
     solution, uncertainty, dropped = _identify(fine, coordinates, start, config, store, report)
-    refused = [as_in_base(name, config.base, reason) for name, reason in scope.refused.items()]
+    refused = [as_in_base(name, reason) for name, reason in scope.refused.items()]
     kept = [*refused, *dropped]
     perturbation = msgspec.structs.replace(
-        solution.coordinates.perturbation(solution.z),
-        name=config.name,
-        timestep_s=config.base.timestep_s,
+        solution.coordinates.perturbation(solution.z), name=config.name
     )
     return FittedTwin(
         perturbation=perturbation,
-        base=config.base,
-        timestep_s=config.base.timestep_s,
         recordings=data.recordings,
         estimates=tuple(
             sorted(
@@ -165,7 +154,7 @@ def fit(
             *fit_warnings(solution, uncertainty),
         ),
         held_out=_held_out_gaps(data, scope, config, perturbation, report),
-        noise=_deviations(fine, config.base, perturbation),
+        noise=_deviations(fine, perturbation),
         segments=len(data.segments),
         clusters=uncertainty.clusters,
         condition_number=uncertainty.condition_number,
@@ -177,7 +166,7 @@ def fit(
 
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
     """Cut at most `max_segments` segments of ordinary driving to fit, and the held-out ones."""
-    steps = logged_steps(store, config.task_hash, config.recordings, config.robot)
+    steps = logged_steps(store, config.task_hash, config.recordings)
     segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
     if not len(segments):
         why = ", ".join(f"{steps} {reason}" for reason, steps in segments.left_out.items())
@@ -277,12 +266,7 @@ def _held_out_gaps(
         held_out = ordinary.take(split_at(ordinary, data.held_out_from_ns)[1])
         if not len(held_out):
             continue
-        replayed = replay_segments(
-            held_out,
-            [config.base, fitted],
-            timestep_s=config.base.timestep_s,
-            nthread=config.nthread,
-        )
+        replayed = replay_segments(held_out, [BASE, fitted], nthread=config.nthread)
         before, after = position_gap_m(held_out, replayed)[:, :, -1]
         rng = np.random.Generator(np.random.PCG64(config.seed))
         interval = bootstrap([after], median, rng=rng, resamples=1000)
@@ -292,9 +276,7 @@ def _held_out_gaps(
     return tuple(gaps)
 
 
-def _deviations(
-    residuals: ReplayResiduals, base: Perturbation, fitted: Perturbation
-) -> dict[str, dict[str, Any]]:
+def _deviations(residuals: ReplayResiduals, fitted: Perturbation) -> dict[str, dict[str, Any]]:
     """Return the median deviations of each channel before and after the fit."""
     return {
         name: {
@@ -302,5 +284,5 @@ def _deviations(
             "before": float(np.median(np.abs(values[0]))),
             "after": float(np.median(np.abs(values[1]))),
         }
-        for name, values in residuals.of([base, fitted]).items()
+        for name, values in residuals.of([BASE, fitted]).items()
     }

@@ -31,6 +31,7 @@ from restock.replay.store.store import Store
 from restock.train.twin.calibration.open_loop import LoggedSegments, OpenLoopResult, replay_segments
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
 
+BASE = Perturbation()  # the twin before the fit, and what is not fitted
 # Channel -> (unit, noise to begin with). What the log's noise is comes from the residuals later.
 CHANNELS: dict[str, tuple[str, float]] = {
     "wheel speed": ("m/s", 0.02),
@@ -84,11 +85,11 @@ DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
 class Coordinates:
     """The map between perturbations and points z of the unit cube, an axis per fitted parameter.
 
-    Parameters that are not fitted stay as in `base`.
+    Parameters that are not fitted stay as in `BASE`.
     """
 
-    def __init__(self, names: Sequence[str], base: Perturbation, task: Task) -> None:
-        self.names, self.base, self.task = tuple(names), base, task
+    def __init__(self, names: Sequence[str], task: Task) -> None:
+        self.names, self.task = tuple(names), task
         self.parameters = [PARAMETERS[name] for name in names]
         ends = np.array([RANGES[name] for name in names], np.float64).reshape(-1, 2)
         if "latency_s" in self.names:  # four commands are kept, and a later one is not simulated
@@ -126,20 +127,20 @@ class Coordinates:
         """Return the perturbation at a point (n,)."""
         # Rounded so that equal points are equal, and ends of ranges are within them.
         values = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
-        return msgspec.structs.replace(self.base, **values)
+        return msgspec.structs.replace(BASE, **values)
 
-    def drivable(self, z: F64, timestep_s: float) -> F64:
+    def drivable(self, z: F64) -> F64:
         """Return the point (n,) with its latency rounded to whole physics steps."""
         moved = z.copy()
         if "latency_s" in self.names:
             at = self.names.index("latency_s")
-            tick = timestep_s / self._span[at]
+            tick = BASE.timestep_s / self._span[at]
             moved[at] = np.clip(np.round(z[at] / tick), 0, np.floor(1 / tick + 1e-9)) * tick
         return moved
 
     def without(self, name: str) -> Coordinates:
-        """Return these coordinates without one parameter, which stays as in `base`."""
-        return Coordinates([other for other in self.names if other != name], self.base, self.task)
+        """Return these coordinates without one parameter, which stays as in `BASE`."""
+        return Coordinates([other for other in self.names if other != name], self.task)
 
 
 @dataclass(frozen=True)
@@ -275,11 +276,9 @@ class ReplayResiduals:
         segments: LoggedSegments,
         channels: Sequence[str] = tuple(CHANNELS),
         *,
-        timestep_s: float = 0.01,
         nthread: int = 1,
     ) -> None:
-        self.segments, self.channels = segments, tuple(channels)
-        self.timestep_s, self.nthread = timestep_s, nthread
+        self.segments, self.channels, self.nthread = segments, tuple(channels), nthread
         self.replays = 0  # perturbations driven so far
         self._known: dict[Perturbation, dict[str, F64]] = {}
 
@@ -303,12 +302,12 @@ class ReplayResiduals:
 
     def _between(self, perturbation: Perturbation) -> list[tuple[Perturbation, float]]:
         """Return the replays whose weighted mean stands for a perturbation, with their weights."""
-        ticks = perturbation.latency_s / self.timestep_s
+        ticks = perturbation.latency_s / BASE.timestep_s
         low = int(np.floor(ticks + 1e-6))
         above = max(ticks - low, 0.0)
         pair = [(low, 1 - above), (low + 1, above if above > 1e-6 else 0.0)]
         base = msgspec.structs.replace(perturbation, name="", gyro_bias_radps=0.0)
-        latencies = [(min(tick * self.timestep_s, 0.5), weight) for tick, weight in pair]
+        latencies = [(min(tick * BASE.timestep_s, 0.5), weight) for tick, weight in pair]
         return [(msgspec.structs.replace(base, latency_s=s), weight) for s, weight in latencies]
 
     def _drive(self, twins: Sequence[Perturbation]) -> None:
@@ -318,9 +317,7 @@ class ReplayResiduals:
             new = list(dict.fromkeys(twins))
         if not new:
             return
-        replayed = replay_segments(
-            self.segments, new, timestep_s=self.timestep_s, nthread=self.nthread
-        )
+        replayed = replay_segments(self.segments, new, nthread=self.nthread)
         self.replays += len(new)
         residuals = channel_residuals(self.segments, replayed)
         for index, twin in enumerate(new):
@@ -427,7 +424,7 @@ class FitProblem:
         """
         del residual  # it is between two latencies; this is at one
         size, steps = len(self.coordinates), self.coordinates.steps
-        at = self.coordinates.drivable(z.reshape(-1), self.residuals.timestep_s)
+        at = self.coordinates.drivable(z.reshape(-1))
         # Of the latency, to the side on which z lies: residuals are interpolated there.
         forward = (at + steps <= 1.0) & (z.reshape(-1) >= at - 1e-9)
         forward |= at - steps < 0.0
@@ -453,9 +450,8 @@ def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
 
     sampler = qmc.Sobol(len(problem.coordinates), scramble=True, rng=seed)
     drawn = sampler.random(points) if points else np.zeros((0, len(problem.coordinates)))
-    start = problem.coordinates.point(problem.coordinates.base)
-    timestep_s = problem.residuals.timestep_s
-    trial = np.array([problem.coordinates.drivable(z, timestep_s) for z in (start, *drawn)])
+    start = problem.coordinates.point(BASE)
+    trial = np.array([problem.coordinates.drivable(z) for z in (start, *drawn)])
     batches = [trial[begin : begin + 16] for begin in range(0, len(trial), 16)]
     value = np.concatenate([cost(problem.residual(batch.T)) for batch in batches])
     return trial[np.argsort(value, kind="stable")[:best]]

@@ -22,6 +22,7 @@ from restock.files import write_text
 from restock.stats import cluster_counts
 from restock.toml import toml_value
 from restock.train.twin.calibration.fit_solver import (
+    BASE,
     PARAMETERS,
     FitProblem,
     FitSolution,
@@ -63,8 +64,6 @@ class FittedTwin:
     """The twin with the parameters of a log's robot, as far as the log identifies them."""
 
     perturbation: Perturbation
-    base: Perturbation
-    timestep_s: float
     recordings: tuple[str, ...]
     estimates: tuple[ParameterEstimate, ...]
     warnings: tuple[str, ...]
@@ -82,7 +81,6 @@ class FittedTwin:
         return {
             **vars(self),
             "perturbation": msgspec.to_builtins(self.perturbation),
-            "base": msgspec.to_builtins(self.base),
             "estimates": [vars(item) for item in self.estimates],
             "held_out": [vars(item) for item in self.held_out],
         }
@@ -92,7 +90,7 @@ class FittedTwin:
         estimates = {item.name: item for item in self.estimates}
         lines = [
             f"# Effective parameters, fitted to {', '.join(self.recordings)}",
-            f"# at a timestep of {self.timestep_s:g} s: {self.segments} segments.",
+            f"# at a timestep of {BASE.timestep_s:g} s: {self.segments} segments.",
         ]
         lines += [f"# {warning}" for warning in self.warnings]
         for name, value in msgspec.to_builtins(self.perturbation).items():
@@ -114,12 +112,11 @@ def fleet_schedule(fits: Sequence[FittedTwin]) -> Schedule:
     shared = [
         item.name for item in fits[0].estimates if all(item.name in names for names in fitted)
     ]
-    base = msgspec.structs.replace(fits[0].base, timestep_s=fits[0].timestep_s)
     values = {name: [getattr(fit.perturbation, name) for fit in fits] for name in shared}
     middle = {name: float(np.mean(each)) for name, each in values.items()}
     return Schedule(
         ranges={name: (min(each), max(each)) for name, each in values.items()},
-        base=msgspec.structs.replace(base, name="fleet", **middle),
+        base=msgspec.structs.replace(BASE, name="fleet", **middle),
         name="fleet",
     )
 
@@ -147,7 +144,7 @@ def write_fit(path: Path | str, fits: Sequence[FittedTwin]) -> None:
 def _schedule_toml(fits: Sequence[FittedTwin]) -> str:
     made = fleet_schedule(fits)
     lines = [
-        f"# Fitted to {len(fits)} recordings, each separately, at {fits[0].timestep_s:g} s.",
+        f"# Fitted to {len(fits)} recordings, each separately, at {BASE.timestep_s:g} s.",
         f"name = {toml_value(made.name)}",
         "",
         "[ranges]",
@@ -156,7 +153,7 @@ def _schedule_toml(fits: Sequence[FittedTwin]) -> str:
         "[base]",
     ]
     for name, value in msgspec.to_builtins(made.base).items():
-        if value != getattr(Perturbation(), name):
+        if value != getattr(BASE, name):
             lines.append(f"{name} = {toml_value(value)}")
     return "\n".join(lines) + "\n"
 
@@ -289,7 +286,7 @@ def _kept_as_in_base(
     problem = FitProblem(residuals, coordinates, solution.scale)
     low, high = cost_profile(problem, solution, index)
     ends = [_value(solution, index, end) for end in (low, high)]
-    start = coordinates.point(coordinates.base)[index]
+    start = coordinates.point(BASE)[index]
     base_fits = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
     # At an end of its range, and the residuals there do not move with it: where it got to is the
     # search's doing, whatever the jumps of the cost on the way to the base say.
@@ -302,17 +299,15 @@ def _kept_as_in_base(
         reason = "at the end of its range, where it has no effect on the log"
     if parameter.name in ("friction_scale", "left_friction_scale"):
         fitted = coordinates.perturbation(solution.z)
-        sliding = replay_segments(
-            residuals.segments, [fitted], timestep_s=residuals.timestep_s, nthread=residuals.nthread
-        ).sliding_mps
-        share = float((sliding > SLIDES_MPS).mean())
+        replayed = replay_segments(residuals.segments, [fitted], nthread=residuals.nthread)
+        share = float((replayed.sliding_mps > SLIDES_MPS).mean())
         reason += f" (wheels slide in {share:.1%} of the steps)"
     else:
         other = _confounded_with(uncertainty.correlation, index)
         if other is not None:
             correlation = uncertainty.correlation[index, other]
             reason += f" (its correlation with {coordinates.names[other]} is {correlation:.2f})"
-    return as_in_base(parameter.name, coordinates.base, reason, *ends)
+    return as_in_base(parameter.name, reason, *ends)
 
 
 def _confounded_with(correlation: F64, index: int) -> int | None:
@@ -324,10 +319,10 @@ def _confounded_with(correlation: F64, index: int) -> int | None:
 
 
 def as_in_base(
-    name: str, base: Perturbation, reason: str, low: float | None = None, high: float | None = None
+    name: str, reason: str, low: float | None = None, high: float | None = None
 ) -> ParameterEstimate:
     """Return a parameter that is not fitted."""
-    value, unit = float(getattr(base, name)), PARAMETERS[name].unit
+    value, unit = float(getattr(BASE, name)), PARAMETERS[name].unit
     return ParameterEstimate(name, unit, value, low, high, False, reason)
 
 

@@ -31,7 +31,7 @@ from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.filling import Routing
-from restock.ingest.task.robot import Robot
+from restock.ingest.task.surroundings import PLAN_PARTS
 from restock.ingest.task.task import (
     OBSERVED,
     TRACK_SIGNALS,
@@ -258,7 +258,7 @@ class PlanMemory:
 
     def _view(self, plan: Ints, pose: Signals) -> dict[str, F64]:
         seen = self.routing.view(self.task, plan, pose)
-        near, far = seen.look_ahead_m[:, 0], seen.look_ahead_m[:, 1]
+        near, far = (seen.look_ahead_m[:, part * PLAN_PARTS] for part in (1, 2))
         values = (near[:, 0], near[:, 1], far[:, 0], far[:, 1], seen.remaining_m)
         return dict(zip(ROUTE, values, strict=True))
 
@@ -322,17 +322,12 @@ def measure_gap(
     calibrated: Perturbation | None = None,
     config: GapConfig | None = None,
     *,
-    warehouse: Warehouse | None = None,
     task_hash: str | None = None,
-    robot: Robot | None = None,
-    notes: tuple[str, ...] = (),
     on_progress: Callable[[str], None] | None = None,
 ) -> TwinGap:
     """Measure the gap of the nominal twin and, if given, of a calibrated one.
 
-    `warehouse` is the floor that the log may have been driven on (default: the twin's own); what
-    the lidar sees is compared only where the two agree. `robot` is whose logs they are (default:
-    that of the store's own profile). `notes` are listed beside what was not done.
+    What the lidar sees is compared only if the log was driven on the twin's own floor.
 
     Raises:
         ConfigError: a horizon that is not some control periods, or a control period that the twin
@@ -340,11 +335,11 @@ def measure_gap(
         StoreError: no rows, rows of several tasks and no `task_hash`, or no row that is followed
             by another.
     """
-    config, warehouse = config or GapConfig(), warehouse or default_warehouse()
+    config, warehouse = config or GapConfig(), default_warehouse()
     report = on_progress or (lambda text: None)
     twins = {BEFORE: Perturbation()} | ({AFTER: calibrated} if calibrated is not None else {})
     judged = list(twins)[-1]
-    steps = logged_steps(store, task_hash, robot=robot)
+    steps = logged_steps(store, task_hash)
     if not steps.followed.any():
         raise StoreError("no step is followed by another", where=str(store.path))
     noise = measured_noise(steps, twins[judged])
@@ -386,10 +381,7 @@ def measure_gap(
         observations=observation_rows,
         rewards=reward_rows,
         verdicts=_verdicts(steps, config.limits, judged, path_rows, ratios),
-        not_done=(
-            *_not_done(steps, twins, stepped, difference, noise.drift_m, paths),
-            *notes,
-        ),
+        not_done=tuple(_not_done(steps, twins, stepped, difference, noise.drift_m, paths)),
     )
 
 
@@ -560,10 +552,9 @@ def _not_done(
     elif difference > AGREES:
         yield (
             "Lidar readings were not compared: the log was driven on another floor than the "
-            "twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is "
+            f"twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is "
             "the limit). Steps were driven on an empty floor: clearances in their rewards are "
-            "the "
-            "log's own, and there are no obstacles."
+            "the log's own, and there are no obstacles."
         )
     if steps.robot is None and steps.task.body != load_profile("warehouse_amr").task.body:
         yield (

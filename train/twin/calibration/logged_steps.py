@@ -96,18 +96,15 @@ def logged_steps(
     store: Store,
     task_hash: str | None = None,
     recordings: Sequence[str] = (),
-    robot: Robot | None = None,
 ) -> LoggedSteps:
     """Read the rows of a task from these recordings of a store (all by default).
-
-    `robot` is whose they are; None: that of the profile that the store keeps.
 
     Raises:
         ConfigError: no such recording, or a robot that the twin cannot build.
         StoreError: no rows, rows of several tasks and no `task_hash`, or columns are missing.
     """
     task = store.task(task_hash)
-    robot = robot or robot_of_store(store, task_hash or task.hash)
+    robot = robot_of_store(store, task_hash or task.hash)
     recordings_of(store, recordings, task_hash)
     sql = (files("restock.train.twin.calibration") / "logged_steps.sql").read_text(encoding="utf-8")
     parameters = {"task_hash": task_hash or task.hash, "recordings": list(recordings)}

@@ -44,7 +44,7 @@ from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, Missi
 from restock.train.twin.env.interface import Info, MadeAgain, Step
 from restock.train.twin.env.navigation import Navigation, Truth, info_after, info_now
 from restock.train.twin.env.render import draw_map
-from restock.train.twin.floors.floors import floors_of
+from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS
 from restock.train.twin.physics.episode import (
@@ -208,7 +208,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.task = task or load_profile("warehouse_amr").task
-        self.floors = floors_of(layouts) if warehouse is None else (warehouse,)
+        self.floors = open_floors(layouts) if warehouse is None else (warehouse,)
         self.layout_names = np.array([floor.name for floor in self.floors])
         self.floor_objects = np.empty(len(self.floors), object)
         self.floor_objects[:] = self.floors

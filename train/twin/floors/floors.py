@@ -169,33 +169,29 @@ def transposed(floor: Warehouse) -> Warehouse:
     )
 
 
-def open_floors(text: str) -> tuple[Warehouse, ...]:
-    """Open the floors of a name, file or comma-separated list; `docs/layouts.md` lists them.
+def open_floors(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ...]:
+    """Open the floors of names, files or comma-separated lists; `docs/layouts.md` lists them.
 
     Raises:
-        ConfigError: no such floor, or a file that is not a floor; says which and what to write.
+        ConfigError: no such floor, or a file that is not a floor; says which and what to write. Or
+            none at all, or two of one name.
     """
-    floors = [floor for part in text.split(",") for floor in _open(part.strip())]
-    names = [floor.name for floor in floors]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise ConfigError(f"{', '.join(repeated)} is given twice", where=f"layouts {text!r}")
-    return tuple(floors)
-
-
-def floors_of(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ...]:
-    """Return floors, read by `open_floors` if given as text. Raises ConfigError if names repeat."""
-    parts = [layouts] if isinstance(layouts, str) else layouts
-    opened = [open_floors(part) if isinstance(part, str) else (part,) for part in parts]
-    floors = tuple(floor for some in opened for floor in some)
+    floors: list[Warehouse] = []
+    for part in [layouts] if isinstance(layouts, str) else layouts:
+        if isinstance(part, Warehouse):
+            floors.append(part)
+        else:
+            floors += [floor for text in part.split(",") for floor in _open(text.strip())]
     names = [floor.name for floor in floors]
     if not floors or len(set(names)) < len(names):
         raise ConfigError(
-            f"layout names must be unique, got {names}" if floors else "there must be a layout",
-            where="the twin",
+            f"layout names must be unique, got {', '.join(names)}"
+            if floors
+            else "there must be a layout",
+            where="layouts",
             remedy="give floors that differ in their name",
         )
-    return floors
+    return tuple(floors)
 
 
 def layouts_of_split(text: str, split: Split) -> str:

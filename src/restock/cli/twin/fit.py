@@ -98,11 +98,13 @@ class FitCommand:
 
 
 def _show(fit: FittedTwin) -> None:
+    from restock.train.twin.calibration.fit_solver import BASE
+
     rows = [
         {
             "parameter": item.name,
             "unit": item.unit,
-            "before": getattr(fit.base, item.name),
+            "before": getattr(BASE, item.name),
             "effective": item.value,
             "95 % from": item.low,
             "to": item.high,
@@ -113,7 +115,7 @@ def _show(fit: FittedTwin) -> None:
     title = (
         f"{', '.join(fit.recordings)}  {counted(fit.segments, 'segment')} of "
         f"{counted(fit.clusters, 'cluster')}"
-        f"  timestep {fit.timestep_s:g} s"
+        f"  timestep {BASE.timestep_s:g} s"
     )
     output.print_table(rows, title=title)
     output.print_table(
