@@ -28,7 +28,6 @@ from restock.train.feed.practice import (
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.perturbation import Schedule
 
 ARMS = [
     MissionArm("nominal", "nominal", 0.6),
@@ -100,10 +99,10 @@ def test_success_practises_what_fails_once_it_is_believed(monkeypatch):
 
 
 def test_an_arm_with_too_few_missions_goes_by_its_kind() -> None:
-    arms = [MissionArm(f"slip on {x}", "wheel_slip", 0.1, layout=f"{x}") for x in range(9)]
+    arms = [MissionArm(f"slip {x}", "wheel_slip", 0.1, block=f"{x}") for x in range(9)]
     found = practice([*arms, ARMS[0]], rule="success", floor=0.0)
-    slip = replace(ended("wheel_slip", True)[0], layout="0")
-    found.note([slip, replace(slip, layout="1", success=False), *[replace(slip, layout="2")] * 6])
+    slip = replace(ended("wheel_slip", True)[0], block="0")
+    found.note([slip, replace(slip, block="1", success=False), *[replace(slip, block="2")] * 6])
     rates = found.failure_rate
     assert rates[2] == pytest.approx(0.5 / 7, abs=0.01)  # its own six successes
     np.testing.assert_allclose(np.delete(rates[:9], 2), rates[0])  # the kind's: one of eight
@@ -146,7 +145,6 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("practice.by=['friction_scale']", "cannot be distinguished by 'friction_scale'"),
         ("practice={rule='success', floor=0.5}", "above 1"),
     ],
 )
@@ -196,7 +194,7 @@ def test_a_run_of_other_arms_is_not_resumed(tmp_path: Path) -> None:
 
 def test_warehouse_draws_missions_of_the_requested_arms() -> None:
     twin = WarehouseVectorEnv(2, seed=3)
-    names = [arm.name for arm in twin.mission_arms(["block"])]
+    names = [arm.name for arm in twin.mission_arms()]
     assert names[2:4] == ["blocked_aisle (partial)", "blocked_aisle (full)"]
     twin.set_mission_shares([0, 0, 1, 0, 0])
     _, info = twin.reset(seed=3)
@@ -209,20 +207,10 @@ def test_warehouse_draws_missions_of_the_requested_arms() -> None:
     assert [twin.queue.next(0)[0] for _ in range(5)] == first  # the same, whenever it is asked
 
 
-def test_arms_by_half_of_a_range_draw_from_that_half() -> None:
-    schedule = Schedule({"friction_scale": (0.4, 1.0)})
-    twin = WarehouseVectorEnv(1, seed=1, perturbation=schedule, conditions={"nominal": 1})
-    arms = twin.mission_arms(["friction_scale"])
-    assert [arm.name for arm in arms] == [f"nominal, friction_scale {x}" for x in ("low", "high")]
-    twin.set_mission_shares([1, 0])
-    drawn = [twin.queue.next(0)[0].perturbation for _ in range(8)]
-    assert all(p is not None and 0.4 <= p.friction_scale <= 0.7 for p in drawn)
-
-
 def test_an_order_is_an_arm_and_says_so() -> None:
     orders = [MissionOrder(kind="near_collision", missions=2)]
     twin = WarehouseVectorEnv(1, missions=orders, missions_share=0.25, conditions={"nominal": 1})
-    arms = twin.mission_arms([])
+    arms = twin.mission_arms()
     assert [(arm.name, arm.share) for arm in arms] == [
         ("nominal", 0.75),
         ("missions[0] near_collision", 0.25),

@@ -40,7 +40,7 @@ assert set(env.episode_condition) == {kind}, env.episode_condition
 assert meets(kind, truths) and not meets(kind, ["nominal"]), truths
 assert kind in CELLS and kind in RARE and kind in TrainConfig().env.conditions
 assert NATURAL[kind] == 0.05 and CONDITION_COLOURS[kind] == "#009e73"
-assert [arm.name for arm in env.mission_arms(["block"])] == [kind]
+assert [arm.name for arm in env.mission_arms()] == [kind]
 """
 
 

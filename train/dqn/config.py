@@ -191,8 +191,6 @@ class PracticeConfig(Checked, frozen=True):
     """Which missions the twin gives next: see `restock.train.feed.practice`."""
 
     rule: Literal["natural", "even", "success"] = "natural"
-    # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
-    by: tuple[str, ...] = ("block",)
     floor: Share | None = None  # least share of an arm; None: FLOOR if shares move, else 0
 
 

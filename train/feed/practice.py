@@ -14,7 +14,6 @@ interval. Nothing is drawn here: the twin draws its missions from its own seed.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -106,7 +105,7 @@ class Practice(Stateful):
             if share
         ]
         if isinstance(env, ArmedTwin):
-            return cls(config, list(env.mission_arms(config.by)), env.set_mission_shares, goal=goal)
+            return cls(config, list(env.mission_arms()), env.set_mission_shares, goal=goal)
         if isinstance(env, KindsTwin):
             tell = partial(_set_kinds, env, [arm.kind for arm in kinds])
             return cls(config, kinds, tell, goal=goal)
@@ -191,7 +190,7 @@ class Practice(Stateful):
         return RunError(
             f"practised {', '.join(map(str, value or ()))}; now there are {', '.join(self.names)}",
             where=WHERE,
-            remedy="resume it with its own env and practice.by, or start another run",
+            remedy="resume it with its own env, or start another run",
         )
 
     def _tell(self) -> None:
@@ -224,9 +223,8 @@ class Practice(Stateful):
         """Return the number of an episode's arm; None if it belongs to none."""
         if episode.arm >= 0:
             return episode.arm
-        values = json.loads(episode.perturbation_values)
         for place, arm in enumerate(self.arms):
-            if arm.holds(episode.true_condition, episode.block, episode.layout, values):
+            if arm.holds(episode.true_condition, episode.block):
                 return place
         return None
 
@@ -244,7 +242,7 @@ class Practice(Stateful):
     def _resolved_floor(self) -> float:
         config, count = self.config, len(self.arms)
         if config.floor is None:
-            # Many arms (floors, orders) leave less for each: half is always free to move.
+            # Many arms (orders) leave less for each: half is always free to move.
             least = FLOOR if config.rule == "success" else 0.0
             return min(least, 0.5 / max(count, 1))
         if count * config.floor > 1 + 1e-9:
@@ -327,7 +325,7 @@ def mission_arms(config: TrainConfig) -> MissionArms:
     """Make the arms of a run's missions.
 
     Raises:
-        ConfigError: an order that the floors cannot hold, or `practice.by` that says nothing.
+        ConfigError: an order that the floors cannot hold.
     """
     floors, ordered = open_floors(config.env.layouts), mission_orders(config)
     routes = planners(floors)
@@ -336,7 +334,6 @@ def mission_arms(config: TrainConfig) -> MissionArms:
         floors,
         routes,
         config.env.conditions,
-        by=config.practice.by,
         schedule=perturbation if isinstance(perturbation, Schedule) else None,
         orders=MissionOrders(ordered, floors, routes, where=MISSIONS) if ordered else None,
         orders_share=config.env.missions_share,

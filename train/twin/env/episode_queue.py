@@ -2,7 +2,7 @@
 
 Fixed episodes come in their order, then drawn ones. These may be of ordered missions (a kind, a
 floor and a zone), or of arms, the kinds of missions that practice chooses among: a kind of episode,
-and on request one block of a blocked aisle, one floor, or one part of a perturbation's range.
+of a blocked aisle one block.
 
 An episode is determined by its kind and its seed. An episode that must come through a zone, or
 belong to an arm, gets the first of its seeds that does: the episode itself is not changed.
@@ -146,43 +146,27 @@ def _some(names: list[Any]) -> str:
     return ", ".join(map(str, names[:12])) + (", …" if len(names) > 12 else "")
 
 
-BLOCK, LAYOUT = "block", "layout"
-PARTS = ("low", "high")  # halves of a range of the perturbation
 BLOCK_TRIES = 300  # seeds that are tried for a block
 _PROBES = 24  # seeds that show which blocks a floor has room for
 
 
 @dataclass(frozen=True)
 class MissionArm:
-    """A group of missions that can be chosen; "" and () leave a choice to the seed."""
+    """A group of missions that can be chosen; "" leaves a choice to the seed."""
 
     name: str
     kind: str
     share: float  # natural: of the missions, where nothing is practised
     block: str = ""  # partial | full
-    layout: str = ""
-    ranges: tuple[tuple[str, float, float], ...] = ()  # of the schedule: field, low, high
     order: int = -1  # of the ordered missions
 
-    def holds(self, kind: str, block: str, layout: str, values: Mapping[str, float]) -> bool:
-        """Return whether an episode is of this arm; `values` are those of its perturbation."""
-        return (
-            self.order < 0
-            and kind == self.kind
-            and self.block in ("", block)
-            and self.layout in ("", layout)
-            and all(low <= values.get(name, low) <= high for name, low, high in self.ranges)
-        )
+    def holds(self, kind: str, block: str) -> bool:
+        """Return whether an episode is of this arm."""
+        return self.order < 0 and kind == self.kind and self.block in ("", block)
 
 
 class MissionArms:
-    """The arms of a twin: its floors, kinds, orders and schedule, split `by` what is requested.
-
-    `by` holds "block", "layout" and fields of the schedule's ranges, each split in two halves.
-
-    Raises:
-        ConfigError: `by` names something else.
-    """
+    """The arms of a twin: its kinds of episodes, each block of them, and its orders."""
 
     def __init__(
         self,
@@ -190,7 +174,6 @@ class MissionArms:
         planners: Sequence[Planner],
         conditions: Mapping[str, float],
         *,
-        by: Sequence[str],
         schedule: Schedule | None = None,
         orders: MissionOrders | None = None,
         orders_share: float = 0.0,
@@ -198,29 +181,14 @@ class MissionArms:
         self._floors, self._planners = list(floors), list(planners)
         self._place = {floor.name: place for place, floor in enumerate(floors)}
         self._schedule, self._orders = schedule, orders
-        ranges = {} if schedule is None else schedule.ranges
-        unknown = [name for name in by if name not in (BLOCK, LAYOUT, *ranges)]
-        if unknown:
-            raise ConfigError(
-                f"missions cannot be distinguished by {', '.join(map(repr, unknown))}",
-                where="practice.by",
-                remedy=f"give {', '.join((BLOCK, LAYOUT, *ranges))}"
-                + ("" if ranges else "; fields of env.perturbation, where it is a schedule"),
-            )
         left = 1.0 if orders is None else 1.0 - orders_share
         total = sum(conditions.values())
         arms = [
-            MissionArm(kind, kind, left * part / total)
+            arm
             for kind, part in conditions.items()
             if left * part  # a kind without a share is evaluated, and never practised
+            for arm in self._by_block(MissionArm(kind, kind, left * part / total))
         ]
-        if LAYOUT in by:
-            arms = [one for arm in arms for one in self._by_layout(arm)]
-        if BLOCK in by:
-            arms = [one for arm in arms for one in self._by_block(arm)]
-        for field in by:
-            if field in ranges:
-                arms = [one for arm in arms for one in _by_range(arm, field, ranges[field])]
         if orders is not None:
             arms += [
                 MissionArm(
@@ -243,75 +211,43 @@ class MissionArms:
         arm = self.arms[number]
         if arm.order >= 0 and self._orders is not None:
             return perturbed(self._orders.spec(arm.order, seed), self._schedule)
-        layout, rng = arm.layout or None, np.random.default_rng([seed, 3])
+        rng = np.random.default_rng([seed, 3])
         for _ in range(BLOCK_TRIES):
-            spec = EpisodeSpec(arm.kind, seed, layout=layout)
+            spec = EpisodeSpec(arm.kind, seed)
             if not arm.block or self._block(spec) == arm.block:
-                return perturbed(spec, self._narrowed(arm))
+                return perturbed(spec, self._schedule)
             seed = int(rng.integers(1 << 31))
         raise ConfigError(
             f"none of {BLOCK_TRIES} seeds gave a mission of {arm.name}",
             where="practice",
-            remedy="its floor hardly has room for it: leave `block` out of practice.by",
+            remedy="its floor hardly has room for it: give the kind no share",
         )
-
-    def _narrowed(self, arm: MissionArm) -> Schedule | None:
-        """Return the schedule for an arm's perturbations, its ranges narrowed to the arm's."""
-        ranges = {name: (low, high) for name, low, high in arm.ranges}
-        if self._schedule is None or not ranges:
-            return self._schedule
-        return msgspec.structs.replace(self._schedule, ranges=self._schedule.ranges | ranges)
 
     def _block(self, spec: EpisodeSpec) -> str:
         place = floor_place(spec, self._place)
         return draw_episode(spec, self._floors[place], self._planners[place]).block
 
-    def _by_layout(self, arm: MissionArm) -> list[MissionArm]:
-        names = list(self._place)
-        if len(names) == 1:
-            return [arm]
-        share = arm.share / len(names)
-        return [
-            replace(arm, name=f"{arm.name} on {name}", layout=name, share=share) for name in names
-        ]
-
     def _by_block(self, arm: MissionArm) -> list[MissionArm]:
         if not MISSIONS[arm.kind].blocks:
             return [arm]
-        found = self._blocks(arm)
-        name, _, floor = arm.name.partition(" on ")
-        floor = f" on {floor}" if floor else ""
+        found = self._blocks(arm.kind)
         return [
-            replace(arm, name=f"{name} ({block}){floor}", block=block, share=arm.share / len(found))
+            replace(arm, name=f"{arm.name} ({block})", block=block, share=arm.share / len(found))
             for block in found
         ]
 
-    def _blocks(self, arm: MissionArm) -> list[str]:
-        """Return the blocks that an arm's floors have room for."""
+    def _blocks(self, kind: str) -> list[str]:
+        """Return the blocks of a kind that the floors have room for."""
         found: set[str] = set()
-        blocks = list(MISSIONS[arm.kind].blocks)
+        blocks = list(MISSIONS[kind].blocks)
         for seed in range(_PROBES):
             try:
-                found.add(self._block(EpisodeSpec(arm.kind, seed, layout=arm.layout or None)))
+                found.add(self._block(EpisodeSpec(kind, seed)))
             except ConfigError:  # no room at all: the floors are asked about kinds elsewhere
                 break
             if len(found) == len(blocks):
                 break
         return [block for block in blocks if block in found] or [""]
-
-
-def _by_range(arm: MissionArm, field: str, ends: tuple[float, float]) -> list[MissionArm]:
-    low, high = ends
-    edges: F64 = np.linspace(low, high, len(PARTS) + 1)
-    return [
-        replace(
-            arm,
-            name=f"{arm.name}, {field} {part}",
-            share=arm.share / len(PARTS),
-            ranges=(*arm.ranges, (field, float(edges[number]), float(edges[number + 1]))),
-        )
-        for number, part in enumerate(PARTS)
-    ]
 
 
 def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
@@ -402,13 +338,12 @@ class EpisodeQueue(Stateful):
         parts = np.asarray(shares, np.float64)
         self._arms, self._arm_shares = self._asked, np.cumsum(parts) / parts.sum()
 
-    def arms(self, by: Sequence[str], planners: Sequence[Planner]) -> list[MissionArm]:
-        """Return the arms of its drawn episodes. Raises ConfigError as `MissionArms` does."""
+    def arms(self, planners: Sequence[Planner]) -> list[MissionArm]:
+        """Return the arms of its drawn episodes."""
         self._asked = MissionArms(
             self._layouts,
             planners,
             self.conditions,
-            by=by,
             schedule=self.schedule,
             orders=self._orders,
             orders_share=self._orders_share,

@@ -283,15 +283,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         """Set the shares per kind of episode, for episodes that begin from now on."""
         self.queue.set_conditions(conditions)
 
-    def mission_arms(self, by: Sequence[str]) -> list[MissionArm]:
-        """Return the arms that drawn episodes can be chosen by, each with its natural share.
-
-        `by` splits them: "block" (of a blocked aisle), "layout", a field of the schedule's ranges.
-
-        Raises:
-            ConfigError: `by` names something else.
-        """
-        return self.queue.arms(by, self.navigation.planners)
+    def mission_arms(self) -> list[MissionArm]:
+        """Return the arms that drawn episodes can be chosen by, each with its natural share."""
+        return self.queue.arms(self.navigation.planners)
 
     def set_mission_shares(self, shares: Sequence[float]) -> None:
         """Set the shares of the last `mission_arms`, for episodes that begin from now on.
