@@ -34,7 +34,6 @@ from restock.train.twin.calibration.logged_steps import (
     sector_clearance,
 )
 from restock.train.twin.calibration.open_loop import empty_floor
-from restock.train.twin.calibration.path_gap import FLOOR
 from restock.train.twin.calibration.twin_gap import (
     TRUSTED,
     UNDECIDED,
@@ -89,12 +88,11 @@ def position(gap: TwinGap, condition: str, source: str, horizon_s: float) -> dic
 
 
 @pytest.mark.parametrize("horizon_s", [3.0, 6.0])
-def test_the_true_parameters_close_the_gap_to_near_the_floor(gap, horizon_s):
-    before, after, floor = (
-        position(gap, "nominal", source, horizon_s)["median"] for source in (BEFORE, AFTER, FLOOR)
+def test_the_true_parameters_close_the_gap(gap, horizon_s):
+    before, after = (
+        position(gap, "nominal", source, horizon_s)["median"] for source in (BEFORE, AFTER)
     )
     assert after < 0.5 * before
-    assert after < 1.6 * floor
     odometry = position(gap, "nominal", "odometry", horizon_s)["median"]
     assert after < odometry  # whose wheels are not as large as it takes them to be
 

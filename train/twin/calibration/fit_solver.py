@@ -213,7 +213,7 @@ def fit_scope(
         notes.append("no IMU: yaw rate is known only from headings")
         if "gyro_bias_radps" in names:
             refused["gyro_bias_radps"] = "the log has no gyroscope"
-    if _pose_is_odometry(store, wanted):
+    if pose_is_odometry(store, recordings):
         channels = [name for name in channels if name not in ("position", "heading")]
         why = "the log's pose is the wheels' odometry: nothing measures the motion over ground"
         refused |= {name: why for name in names if name in ("wheel_radius_scale", "friction_scale")}
@@ -238,8 +238,9 @@ def _recording_filter(recordings: Sequence[str]) -> str:
     return f"WHERE recording_id IN ({quoted})" if recordings else ""
 
 
-def _pose_is_odometry(store: Store, wanted: str) -> bool:
-    """Return whether all recordings were read with odometry but without a localiser's topic."""
+def pose_is_odometry(store: Store, recordings: Sequence[str]) -> bool:
+    """Return whether these recordings were read with odometry but without a localiser's topic."""
+    wanted = _recording_filter(recordings)
     rows = store.sql(
         "SELECT recording_id, coalesce(list(DISTINCT type) FILTER (decoded > 0), [])"
         f" FROM recordings LEFT JOIN topics USING (recording_id) {wanted} GROUP BY recording_id"

@@ -45,6 +45,7 @@ from restock.ingest.task.task import (
 )
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_quantiles, clustered_ratio
+from restock.train.twin.calibration.fit_solver import pose_is_odometry
 from restock.train.twin.calibration.logged_steps import (
     NOMINAL,
     LoggedSteps,
@@ -64,7 +65,6 @@ from restock.train.twin.calibration.open_loop import (
 from restock.train.twin.calibration.path_gap import (
     QUANTITIES,
     PathGap,
-    measured_noise,
     path_gap,
 )
 from restock.train.twin.calibration.twin_gap import (
@@ -342,11 +342,10 @@ def measure_gap(
     steps = logged_steps(store, task_hash)
     if not steps.followed.any():
         raise StoreError("no step is followed by another", where=str(store.path))
-    noise = measured_noise(steps, twins[judged])
     paths = []
     for horizon in config.horizons_s:
         report(f"driving segments of {horizon:g} s again")
-        paths.append(path_gap(steps, horizon, twins, noise, config))
+        paths.append(path_gap(steps, horizon, twins, config))
     report("one step from each logged state")
     rng = np.random.default_rng([config.seed, 2])
     difference = _floor_difference(store, steps, warehouse, rng)
@@ -365,7 +364,6 @@ def measure_gap(
         "episodes": len(np.unique(steps.episode_id)),
         "judged": judged,
         "twins": {name: msgspec.to_builtins(twin) for name, twin in twins.items()},
-        "noise": asdict(noise),
         "limits": asdict(config.limits),
         "robot": "the twin's stand-in" if steps.robot is None else "the profile's own",
         "floor": warehouse.name,
@@ -381,7 +379,7 @@ def measure_gap(
         observations=observation_rows,
         rewards=reward_rows,
         verdicts=_verdicts(steps, config.limits, judged, path_rows, ratios),
-        not_done=tuple(_not_done(steps, twins, stepped, difference, noise.drift_m, paths)),
+        not_done=tuple(_not_done(store, steps, twins, stepped, difference, paths)),
     )
 
 
@@ -539,8 +537,8 @@ def _verdicts(
 
 
 def _not_done(
-    steps: LoggedSteps, twins: Mapping[str, Perturbation], stepped: OneStep,
-    difference: float, drift_m: float, paths: list[PathGap],
+    store: Store, steps: LoggedSteps, twins: Mapping[str, Perturbation], stepped: OneStep,
+    difference: float, paths: list[PathGap],
 ) -> Iterator[str]:  # fmt: skip
     if AFTER not in twins:
         yield "No gap after calibration: no fitted perturbation was given."
@@ -566,17 +564,13 @@ def _not_done(
             "Waypoints and distance to a goal were not compared: the log has no goal and no plan;"
             " progress is forward motion."
         )
-    if not drift_m and any(twin.localisation_drift_m for twin in twins.values()):
+    if pose_is_odometry(store, np.unique(steps.recording_id).tolist()):
         yield (
-            "The pose always agrees with the wheels, so it is wheel odometry: the gap is measured "
-            "against that, slip is not visible, and localisation noise cannot be estimated."
+            "The pose is wheel odometry: the gap is measured against that, and slip is not visible."
         )
     for path in paths:
         if not len(path.episode_id):
             yield f"No segment of {path.horizon_s:g} s could be driven again."
-    last_steps = int((~steps.followed).sum())
-    if last_steps:
-        yield f"{last_steps} last steps of episodes have no step after them to compare with."
     if stepped.unexplained:
         yield (
             f"The rewards of {stepped.unexplained} steps are not the sum of their terms by this "

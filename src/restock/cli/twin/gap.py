@@ -17,9 +17,9 @@ class GapCommand:
 
     For each condition, it measures the error of pose and signals after 1, 3 and 6 s, open loop, and
     of observation and reward after one step from each logged state: for the nominal twin and, with
-    --perturbation, for a calibrated one. For comparison it shows dead-reckoned odometry, and the
-    least error that localisation noise allows. It lists the conditions in which the twin should not
-    be trusted, by the limits below, with 95 % confidence over episodes. See docs/robot.md.
+    --perturbation, for a calibrated one. For comparison it shows dead-reckoned odometry. It lists
+    the conditions in which the twin should not be trusted, by the limits below, with 95 %
+    confidence over episodes. See docs/robot.md.
 
     The exit code is 0 whatever the gap. With --check, it is 1 if a condition is untrusted.
 

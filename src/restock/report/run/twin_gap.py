@@ -35,7 +35,6 @@ COLOURS = {
     "nominal twin": "#b45309",
     "calibrated twin": "#0f766e",
     "odometry": "#64748b",
-    "floor": "#2563eb",
     "persistence": "#94a3b8",
 }
 _MEANING = {
@@ -127,9 +126,7 @@ def gap_section(gap: TwinGap) -> Section:
             "horizon": f"after {row['horizon_s']:g} s",
         }
         for row in gap.paths
-        if row["quantity"] == "position"
-        and row["median"] is not None
-        and (row["source"] != "floor" or row["p90"])  # nothing to see without localisation noise
+        if row["quantity"] == "position" and row["median"] is not None
     ]
     rows = [
         {
@@ -149,12 +146,11 @@ def gap_section(gap: TwinGap) -> Section:
         "twin-gap",
         "Can the twin be trusted?",
         intro="Logged commands, driven again in the twin in open loop, without feedback from the "
-        "log. Odometry: dead reckoning from the logged wheels; a twin should be better. The "
-        "floor is the least error that can be measured: that of a perfect twin with the same "
-        "localisation noise. A condition is trusted if nine in ten segments of "
-        f"{limits['horizon_s']:g} s end within {limits['position_m']:g} m of the log, and the "
-        f"error of the one-step reward is less than {limits['reward_ratio']:g} times its "
-        "standard deviation in the log (its spread), both with 95 % confidence over episodes.",
+        "log. Odometry: dead reckoning from the logged wheels; a twin should be better. A "
+        f"condition is trusted if nine in ten segments of {limits['horizon_s']:g} s end within "
+        f"{limits['position_m']:g} m of the log, and the error of the one-step reward is less than "
+        f"{limits['reward_ratio']:g} times its standard deviation in the log (its spread), both "
+        "with 95 % confidence over episodes.",
         callout=headline(gap) + "." if gap.untrusted else "",
         figures=[
             Figure(
