@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from restock.train.twin.recording.bag_writer import Message, typestore
 from restock.train.twin.recording.publish import LIDAR_LSB_M, Rates, Robot
 from restock.train.twin.recording.recorder import NOISELESS
-from restock.train.twin.recording.robot_topics import EMPTY, TOPICS, Drive, Lidar, Motion, Odometer
+from restock.train.twin.recording.robot_topics import TOPICS, Drive, Lidar, Motion, Odometer, Scene
 
 START_NS = 1_772_000_000_000_000_000
 TYPES = {topic.name: topic.type_name for topic in TOPICS}
@@ -59,7 +59,9 @@ def _drive(rng: np.random.Generator) -> Drive:
         true_exposure=["nominal"] * 20,
         policy=[("planner", "1", 0.98)] * 12 + [("operator", "1", 0.97)] * 8,
         plans=[(0, np.zeros((5, 2))), (10, np.ones((7, 2)))],
-        scene=replace(EMPTY, perturbation=NOISELESS),
+        scene=Scene(
+            np.zeros((0, 3)), np.zeros((0, 5)), np.zeros((1, 0, 3)), NOISELESS, 0.4, (0.7, 0.5, 0.3)
+        ),
     )
 
 

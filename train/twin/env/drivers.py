@@ -16,7 +16,6 @@ actions are random.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -131,22 +130,11 @@ class PlannerFollower(SoftPolicy):
         return PathFollower(env.task, stop_m=self.stop_m, slow_m=self.slow_m)
 
 
-@dataclass(frozen=True)
-class HandoverEvent:
-    """A change of control from one policy to another."""
-
-    env: int
-    episode_seed: int
-    step: int  # of the episode
-    driver: str  # who drives from here on
-    reason: str  # stuck, bumped, slipping, clear
-
-
 class Handover:
     """A pair of drivers: the operator takes over from the planner in trouble, then hands back.
 
     Trouble is what the robot itself can detect: no movement for 3 s, the bumper, or wheels that
-    disagree with the localisation. `events` keeps every handover, oldest first.
+    disagree with the localisation.
     """
 
     version = "1"
@@ -154,7 +142,6 @@ class Handover:
     def __init__(self, planner: BehaviourPolicy, operator: Overseer) -> None:
         self.planner, self.operator = planner, operator
         self.name = f"{planner.name}+{operator.name}"
-        self.events: list[HandoverEvent] = []
         self.acting = np.array([], "U16")
         self.acting_version = np.array([], "U16")
         self._prepare(0)
@@ -200,14 +187,8 @@ class Handover:
         slip |= np.abs(signals["wheel_yaw_rate_radps"] - signals["gyro_yaw_rate_radps"]) > 0.5
         self._slipping = np.where(slip, self._slipping + 1, np.maximum(self._slipping - 1, 0))
         self._since_handover += 1
-        stuck = self._still >= STUCK_STEPS
-        slipping = self._slipping >= SLIP_STEPS
-        trouble = stuck | signals["bumped"] | slipping
-        for index in np.flatnonzero(trouble & ~self._by_operator):
-            reason = (
-                "bumped" if signals["bumped"][index] else "slipping" if slipping[index] else "stuck"
-            )
-            self._pass(env, int(index), True, reason)
+        trouble = (self._still >= STUCK_STEPS) | (self._slipping >= SLIP_STEPS)
+        self._pass((trouble | signals["bumped"]) & ~self._by_operator, to_operator=True)
         clear = (
             ~(signals["clearance_m"] <= 0.2)  # NaN: not known
             & (self._slipping == 0)
@@ -215,22 +196,12 @@ class Handover:
             & (self._since_handover >= MIN_STEPS_BETWEEN_HANDOVERS)
             & ~self.operator.sees_trouble(env)
         )
-        for index in np.flatnonzero(clear & self._by_operator):
-            self._pass(env, int(index), False, "clear")
+        self._pass(clear & self._by_operator, to_operator=False)
 
-    def _pass(self, env: WarehouseVectorEnv, index: int, taken: bool, reason: str) -> None:
-        names = self.planner.name, self.operator.name
-        self._by_operator[index] = taken
-        self._since_handover[index] = self._still[index] = 0
-        self.events.append(
-            HandoverEvent(
-                env=index,
-                episode_seed=int(env.episode_seed[index]),
-                step=int(env.steps[index]),
-                driver=names[taken],
-                reason=reason,
-            )
-        )
+    def _pass(self, robots: Bools, *, to_operator: bool) -> None:
+        """Hand robots (N,) over to one of the two."""
+        self._by_operator[robots] = to_operator
+        self._since_handover[robots] = self._still[robots] = 0
 
 
 # Nearer than this to anything is too near, and less room than that is a squeeze, for a robot of

@@ -24,26 +24,7 @@ Exposures are what was so at t, whatever came of it:
 Several may hold at once: the text of a step names all of them, sorted, with commas between, and is
 "nominal" where none holds. `restock.ingest.store.manifest.primary_of` makes it one.
 
-`info` says more of a step than observation and reward. It holds arrays (N,) about the step just
-taken, whole even if an episode ended:
-
-- `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
-  `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
-- `true_condition`: the conditions over [t, t + 1); `true_exposure`: the exposures at t;
-  `episode_condition`, `block` (none, partial, full), `episode_seed`, `perturbation` and `layout`
-  (their names), `floor` (the layout itself), `episode_number` (place in `set_episodes`, or -1),
-  `mission_arm` (place among `mission_arms`, -1 if none was requested); `perturbation_values`, as
-  JSON those that are not nominal;
-- `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
-  far), `episode_steps`, `true_pose` (N, 3);
-- `travelled_m`, over ground in [t, t + 1); `closest_person_m`, the least true distance so far from
-  the body's edge to a person or forklift, as the crow flies, of the episodes of `set_episodes`:
-  inf if nobody is on the floor, and in others, where it is not measured;
-- `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
-- `final_obs`, with the mask `_final_obs`;
-- in the continuous action space, and behind a limiter (`env.limits`), `action`, the nearest of the
-  task's, and `action_residual`;
-- behind a limiter `limiter`, the rule that held: `restock.ingest.task.robot.RULES`.
+`docs/twin.md` lists what `info` holds.
 """
 
 from __future__ import annotations

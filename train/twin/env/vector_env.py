@@ -14,8 +14,8 @@ Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` i
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
 termination.
 
-`restock.train.twin.env.navigation` lists what `info` holds. `WarehouseEnv` is one warehouse as a
-plain Gymnasium environment, without autoreset.
+`docs/twin.md` lists what `info` holds. `WarehouseEnv` is one warehouse as a plain Gymnasium
+environment, without autoreset.
 """
 
 from __future__ import annotations

@@ -49,17 +49,15 @@ NEAR_M = 3.0  # places that are no further apart give short missions alone
 NEAREST_M = 0.5  # a way shorter than this is no mission
 
 
-@dataclass(frozen=True)
-class Places:
-    """Places (x, y) in the floor's frame, with notes for the user."""
-
-    places_m: tuple[tuple[float, float], ...] = ()
-    notes: list[str] = field(default_factory=list)
-
-
 def find_places(
-    free: Bools, reachable: Bools, cell_m: float, visited_m: F64, room_m: float, turn_m: float
-) -> Places:
+    free: Bools,
+    reachable: Bools,
+    cell_m: float,
+    visited_m: F64,
+    room_m: float,
+    turn_m: float,
+    notes: list[str],
+) -> tuple[tuple[float, float], ...]:
     """Choose start and goal places among those visited (N, 2), in the floor's frame.
 
     `free` and `reachable` (X, Y) are the floor's cells, `room_m` is what driving needs around a
@@ -71,7 +69,6 @@ def find_places(
     cells = cells[on]
     fits = reachable[tuple(cells.T)]
     wide = fits & (room[tuple(cells.T)] >= turn_m)
-    notes = []
     if len(visited_m) and fits.sum() < 0.9 * len(visited_m):
         notes.append(
             f"{1 - fits.sum() / len(visited_m):.0%} of the poses are nearer to obstacles than the"
@@ -93,8 +90,8 @@ def find_places(
             f"the robot was at {len(places) or 'no'} place{'s'[: not places]} with room to turn: "
             "missions start and end wherever there is room"
         )
-        return Places((), notes)
-    return Places(tuple(places), notes)
+        return ()
+    return tuple(places)
 
 
 def with_missions(
@@ -304,9 +301,7 @@ def floor_of_grid(
     )
     places: tuple[tuple[float, float], ...] = ()
     if visited_m is not None:
-        found = find_places(free, reachable, cell_m, grid.within(visited_m), room_m, turn_m)
-        places = found.places_m
-        notes += found.notes
+        places = find_places(free, reachable, cell_m, grid.within(visited_m), room_m, turn_m, notes)
     if visited_m is None:
         elsewhere = find_goals(free & reachable, cell_m, room_m=turn_m)
     else:

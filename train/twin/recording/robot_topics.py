@@ -88,16 +88,6 @@ class Scene:
     body_m: tuple[float, float, float]  # length, width, height of the robot
 
 
-EMPTY = Scene(
-    pallets=np.zeros((0, 3)),
-    patches=np.zeros((0, 5)),
-    traffic=np.zeros((1, 0, 3)),
-    perturbation=Perturbation(),
-    goal_radius_m=0.4,
-    body_m=(0.7, 0.5, 0.3),
-)
-
-
 @dataclass(frozen=True)
 class Drive:
     """A mission: true motion between the control ticks, and signals and actions at them.
@@ -116,7 +106,7 @@ class Drive:
     true_exposure: list[str]  # T
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
     plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
-    scene: Scene = EMPTY
+    scene: Scene
 
 
 @dataclass
