@@ -206,7 +206,6 @@ def test_a_schedule_of_several_fits_spans_what_all_identified(tmp_path: Path) ->
             noise={},
             segments=9,
             clusters=9,
-            condition_number=1.0,
         )
 
     fits = [one(0.9, True), one(0.96, False)]

@@ -9,7 +9,6 @@ at which they were fitted, which is the one training uses.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -119,7 +118,6 @@ def fit(
         ConfigError: no such recording, or the log identifies none of the parameters.
         StoreError: no rows, rows of several tasks, or too few segments of ordinary driving.
     """
-    begun = time.perf_counter()
     config, report = config or FitConfig(), on_progress or (lambda text: None)
     rng = np.random.Generator(np.random.PCG64(config.seed))
     task = store.task(config.task_hash)
@@ -157,10 +155,7 @@ def fit(
         noise=_deviations(fine, perturbation),
         segments=len(data.segments),
         clusters=uncertainty.clusters,
-        condition_number=uncertainty.condition_number,
         left_out=data.left_out,
-        replays=fine.replays + coarse.replays,
-        work_s=time.perf_counter() - begun,
     )
 
 

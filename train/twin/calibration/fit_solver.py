@@ -280,7 +280,6 @@ class ReplayResiduals:
         nthread: int = 1,
     ) -> None:
         self.segments, self.channels, self.nthread = segments, tuple(channels), nthread
-        self.replays = 0  # perturbations driven so far
         self._known: dict[Perturbation, dict[str, F64]] = {}
 
     def of(self, perturbations: Sequence[Perturbation]) -> dict[str, F64]:
@@ -319,7 +318,6 @@ class ReplayResiduals:
         if not new:
             return
         replayed = replay_segments(self.segments, new, nthread=self.nthread)
-        self.replays += len(new)
         residuals = channel_residuals(self.segments, replayed)
         for index, twin in enumerate(new):
             self._known[twin] = {name: residuals[name][index] for name in self.channels}

@@ -71,10 +71,7 @@ class FittedTwin:
     noise: dict[str, dict[str, Any]]  # channel -> unit, before, after: median deviations
     segments: int  # that were fitted
     clusters: int  # that uncertainty was drawn over
-    condition_number: float  # of the information matrix
     left_out: dict[str, int] = field(default_factory=dict)  # segments or steps, by reason
-    replays: int = 0
-    work_s: float = 0.0
 
     def describe(self) -> dict[str, Any]:
         """Return the fit as plain values for JSON."""
@@ -164,7 +161,6 @@ PROFILE_POINTS = 12
 CHI_SQUARE_95 = 3.84  # of one degree of freedom
 SLIDES_MPS = 0.05  # a wheel faster than this over the floor slides
 CONFOUNDED = 0.95  # correlation of two estimates
-ILL_CONDITIONED = 1e6  # condition number of the information
 
 
 @dataclass(frozen=True)
@@ -173,7 +169,6 @@ class Uncertainty:
 
     half: F64  # (n,) of the 95 % intervals; inf where the log says nothing
     correlation: F64  # (n, n) of the estimates
-    condition_number: float  # of the information, parameters in units of `Parameter.useful`
     clusters: int  # episodes, or segments where there are few episodes
 
 
@@ -204,9 +199,6 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
     whole = hessian.sum(axis=0)
     inside = (solution.z > 1e-9) & (solution.z < 1 - 1e-9)  # at an end the gradient may stay
     gradient = np.where(inside, gradient - gradient.mean(axis=0), gradient)
-    in_units = whole * np.outer(useful, useful)
-    eigenvalues = np.linalg.eigvalsh(in_units)
-    condition_number = float(eigenvalues[-1] / max(eigenvalues[0], 1e-300))
 
     # A parameter without any information would make every other infinite: a hair's breadth of it.
     ridge = np.diag(1e-6 / useful**2)
@@ -223,7 +215,6 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
     return Uncertainty(
         half=half,
         correlation=inverse / np.outer(deviation, deviation),
-        condition_number=condition_number,
         clusters=count,
     )
 
@@ -361,9 +352,4 @@ def fit_warnings(solution: FitSolution, uncertainty: Uncertainty) -> list[str]:
                 )
     if not solution.converged:
         lines.append("least squares had not converged: the intervals are too narrow")
-    if uncertainty.condition_number > ILL_CONDITIONED:
-        lines.append(
-            "ill-conditioned: the information's condition number is"
-            f" {uncertainty.condition_number:.1e}"
-        )
     return lines
