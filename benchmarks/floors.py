@@ -74,7 +74,7 @@ def drive(made: Surveyed, missions: int) -> Counter[str]:
     size = made.footprint
     body = Body(length_m=size.length_m, width_m=size.width_m)
     task = msgspec.structs.replace(load_profile("warehouse_amr").task, body=body)
-    env = WarehouseVectorEnv(missions, warehouse=made.floor, task=task, conditions={"nominal": 1.0})
+    env = WarehouseVectorEnv(missions, layouts=[made.floor], task=task, conditions={"nominal": 1.0})
     env.set_episodes([EpisodeSpec("nominal", seed) for seed in range(missions)])
     observation, _ = env.reset()
     driver, done, ends = PlannerFollower(epsilon=0.0), np.zeros(missions, np.bool_), Counter[str]()

@@ -41,7 +41,7 @@ from restock.train.twin.env import vector_env
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics import sensing
-from restock.train.twin.physics.robot_model import LIDAR_BEAMS
+from restock.train.twin.physics.robot_model import LIDAR_BEAMS, stand_in
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import Simulation
 
@@ -105,7 +105,8 @@ def with_beams(beams: int) -> Contestant:
     """Return the same with another lidar."""
     env = WarehouseVectorEnv(SCALED, seed=1)
     old = env.simulation
-    env.simulation = Simulation(SCALED, env.task, env.warehouse, old.timestep_s, 1, beams=beams)
+    robot = stand_in(env.task.body, beams)
+    env.simulation = Simulation(SCALED, env.task, env.floors[0], old.timestep_s, 1, robot=robot)
     env.sensing = Sensing(env.simulation, env.task)
     return Contestant(under_way(env), SCALED)
 
@@ -124,8 +125,9 @@ def ranging(switch: str, beams: int, boxes: int | None) -> Contestant:
     """Lidar ranges alone, of robots under way."""
     env = WarehouseVectorEnv(SCALED, seed=1)
     under_way(env)
-    floor = env.warehouse if boxes is None else in_pieces(env.warehouse, boxes)
-    sim = Simulation(SCALED, env.task, floor, env.simulation.timestep_s, 1, beams=beams)
+    floor = env.floors[0] if boxes is None else in_pieces(env.floors[0], boxes)
+    robot = stand_in(env.task.body, beams)
+    sim = Simulation(SCALED, env.task, floor, env.simulation.timestep_s, 1, robot=robot)
     sim.qpos[:] = env.simulation.qpos
     ids = np.arange(SCALED)
 

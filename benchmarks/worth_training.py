@@ -87,7 +87,7 @@ def fixed(per_cell: int) -> list[tuple[EpisodeSpec, str]]:
         seed = FIRST_SEED
         while len(count) < cells[kind] or min(count.values()) < per_cell:
             spec = EpisodeSpec(kind, seed)
-            cell = cell_of(draw_episode(spec, env.warehouse, env.navigation.planners[0]))
+            cell = cell_of(draw_episode(spec, env.floors[0], env.navigation.planners[0]))
             if count.get(cell, 0) < per_cell:
                 episodes.append((spec, cell))
             count[cell] = count.get(cell, 0) + 1

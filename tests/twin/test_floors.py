@@ -133,7 +133,7 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
     ("data", "message"),
     [
         pytest.param(b"P5\n4 4\n255\nab", "truncated", marks=SAYS_TRUNCATED),
-        (b"P5\n99999 99999\n255\n", "more than 40,000,000 pixels"),
+        (b"P5\n99999 99999\n255\n", "exceeds limit"),
         (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # by the header: no pixel follows
         (b"P2\n2 1\n9\n1 10", "too large"),
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
@@ -243,7 +243,7 @@ def test_a_block_in_an_aisle_that_runs_north_is_found() -> None:
     floor = generate(3)
     area = floor.segments[1].area
     assert floor.segments[1].along == "y"
-    finder = BlockFinder(floor, 1)
+    finder = BlockFinder([floor], 1)
     pose = np.array([[area.center[0], area.y_min + 0.2, np.pi / 2]])
     half = area.half_size[0] - 0.15
     across = np.linspace(-half, half, 9)
@@ -301,3 +301,30 @@ def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:
         assert floor.name == info["layout"][index] == env.floor_of(index).name
     with pytest.raises(ConfigError, match="is not among the environment's 4"):
         _drive(env, [EpisodeSpec("nominal", 1, layout="default")] * 64, 0)
+
+
+def test_the_profile_names_the_same_zones_as_the_warehouse() -> None:
+    zones = {zone.name: zone.box_m for zone in load_profile("warehouse_amr").zones}
+    built = default_warehouse().zones
+    assert zones.keys() == built.keys()
+    for name, rect in built.items():
+        edges = (rect.x_min, rect.y_min, rect.x_max, rect.y_max)
+        np.testing.assert_allclose(zones[name], edges, atol=1e-9, err_msg=name)
+
+
+def test_racks_fill_exactly_what_aisles_and_cross_aisles_leave() -> None:
+    floor = default_warehouse()
+    rng = np.random.default_rng(1)
+    for x, y in rng.uniform((0, 0), (floor.width_m, floor.depth_m), (400, 2)):
+        in_aisle = any(segment.area.contains(x, y) for segment in floor.segments)
+        in_cross = any(zone.contains(x, y) for _, zone in floor.cross_zones)
+        in_rack = any(rack.contains(x, y) for rack in floor.racks)
+        assert in_rack == (not in_aisle and not in_cross)
+
+
+def test_a_point_belongs_to_its_aisle_segment() -> None:
+    floor = default_warehouse()
+    middles = np.array([segment.area.center for segment in floor.segments])
+    segment = floor.segment_of(middles[:, 0], middles[:, 1])
+    assert segment.tolist() == list(range(len(floor.segments)))
+    assert floor.segment_of(np.array([1.1]), np.array([5.0]))[0] == -1  # in a cross-aisle

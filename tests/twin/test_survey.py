@@ -168,7 +168,7 @@ def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, capsys):
     driven = poses[:, :2] - floor.map_origin[:2]
     for place in floor.goals_m + floor.starts_m:
         assert np.hypot(*(driven - place).T).min() < 0.1
-    env = WarehouseVectorEnv(2, warehouse=floor, conditions={"nominal": 1.0})
+    env = WarehouseVectorEnv(2, layouts=[floor], conditions={"nominal": 1.0})
     env.set_episodes([EpisodeSpec("nominal", seed) for seed in range(2)])
     _, info = env.reset()
     driver, done = PlannerFollower(epsilon=0.0), np.zeros(2, np.bool_)

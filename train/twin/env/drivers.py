@@ -51,14 +51,6 @@ class BehaviourPolicy(Policy, Protocol):
     acting_version: NDArray[np.str_]  # (N,)
 
 
-class Overseer(BehaviourPolicy, Protocol):
-    """A policy that can take over, and knows when it is no longer needed."""
-
-    def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
-        """Return where (N,) it would not hand back yet."""
-        ...
-
-
 class SoftPolicy:
     """A policy that takes a random action with probability `epsilon`."""
 
@@ -139,7 +131,7 @@ class Handover:
 
     version = "1"
 
-    def __init__(self, planner: BehaviourPolicy, operator: Overseer) -> None:
+    def __init__(self, planner: BehaviourPolicy, operator: Operator) -> None:
         self.planner, self.operator = planner, operator
         self.name = f"{planner.name}+{operator.name}"
         self.acting = np.array([], "U16")

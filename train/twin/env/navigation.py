@@ -68,12 +68,12 @@ class BlockFinder(Stateful):
     Within the aisle segment ahead, lidar returns that are neither rack nor wall are gathered up
     to `reach_m` away. If no free gap across the aisle is as wide as `passable_m`, and that is so
     for `persistence` steps at the same place, the aisle is blocked there. Robots may be on several
-    floors: `floor` (N,) says on which of `warehouses` each is.
+    floors: `floor` (N,) says on which of `floors` each is.
     """
 
     STATE = ("seen", "place")
 
-    warehouses: Warehouse | Sequence[Warehouse]
+    floors: Sequence[Warehouse]
     num: int
     reach_m: float = 2.0
     passable_m: float = 0.6
@@ -83,8 +83,6 @@ class BlockFinder(Stateful):
         self.seen = np.zeros(self.num, np.int64)  # steps in a row
         self.place = np.full((self.num, 2), -1, np.int64)  # of the last sighting: a closure
         self.floor = np.zeros(self.num, np.int64)
-        floors = self.warehouses
-        self.floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
 
     def reset(self, ids: Ints) -> None:
         self.seen[ids] = 0
@@ -97,15 +95,14 @@ class BlockFinder(Stateful):
         hits_m: F64,
         valid: Bools,
         heading: F64,
-        along_y: Bools | None = None,
+        turned: Bools,
     ) -> list[tuple[int, Closure]]:
         """Look at one scan of each robot in `ids`; returns (robot, closure) of each block.
 
         `pose` (n, 3) is localised, `hits_m` (n, B, 2) are the returns in the map frame, `valid`
         (n, B) which of them are returns, `heading` (n,) the sign of the way along x, or along y
-        where `along_y` (n,) says that it mostly runs that way.
+        where it mostly runs that way (`turned`, (n,)).
         """
-        turned = np.zeros(len(ids), np.bool_) if along_y is None else along_y
         segment, edges = self._segments_ahead(ids, pose, heading, turned)
         x, y, here = hits_m[..., 0], hits_m[..., 1], pose[:, :1]
         if turned.any():

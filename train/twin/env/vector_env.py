@@ -169,7 +169,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         render_mode: str | None = None,
         task: Task | None = None,
         robot: Robot | None = None,
-        warehouse: Warehouse | None = None,
         layouts: str | Sequence[Warehouse | str] = DEFAULT,
         missions: Sequence[MissionOrder] = (),
         missions_share: float = 0.5,
@@ -187,7 +186,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
 
         `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
         `generated:train`: an episode whose spec names none of them is on one that its seed draws.
-        `warehouse` is the one floor, in their place.
 
         `nav_command`: the navigation stack's proposal is among the signals, as on a robot whose
         profile has that input; where the task has no route it is unknown in any case.
@@ -208,7 +206,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.task = task or load_profile("warehouse_amr").task
-        self.floors = open_floors(layouts) if warehouse is None else (warehouse,)
+        self.floors = open_floors(layouts)
         self.layout_names = np.array([floor.name for floor in self.floors])
         self.floor_objects = np.empty(len(self.floors), object)
         self.floor_objects[:] = self.floors
@@ -267,11 +265,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.perturbation_values = np.full(num_envs, "{}", object)  # JSON, what is not nominal
 
     # -- floors ---------------------------------------------------------------------------------
-
-    @property
-    def warehouse(self) -> Warehouse:
-        """Return the floor, or the first of several."""
-        return self.floors[0]
 
     def floor_of(self, env: int) -> Warehouse:
         """Return the floor that an environment's episode is on."""

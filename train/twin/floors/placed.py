@@ -99,11 +99,11 @@ def logged_drives(
             connection.execute(query, [recording, count // ROWS + 1]).fetchnumpy().values()
         )
         poses = np.column_stack([x, y, yaw]).astype(np.float64)
-        if task is None or not task.lidar:
-            drives[recording] = Drive(_known(poses)[:, :2], np.empty((0, 2)))
-        else:
+        if task is not None and seen:
             clearance_m = clearances_of(task, np.stack(list(seen[0])))
             drives[recording] = drive_of(task, poses, clearance_m)
+        else:
+            drives[recording] = Drive(_known(poses)[:, :2], np.empty((0, 2)))
     return drives
 
 

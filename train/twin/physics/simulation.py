@@ -32,7 +32,6 @@ from restock.train.twin.physics.model import Handles, build_model, yaw_of
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
 from restock.train.twin.physics.robot_model import (
     FLOOR_FRICTION,
-    LIDAR_BEAMS,
     FloorFriction,
     RobotModel,
     stand_in,
@@ -269,13 +268,11 @@ class BodyState:
     y_m: F64
     yaw_rad: F64
     speed_mps: F64  # (N,) over ground, forward
-    lateral_mps: F64  # (N,) over ground, to the left
     yaw_rate_radps: F64
     wheel_angle_rad: F64  # (N, 2) left, right
     wheel_speed_radps: F64  # (N, 2)
     accel_mps2: F64  # (N, 3) of the accelerometer, mean since the call before
     bumped: Bools  # (N,) at any substep since the call before
-    set_point: F64  # (N, 2) speed and yaw rate that the wheels are to reach now
 
 
 class Simulation(Stateful):
@@ -304,16 +301,15 @@ class Simulation(Stateful):
         timestep_s: float,
         nthread: int,
         *,
-        beams: int = LIDAR_BEAMS,
         robot: RobotModel | None = None,
     ) -> None:
         """Build N warehouses; with several `floors`, `reset` chooses the one of each episode.
 
-        Without a `robot` it is the stand-in, with so many `beams`.
+        Without a `robot` it is the stand-in.
         """
         floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
         self.num_envs, self.task = num_envs, task
-        self.robot = robot = robot or stand_in(task.body, beams)
+        self.robot = robot = robot or stand_in(task.body)
         self.beams = len(robot.bearings_rad)
         self.timestep_s = timestep_s
         self.blocks, self.block_s = blocks_of(task, timestep_s)
@@ -456,21 +452,18 @@ class Simulation(Stateful):
     def body_state(self, accel: F64, pressed: Bools) -> BodyState:
         """Return the true state now."""
         pose = self.pose()
-        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        vx, vy = self.qvel[:, 0], self.qvel[:, 1]
+        ahead = np.cos(pose[:, 2]) * self.qvel[:, 0] + np.sin(pose[:, 2]) * self.qvel[:, 1]
         return BodyState(
             time_s=self.time_s.copy(),
             x_m=pose[:, 0],
             y_m=pose[:, 1],
             yaw_rad=pose[:, 2],
-            speed_mps=cos * vx + sin * vy,
-            lateral_mps=-sin * vx + cos * vy,
+            speed_mps=ahead,
             yaw_rate_radps=self.qvel[:, 5].copy(),
             wheel_angle_rad=self.robot.by_side(self.qpos[:, self._wheel_qpos]).copy(),
             wheel_speed_radps=self.wheel_speeds().copy(),
             accel_mps2=accel,
             bumped=pressed,
-            set_point=self.controller.set_point.copy(),
         )
 
     def pose(self, ids: Ints | slice = slice(None)) -> F64:

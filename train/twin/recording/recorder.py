@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import islice, pairwise
@@ -28,7 +28,6 @@ from restock.train.twin.env.episode_queue import MissionOrders
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
-from restock.train.twin.floors.planner import Planner
 from restock.train.twin.missions import NATURAL
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, TRACK_M, WHEEL_RADIUS_M
@@ -266,7 +265,12 @@ def record(
     missions: OrderedMissions | Iterator[Mission]
     if isinstance(plan.missions, MissionsFile):
         missions = OrderedMissions(
-            ordered(plan, fleet.env.floors, fleet.env.navigation.planners),
+            MissionOrders(
+                plan.orders(),
+                fleet.env.floors,
+                fleet.env.navigation.planners,
+                where="the missions file",
+            ),
             plan.missions,
             plan.seed,
             driver,
@@ -311,17 +315,6 @@ def record(
                 break
     summary.work_s = time.perf_counter() - begun
     return summary
-
-
-def ordered(
-    plan: RecordingPlan, floors: Sequence[Warehouse], planners: Sequence[Planner]
-) -> MissionOrders:
-    """Return the missions of a plan's file, on these floors.
-
-    Raises:
-        ConfigError: one that the twin, or one of the floors, cannot hold.
-    """
-    return MissionOrders(plan.orders(), floors, planners, where="the missions file")
 
 
 def _drive(

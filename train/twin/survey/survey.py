@@ -192,11 +192,11 @@ def _grid(
     usable = [scans for scans in evidence.scans if len(scans) >= MIN_SCANS]
     if usable:
         half_m = MIN_BODY_M / 2 if body is None else body.width_m / 2
-        made = _scanned(usable, poses, half_m + MARGIN_M)
-        if made.agree >= AGREEING or by == "scans":
-            notes += made.notes
-            return "scans", made.grid, f"{made.source}, by {poses.source}"
-        notes.append(f"{made.notes[-1]}: no map was made from them")
+        grid, agree, source, said = _scanned(usable, poses, half_m + MARGIN_M)
+        if agree >= AGREEING or by == "scans":
+            notes += said
+            return "scans", grid, f"{source}, by {poses.source}"
+        notes.append(f"{said[-1]}: no map was made from them")
     elif by == "scans":
         raise RecordingError(
             "contains no scans that can be used: no LaserScan, or no poses at their times",
@@ -209,30 +209,25 @@ def _grid(
     return "corridor", driven_corridor(poses, turn_m), f"the path driven, by {poses.source}"
 
 
-@dataclass(frozen=True)
-class _Scanned:
-    """A map of scans placed by one clock."""
+def _scanned(
+    usable: list[PlacedScans], poses: Poses, room_m: float
+) -> tuple[OccupancyGrid, float, str, list[str]]:
+    """Map the scans by header stamps, or by log time if they agree better so.
 
-    grid: OccupancyGrid
-    agree: float
-    source: str
-    notes: list[str]
-
-
-def _scanned(usable: list[PlacedScans], poses: Poses, room_m: float) -> _Scanned:
-    """Map the scans by header stamps, or by log time if they agree better so."""
-    best: _Scanned | None = None
+    Returns the map, the share of the scans' ends that agree on it, their source, and notes.
+    """
+    best: tuple[OccupancyGrid, float, str, list[str]] | None = None
     for scans in usable:
-        said = list(scans.notes)
-        grid, agree = scan_map(scans, poses.places_m, room_m, poses.frame, said)
-        said.append(
+        notes = list(scans.notes)
+        grid, agree = scan_map(scans, poses.places_m, room_m, poses.frame, notes)
+        notes.append(
             f"{len(scans):,} {scans.source} were used, and {agree:.0%} of their ends are within a "
             "cell of a wall of the combined map"
             + ("" if agree >= AGREEING else ": poses or clocks are off, do not trust it")
         )
-        if best is None or agree > best.agree + CLOCKS_APART:
-            best = _Scanned(grid, agree, scans.source, said)
-        if best.agree >= WELL_AGREEING:
+        if best is None or agree > best[1] + CLOCKS_APART:
+            best = grid, agree, scans.source, notes
+        if best[1] >= WELL_AGREEING:
             break
     assert best is not None
     return best

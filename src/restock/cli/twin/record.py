@@ -79,6 +79,7 @@ class RecordCommand:
         from restock.files import expect_place
         from restock.ingest.profile.tag_rules import parse_tags
         from restock.replay.fleet.missions_file import MissionsFile
+        from restock.train.twin.env.episode_queue import MissionOrders
         from restock.train.twin.floors.floors import open_floors
         from restock.train.twin.floors.planner import planners
         from restock.train.twin.missions import NATURAL
@@ -91,7 +92,6 @@ class RecordCommand:
             HARDWARE,
             NOISELESS,
             RecordingPlan,
-            ordered,
             parse_rates,
             parse_start,
             record,
@@ -123,7 +123,7 @@ class RecordCommand:
         if isinstance(plan.missions, MissionsFile):
             if self.conditions is not None:
                 raise RestockError("--conditions and a missions file cannot be combined")
-            ordered(plan, floors, planners(floors))
+            MissionOrders(plan.orders(), floors, planners(floors), where="the missions file")
         refuse_existing(self.out)
         expect_place(self.out, RecordingError)
         if self.dry_run:
