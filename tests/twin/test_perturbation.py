@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from support.driven_robot import Drive, columns
 from support.paths import ROOT
 
@@ -15,6 +16,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import steps_of
 from restock.ingest.task.schema import Perturbed, parse_perturbation
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import (
     RANGES,
@@ -22,6 +24,8 @@ from restock.train.twin.physics.perturbation import (
     Schedule,
     find_perturbation,
 )
+from restock.train.twin.physics.sensing import DRIFT_TIME_S, Sensing
+from restock.train.twin.physics.simulation import Simulation
 
 PAGE = ROOT / "docs" / "twin.md"
 
@@ -106,14 +110,23 @@ def test_a_bias_moves_its_signal_and_no_other(field, bias, signal, shift):
         assert other == signal or biased[other] == plain[other]
 
 
-def test_info_says_what_is_in_force_in_each_environment() -> None:
-    env = WarehouseVectorEnv(2, perturbation=Schedule(ranges={"payload_kg": (10, 60)}))
-    env.reset(seed=1)
-    info = env.step(np.array([1, 1]))[4]
-    assert info["perturbation"].tolist() == ["schedule"] * 2
-    values = [json.loads(text) for text in info["perturbation_values"]]
-    assert values == [spec.perturbation.changed() for spec in env.specs if spec.perturbation]
-    assert values[0] != values[1]
+def test_localisation_drifts_as_an_autoregressive_walk() -> None:
+    task = load_profile("warehouse_amr").task
+    sensing = Sensing(Simulation(4, task, default_warehouse(), 0.01, nthread=1), task)
+    keep = np.exp(-task.control_period_s / DRIFT_TIME_S)
+    walks = []
+    for env in range(4):
+        sensing.reset(env, np.random.SeedSequence(env), Perturbation())
+        sensing._draw(env, task.time_limit_steps)
+        walk = sensing._noise[env, :, 3:5]
+        drawn = np.random.Generator(np.random.SFC64(np.random.SeedSequence(env))).standard_normal(
+            dtype=np.float32, size=sensing._noise[env].shape
+        )[:, 3:5]
+        drawn[1:] *= np.sqrt(1 - keep**2)
+        drawn[:] = lfilter([1.0], [1.0, -keep], drawn, axis=0)
+        assert np.array_equal(walk, drawn)  # to the bit: episodes of earlier runs stay as they were
+        walks.append(walk)
+    assert 0.5 < np.var(walks) < 1.5
 
 
 # -- in recordings and stores -----------------------------------------------------------------

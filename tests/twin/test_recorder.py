@@ -99,6 +99,7 @@ def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["--policy", "onnx:nowhere.onnx"], "nowhere.onnx: no such file"),
         (["--policy", "random", "--epsilon", ".1"], "random already takes every action"),
         (["--layouts", "moon"], "moon"),
+        (["--out", "drive.txt"], "ends in .mcap"),
     ],
 )
 def test_a_wrong_value_is_one_clear_message(flags, message, tmp_path, capsys):
@@ -110,19 +111,14 @@ def test_a_wrong_value_is_one_clear_message(flags, message, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(tmp_path, capsys):
-    words = ["twin", "record", "--out", str(tmp_path / "drive.txt"), "--minutes", "0.01"]
-    assert cli.main(words) == ExitCode.USAGE
-    assert "ends in .mcap" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-    dated = str(tmp_path / "drive.2026-10-05")  # a folder's
+def test_a_dated_name_is_a_folders(tmp_path: Path) -> None:
+    dated = str(tmp_path / "drive.2026-10-05")
     assert cli.main(["twin", "record", "--out", dated, "--dry-run"]) == ExitCode.OK
 
 
-def test_a_recording_is_never_overwritten(tmp_path, capsys):
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "log.mcap").write_text("precious")
     assert cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap")]) == ExitCode.USAGE
-    assert "never overwritten" in capsys.readouterr().err
     assert (tmp_path / "log.mcap").read_text() == "precious"
 
 

@@ -2,13 +2,16 @@
 
 import hashlib
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.paths import ROOT
 
 from restock.errors import ConfigError
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import (
     Profile,
     load_profile,
@@ -16,8 +19,11 @@ from restock.ingest.profile.profile import (
     profile_toml,
     read_profile_toml,
 )
+from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.robot import Lidar, Robot
 from restock.ingest.task.task import Body, Task
+from restock.replay.store.store import Store
+from restock.train.twin.calibration.logged_steps import robot_of_store
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Warehouse, default_warehouse
@@ -248,3 +254,16 @@ def room_m(episode: Episode, floor: Warehouse, outline_m: NDArray[np.float64]) -
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     points = (outline_m @ turn + (x, y)).T[:, None]
     return float(near_gap(floor, np.empty((1, 0, 4)), *points, np.inf).min())
+
+
+def test_a_changed_robot_reaches_the_store_without_reading_again(tmp_path: Path) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    kept = []
+    for table in ("", "\n[robot]\nmass_kg = 40.0\n", "\n[robot]\nmass_kg = 45.0\n"):
+        profile = amr_with(table)
+        outcome = ingest(ROOT / "sample_logs" / "amr_tuesday", profile, store=writer)
+        with Store(tmp_path / "store") as store:
+            robot = robot_of_store(store, profile.task.hash)
+        kept.append((outcome.status, robot.mass_kg if robot else None))
+    assert kept[0][1] is None
+    assert kept[1:] == [("tagged", 40.0), ("tagged", 45.0)]

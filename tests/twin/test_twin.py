@@ -1,5 +1,6 @@
 """The twin's environments: Gymnasium's rules, determinism, state, and the contract."""
 
+import json
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -289,6 +290,8 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
     assert set(info["perturbation"]) == {"fleet"}
     drawn = [spec.perturbation for spec in made.specs]
     loads = [item.payload_kg for item in drawn if item is not None]
+    values = [json.loads(text) for text in info["perturbation_values"]]
+    assert values == [item.changed() for item in drawn if item is not None]
     assert len(set(loads)) == 8
     assert 0 <= min(loads) <= max(loads) <= 50
     again = WarehouseVectorEnv(8, perturbation=schedule)
