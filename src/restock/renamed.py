@@ -72,6 +72,7 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "sql --run": "give the run after the store: restock sql STORE RUN QUERY",
     "coverage --every": "`restock coverage drift STORE --every month` prints other periods",
     "coverage --figures": "print the page, or query the store for a figure of your own",
+    "compare --page": "`restock report FOLDER` writes the page of several runs",
     "report --figures": "print the page, or query the run for a figure of your own",
     "demo --logs": "`restock start BAGS --out DIR` takes recordings of your own",
     "demo --profile": "`restock start BAGS --out DIR` takes recordings of your own",

@@ -27,26 +27,6 @@ def read(page: Path) -> Page:
     return found
 
 
-def arms(tmp_path: Path, success: tuple[float, float], **changes: Any) -> tuple[list[str], ...]:
-    both = (("plain", success[0], {}), ("dueling", success[1], changes))
-    return tuple(
-        [
-            str(make_run(tmp_path / f"{name}-{seed}", document(seed, **other), success=wins))
-            for seed in range(3)
-        ]
-        for name, wins, other in both
-    )
-
-
-def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
-    plain, other = arms(tmp_path, (0.2, 0.7), config__replay__batch_size=7)
-    page = tmp_path / "page.html"
-    assert main(["compare", *plain, "--against", *other, "--page", str(page)]) == 1
-    found = read(page)
-    assert "the runs differ in config.replay.batch_size" in found.text
-    assert "Probability that" not in found.text
-
-
 def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
     ends = {"success nominal": [0.9, 0.8, 1.1], "success wheel_slip": [0.5, None, None]}
     comparison = {

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from restock.report.history import history_page as history_page
     from restock.report.look.write import write_page as write_page
     from restock.report.run.card import write_card as write_card
-    from restock.report.run.comparison import comparison_page as comparison_page
     from restock.report.run.comparison import gate_page as gate_page
     from restock.report.run.comparison import gate_section as gate_section
     from restock.report.run.comparison import outcome_sections as outcome_sections

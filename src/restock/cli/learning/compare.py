@@ -40,8 +40,6 @@ class CompareCommand:
     """The runs of the second method."""
     treatment: Literal["algorithm", "target", "mixture", "practice", "data", "method"] = "algorithm"
     """The treatment: what is compared, and therefore may differ."""
-    page: Path | None = None
-    """Write an HTML page that opens without a network. Replaces an existing file."""
     json: bool = False
     """Print the verdict, the differences, the checks and the outcomes as JSON."""
 
@@ -64,33 +62,11 @@ class CompareCommand:
                 )
             first, second = first[:1], first[1:]
         comparison = compare(first, second, treatment=self.treatment)
-        if self.page is not None:
-            say(f"wrote {_write(comparison, first, second, self.page)}")
         if self.json:
             print_json(comparison.as_json())
         else:
             _show(comparison, _names(first, second))
         return int(ExitCode.OK if comparison.verdict == "comparable" else ExitCode.FAILED)
-
-
-def _write(
-    comparison: Comparison, first: Sequence[Path], second: Sequence[Path], out: Path
-) -> Path:
-    """Write the page, with the curves and costs that the comparison itself does not need."""
-    from restock.report import comparison_page, write_page
-    from restock.train.study.contrasts import learning_curves, training_cost
-
-    names = _names(first, second)
-    arms = dict(zip(names, (first, second), strict=True))
-    found = {
-        **comparison.as_json(),
-        "names": names,
-        "sentence": comparison.sentence,
-        "curves": learning_curves(arms),
-        "cost": training_cost(arms),
-        "runs": {name: [str(path) for path in paths] for name, paths in arms.items()},
-    }
-    return write_page(comparison_page(plain(found)), out)
 
 
 def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:

@@ -1,7 +1,4 @@
-"""The pages about methods side by side: a comparison, a study with its contrast and arms, a gate.
-
-Of a comparison the gate's verdicts come first.
-"""
+"""The pages about methods side by side, a study and a gate, and the tables of a comparison."""
 
 from __future__ import annotations
 
@@ -32,46 +29,14 @@ from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 MAX_SETTINGS = 4  # differing settings that are named in a line
 FREE_KINDS = ("free", "software")
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
-_KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
+_VERDICTS = {
+    "inconclusive": "Gate refused: inconclusive",
+    "incomparable": "Gate refused: not comparable",
+}
 _INTERVALS = (
     "Intervals are 95 %, over seeds and episodes; with fewer than three seeds or ten episodes, "
     "only values are shown."
 )
-
-
-def comparison_page(found: dict[str, Any]) -> dict[str, Any]:
-    """Return everything that the page's template needs.
-
-    Args:
-        found: a comparison's JSON values with `names` of both arms, the gate's `sentence`,
-            `curves`, `cost` and the `runs` of each name.
-    """
-    first, second = found["names"]
-    sections = [
-        *outcome_sections(found, first, second),
-        curves_section(found["curves"], [first, second]),
-        gate_section(found, first, second),
-        _runs_section(found["runs"]),
-    ]
-    return {
-        "kicker": "comparison",
-        "title": f"{second} against {first}",
-        "verdict": verdict(found),
-        "headline": headline(found, first, second),
-        "lead": f"{found['sentence']}." if found["verdict"] == "comparable" else "",  # or headline
-        "cards": cost_cards(found["cost"]),
-        "sections": sections,
-    }
-
-
-def verdict(found: dict[str, Any]) -> dict[str, str]:
-    """Return the gate's verdict, as the page's first words."""
-    words_of = {
-        "comparable": "gate passed: comparable",
-        "inconclusive": "gate refused: inconclusive",
-        "incomparable": "gate refused: not comparable",
-    }
-    return {"kind": _KINDS[found["verdict"]], "text": words_of[found["verdict"]]}
 
 
 def headline(found: dict[str, Any], first: str, second: str) -> str:
@@ -109,7 +74,7 @@ def outcome_sections(
     """Return the outcomes, or why there are none."""
     title, treatment = f"{second} against {first}", _treatment(found)
     if found["verdict"] != "comparable":
-        text = f"{verdict(found)['text'].capitalize()}: {found['why']}."
+        text = f"{_VERDICTS[found['verdict']]}: {found['why']}."
         return [Section(f"{prefix}outcomes", title, intro=treatment, callout=text)]
     rows = found["outcomes"]
     if not rows:
@@ -290,11 +255,6 @@ def cost_cards(rows: Rows) -> list[dict[str, str]]:
                 }
             )
     return cards
-
-
-def _runs_section(runs: dict[str, list[str]]) -> Section:
-    rows = [{"method": name, "run": path} for name, paths in runs.items() for path in paths]
-    return Section("runs", "Which runs", tables=[Table(rows)])
 
 
 SAFETY = {
