@@ -86,7 +86,6 @@ def _kind_of(place: str) -> str:
     return "run" if (Path(place) / RUN_CONFIG).is_file() else "store"
 
 
-SHOWN = 12  # rows of a table on a terminal; --json has all
 _RECORDINGS = {
     **{"change": "change", "source_file": "recording", "episodes": "episodes", "rows": "rows"},
     "rows_relabelled": "relabelled",
@@ -253,11 +252,7 @@ def _print_labels(labels: dict[str, Any]) -> None:
 
 
 def section(title: str, rows: list[dict[str, Any]]) -> None:
-    """Print a table, cut on a terminal, with a note of what was left out."""
-    if not rows:
-        return
-    shown = rows[:SHOWN] if sys.stdout.isatty() else rows
-    output.print_text()
-    output.print_table(shown, title=title)
-    if len(shown) < len(rows):
-        output.print_text(f"… {len(rows) - len(shown):,} more: --json has all")
+    """Print a table after an empty line; nothing if it has no rows."""
+    if rows:
+        output.print_text()
+        output.print_table(rows, title=title)

@@ -235,11 +235,6 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
             longest = f"; {row['ess_steps']} steps would be few enough" if row["ess_steps"] else ""
             say(f"{row['measure']}: pdwis is refused: {row['refused']}{longest}")
-    if any(row["estimator"] == "fqe" for row in result.rows):
-        say(
-            "fqe is the value of the starts by the fitted model: it has no interval, as the error "
-            "of the model cannot be measured on these logs"
-        )
     estimated = result.rows[0]["estimated_share"] if result.rows else 0.0
     if estimated:
         say(

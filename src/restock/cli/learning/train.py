@@ -268,12 +268,8 @@ def _print(
     )
 
 
-_OF_LOGS = ("policies", "successes", "offline_updates")  # of a teacher's settings
-
-
 def describe_run(prepared: Prepared) -> str:
     """Describe the run, and what not to expect of it, in a line each."""
-    from restock.toml import changed
     from restock.train.dqn.config import PLANNER
     from restock.train.twin.floors.floors import open_floors
     from restock.train.twin.physics.episode import sealed
@@ -303,12 +299,6 @@ def describe_run(prepared: Prepared) -> str:
             "teacher planner: the policy does what navigation proposes, except where Q is more than"
             f" {config.teacher.margin:g} better for another action"
         )
-    if panel is None and config.teacher.asks:
-        resolved = {"successes": False, "offline_updates": config.schedule.offline_updates}
-        lines += [
-            f"teacher.{key} has no effect: there is no panel"
-            for key in changed(config.teacher, _OF_LOGS, **resolved)
-        ]
     if config.evaluation.off_policy and (panel is None or not panel.splits):
         has = "there is no panel" if panel is None else "the panel holds out no rows"
         lines.append(

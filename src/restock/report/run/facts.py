@@ -12,7 +12,6 @@ import numpy as np
 from restock.errors import RestockError, RunError
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
-from restock.replay.plan.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.look.blocks import Rows, ask, rows_of, statements, words
 from restock.train.run.kept_evaluations import (
@@ -77,10 +76,6 @@ class Facts:
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
     # Comparison runs, keyed as `headline` expects.
     compared: dict[str, Rows] = field(default_factory=dict)
-
-    @property
-    def strata(self) -> list[Stratum]:
-        return [] if self.panel is None else list(self.panel.strata)
 
     @property
     def target_rule(self) -> str:

@@ -126,26 +126,15 @@ def fed_table(facts: Facts) -> Table:
 
 def source_table(facts: Facts) -> Table:
     """Show the rows of each source by stratum, also after weights."""
-    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
-    wanted = {stratum.name: stratum.wanted_share for stratum in facts.strata}
-    rows = []
-    for row in facts.sampled:
-        of_panel, available = row["source"] != "fresh", row["available_rows"]
-        wanted_share = wanted.get(row["stratum"], row["quota_share"])
-        rows.append(
-            {
-                **row,
-                "natural_share": natural.get(row["stratum"], row["available_share"])
-                if of_panel
-                else row["available_share"],
-                "wanted_share": wanted_share if of_panel else None,
-                "replays": f"{row['drawn_rows'] / available:.1f}" if available else "",
-            }
-        )
+    rows = [
+        row | {"replays": f"{row['drawn_rows'] / there:.1f}" if there else ""}
+        for row in facts.sampled
+        for there in [row["available_rows"]]
+    ]
     columns = {
         **{name: name for name in ("source", "stratum", "timing")},
-        **{"available_rows": "available", "natural_share": "natural", "wanted_share": "wanted"},
-        **{"drawn_share": "drawn", "effective_share": "after weights", "drawn_rows": "rows drawn"},
+        **{"available_rows": "available", "drawn_share": "drawn"},
+        **{"effective_share": "after weights", "drawn_rows": "rows drawn"},
         **{"replays": "replays per row", "reward_mean": "mean reward"},
         "terminal_share": "terminal",
     }

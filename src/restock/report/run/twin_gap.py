@@ -185,9 +185,12 @@ def _positions(rows: Rows) -> Drawing:
 
 
 def _steps_section(gap: TwinGap) -> Section:
-    """Show the gap of one step: reward by term, observation by component."""
-    twins = list(gap.about["twins"])
-    gaps = _by_source(gap.rewards, "mean_gap", "condition", "term")
+    """Show the gap of the reward of one step, by term."""
+    last = list(gap.about["twins"])[-1]
+    gaps: dict[tuple[str, str], dict[str, str]] = {}  # by source
+    for row in gap.rewards:
+        of_term = gaps.setdefault((row["condition"], row["term"]), {})
+        of_term[source_name(row["source"])] = number(row["mean_gap"])
     moves = {(row["condition"], row["term"]) for row in gap.rewards if row["mean_gap"]}
     rewards = [
         {
@@ -198,54 +201,20 @@ def _steps_section(gap: TwinGap) -> Section:
             **gaps[row["condition"], row["term"]],
         }
         for row in gap.rewards
-        if row["source"] == twins[-1]
+        if row["source"] == last
         and (row["term"] == "reward" or (row["condition"], row["term"]) in moves)
     ]
     return Section(
         "one-step",
-        "One step from each logged state",
+        "Reward of one step from each logged state",
         intro="The twin starts from the logged state and drives the logged action for one control "
-        "period; the task's own functions compute observation and reward. Mean absolute "
-        "differences; persistence is the error of predicting that nothing changes.",
+        "period; the task's own functions compute the reward. Mean absolute differences;"
+        " persistence is the error of predicting that nothing changes. observations.parquet has"
+        " the same of each component of the observation.",
         tables=[
-            Table(
-                rewards,
-                title="Reward, by term",
-                caption="Terms that are the same on both sides everywhere are left out.",
-            ),
-            Table(
-                _observations(gap),
-                title="Observation, by component, in nominal driving",
-                caption="As the policy sees them, scaled to about -1 to 1. The sectors of a lidar "
-                "are shown together; observations.parquet has each component and condition.",
-            ),
+            Table(rewards, caption="Terms that are the same on both sides everywhere are left out.")
         ],
     )
-
-
-def _by_source(rows: Rows, value: str, *keys: str) -> dict[tuple[Any, ...], dict[str, str]]:
-    """Map values of the keys to the name of a source and its value."""
-    cells: dict[tuple[Any, ...], dict[str, str]] = {}
-    for row in rows:
-        key = tuple(row[name] for name in keys)
-        cells.setdefault(key, {})[source_name(row["source"])] = number(row[value])
-    return cells
-
-
-def _observations(gap: TwinGap) -> Rows:
-    """Show observation gaps in nominal driving, lidar sectors averaged."""
-    sums: dict[str, dict[str, list[float]]] = {}
-    for row in gap.observations:
-        if row["condition"] == "nominal" and row["mean_gap"] is not None:
-            name = row["component"]
-            for lidar in ("clearance_", "closing_"):
-                name = f"{lidar[:-1]} (all sectors)" if name.startswith(lidar) else name
-            sums.setdefault(name, {}).setdefault(row["source"], []).append(row["mean_gap"])
-    return [
-        {"component": words(name)}
-        | {source_name(source): f"{sum(values) / len(values):.4f}" for source, values in by.items()}
-        for name, by in sums.items()
-    ]
 
 
 def _interval(interval: ConfidenceInterval, unit: str) -> str:
