@@ -97,20 +97,10 @@ def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, capsys):
     assert commands[2] == f"$ restock profile check {out / 'profile.toml'} {recording}"
     assert commands[-1] == f"$ restock report {out / 'run'}"
     assert not out.exists()
-
-
-def test_a_dry_run_refuses_what_the_run_would(tmp_path, capsys):
-    recording = str(write_bag(Drive(), tmp_path / "drive"))
-    (tmp_path / "precious").mkdir()
-    (tmp_path / "precious" / "thesis.tex").touch()
-    for bags, out, said in (
-        (str(tmp_path / "nowhere"), "out", "no such file or folder"),
-        (recording, "precious", "was not made by `restock start`"),
-    ):
-        assert cli.main(["start", bags, "--out", str(tmp_path / out), "--dry-run"]) == 2
-        printed = capsys.readouterr()
-        assert said in printed.err
-        assert printed.out == ""
+    out.mkdir()
+    (out / "thesis.tex").touch()  # what the run would refuse
+    assert cli.main(["start", str(bags), "--out", str(out), "--dry-run"]) == 2
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("fails", one_in(3, ["eval", "ways", "judge"]))

@@ -81,7 +81,11 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
         _weeks(found["weeks"], in_words, once),
         _robots(found["robots"]),
         _map(found, colours),
-        *_drift(drift),
+        *(
+            [Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")]
+            if isinstance(drift, str)
+            else drift_sections(drift)
+        ),
     ]
     robots = {row["robot"] for row in found["robots"]}
     numbers = {
@@ -330,12 +334,6 @@ def _map(found: dict[str, Rows], colours: dict[str, str]) -> Section | None:
         ],
         two=True,
     )
-
-
-def _drift(drift: Drift | str) -> list[Section | None]:
-    if isinstance(drift, str):
-        return [Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")]
-    return drift_sections(drift)
 
 
 MAX_GAPS = 20  # in the table
