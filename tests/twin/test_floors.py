@@ -237,6 +237,10 @@ def test_one_way_rules_turn_the_plan_but_shut_nobody_in() -> None:
     middle = (lane.x_min + 0.6, lane.center[1])
     out = ruled.plan(*middle, (lane.x_max + 1.0, lane.center[1]), [(2, 5)])
     assert out[:, 0].min() < lane.x_min
+    shut = np.array([[lane.x_max - 0.5, lane.center[1], 0.0]])  # a box across the lane
+    seen = ruled.plan_around(*middle, (lane.x_max + 1.0, lane.center[1]), shut, (0.2, 1.0))
+    assert seen is not None
+    assert seen[:, 0].min() < lane.x_min
 
 
 def test_a_block_in_an_aisle_that_runs_north_is_found() -> None:

@@ -16,11 +16,9 @@ from restock.replay.store.store import Store
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
 from restock.train.twin.calibration.open_loop import (
     POSE,
-    SENSED,
     OpenLoopStart,
     drive_open_loop,
     log_segments,
-    replay_segments,
 )
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
@@ -108,21 +106,3 @@ def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: boo
         assert np.array_equal(values, many.signals[name][..., :2]), name
     assert np.array_equal(one.sliding_mps, many.sliding_mps[..., :2])
     assert one.sector_clearance_m.shape[-1] == (steps.task.sectors if mapped else 0)
-
-
-def test_a_replay_is_a_drive_whose_warm_up_is_laid_onto_the_log(steps: LoggedSteps) -> None:
-    cut = log_segments(steps, 1.2)
-    cut = cut.take(np.arange(min(len(cut), 8)))
-    replayed = replay_segments(cut, [Perturbation(), LATE])
-    moving = ~cut.still
-    motion = {name: np.where(moving, values, 0.0) for name, values in cut.before.items()}
-    motion["localised_lateral_mps"] = np.zeros(len(cut))
-    start = OpenLoopStart(np.zeros((len(cut), 3)), motion, cut.command)
-    driven = drive_open_loop(cut.task, start, [Perturbation(), LATE])
-    for name in SENSED:
-        values = driven.signals[name]
-        assert np.array_equal(values[..., cut.warmup_steps :], replayed.signals[name]), name
-    assert all(np.array_equal(pose[:, 0, :2], cut.pose[:, 0, :2]) for pose in replayed.pose)
-    moved = np.linalg.norm(np.diff(driven.pose[..., :2], axis=2), axis=-1)[..., cut.warmup_steps :]
-    again = np.linalg.norm(np.diff(replayed.pose[..., :2], axis=2), axis=-1)
-    np.testing.assert_allclose(again, moved, atol=1e-9)

@@ -5,7 +5,7 @@ import pytest
 
 from restock import native
 from restock.train.twin.floors.floors import open_floors
-from restock.train.twin.floors.layout import PALLET_HALF_M, Warehouse, default_warehouse
+from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import (
     Motion,
@@ -17,7 +17,6 @@ from restock.train.twin.floors.state_lattice import (
     rectangle,
 )
 from restock.train.twin.missions.mission import length_m
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 
 FLOOR = default_warehouse()
 AISLE = FLOOR.segments[1].area  # aisle 1 east: x from west to east
@@ -63,44 +62,6 @@ def test_time_is_left_by_distance_and_speed() -> None:
     slow = Motion(BODY.outline_m, ahead_mps=0.25, back_mps=0.1, turn_radps=0.3)
     pose = np.array([AISLE.x_min + 0.2, AISLE.center[1], 0.0])
     assert with_gap(0.9, slow).time_s(pose) == pytest.approx(4 * with_gap(0.9).time_s(pose))
-
-
-@pytest.mark.long
-def test_where_a_rule_leaves_no_way_around_a_block_it_is_broken() -> None:
-    """Plan against a one-way rule if a block leaves no other way, as `Planner.plan` does."""
-    broken = 0
-    for floor in open_floors("generated:test")[:24]:
-        if not floor.one_way:
-            continue
-        planner = Planner(floor)
-        for seed in range(40):
-            episode = draw_episode(EpisodeSpec("blocked_aisle", seed), floor, planner)
-            if episode.block != "full":
-                continue
-            pallets = episode.pallets[episode.pallets[:, 0] > 0]
-            start = episode.start[:2]
-            plan = planner.plan_around(*start, episode.goal, pallets, PALLET_HALF_M[:2])
-            assert plan is not None
-            assert clear_of(plan, pallets)
-            broken += against(floor, plan)
-    assert broken > 0
-
-
-def clear_of(plan: np.ndarray, pallets: np.ndarray) -> bool:
-    """Return whether no point of a plan is within a pallet's inner circle."""
-    gap = np.hypot(*(plan[:, None] - pallets[None, :, :2]).transpose(2, 0, 1))
-    return bool(gap.min() > min(PALLET_HALF_M[:2]))
-
-
-def against(floor: Warehouse, plan: np.ndarray) -> bool:
-    """Return whether a plan runs against a one-way rule for half a metre."""
-    along = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
-    step = np.diff(plan, axis=0)
-    for rule in floor.one_way:
-        inside = [rule.area.contains(x, y) for x, y in plan[:-1]]
-        if (step @ np.array(along[rule.heading]))[inside].clip(max=0.0).sum() < -0.5:
-            return True
-    return False
 
 
 @pytest.mark.parametrize(("layouts", "way"), [("default", "1"), ("generated:test", "0")])
