@@ -53,7 +53,6 @@ from restock.replay.plan.source_plan import (
     SourcePlan,
     SourceRows,
     plan_source,
-    taken_by_others,
 )
 from restock.replay.plan.strata import (
     NO_STRATUM,
@@ -274,7 +273,6 @@ def plan_panel(
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
     stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
     warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
-    taken = taken_by_others(table, strata, member, stratum, out.admitted)
     del member
     beyond_cap = leave_out_of_strata(table, mixture, stratum, out)
     if out.gone.all():
@@ -292,7 +290,7 @@ def plan_panel(
     occurs = represented_shares(mixture, strata, given)
     unknown = unknown_conditions(connection)
     worked_out = [
-        plan_source(connection, mixture, strata, source, natural, unknown, taken)
+        plan_source(connection, mixture, strata, source, natural, unknown)
         for source, natural in zip(given, occurs, strict=True)
     ]
     for source, plan in zip(given, worked_out, strict=True):

@@ -1,8 +1,7 @@
 """The plan of one source of a panel: shares, importance weights, and missing rows.
 
-Strata with a wanted share and nearly no rows are named, with the reason and what to change. Most
-often that is nominal: with `unit = "episode"` it has the episodes that met nothing, and a condition
-that nearly every episode meets leaves none.
+Strata with a wanted share and no rows are named, with what to change. Most often that is nominal:
+with `unit = "episode"` it has the episodes that met nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Codes, Ints
-from restock.errors import MixtureError, counted
+from restock.errors import MixtureError
 from restock.ingest.task.conditions import NOMINAL
 from restock.replay.mixture.mixture import Mixture, StratumRule
 from restock.replay.mixture.shares import (
@@ -24,7 +23,6 @@ from restock.replay.mixture.shares import (
     missing_rows,
     plan_shares,
 )
-from restock.replay.plan.candidates import bools, codes
 from restock.replay.plan.exclusions import scramble
 from restock.replay.plan.strata import ResolvedStratum, Stratum
 from restock.replay.plan.weights import (
@@ -37,89 +35,17 @@ from restock.replay.plan.weights import (
     stands_for,
 )
 
-_NEARLY_NONE = 0.1  # of what a stratum could have: it has less than that …
-_TAKEN = 0.5  # … because a condition holds in at least this much
-
 
 def no_rows(rule: StratumRule) -> str:
     """Return what to change where a stratum has no row."""
+    if rule.name == NOMINAL and rule.where is None and rule.unit == "episode":
+        return (
+            "has no episode: each met the condition of another stratum; give the most frequent one"
+            ' unit = "step" or a larger min_steps, or raise its threshold in the profile and run'
+            " `restock store label`"
+        )
     other = "change its `where`" if rule.where is not None else "leave it out of the strata"
     return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
-
-
-def taken_by_others(
-    table: pa.Table,
-    strata: Sequence[ResolvedStratum],
-    member: Bools,
-    stratum: NDArray[np.int16],
-    admitted: Bools,
-) -> dict[str, str]:
-    """Return, of each stratum to which one other condition leaves nearly nothing, which one it is.
-
-    Args:
-        table: what `read_candidates` returns.
-        member: (N, S) which strata a row may be in.
-        stratum: (N,) the one that it is in.
-        admitted: (N,) rows that the mixture admits.
-    """
-    episode = codes(table, "episode_id")
-    found = {}
-    for index, named in enumerate(strata):
-        rule = named.rule
-        rest = named.name == NOMINAL and rule.where is None
-        could = admitted if rest else admitted & member[:, index]
-        total = _count(could, rule, episode)
-        kept = _count(could & (stratum == index), rule, episode)
-        others = [j for j, other in enumerate(strata) if j != index and other.name != NOMINAL]
-        if rule.share in ("natural", 0) or kept >= _NEARLY_NONE * total or not others:
-            continue
-        held = {j: _count(could & member[:, j], rule, episode) for j in others}
-        taker = max(others, key=held.__getitem__)
-        if held[taker] < _TAKEN * total:
-            continue
-        other = strata[taker]
-        remedy = (
-            _less_often(other, _usual_steps(table, taker, admitted))
-            if rest
-            else f"give {named.name} priority = {other.priority - 1}, to come before {other.name}"
-        )
-        unit = "episode" if rule.unit == "episode" else "row"
-        found[named.name] = (
-            f"has {kept:,} of {counted(total, unit)}, since {other.name} is met in"
-            f" {held[taker]:,} of them: {remedy}"
-        )
-    return found
-
-
-def _count(rows: Bools, rule: StratumRule, episode: Codes) -> int:
-    """Return the size of some rows (N,) in the unit of a stratum."""
-    return int((np.bincount(episode[rows]) > 0).sum() if rule.unit == "episode" else rows.sum())
-
-
-def _usual_steps(table: pa.Table, index: int, admitted: Bools) -> int:
-    """Return the median number of steps of a condition, over the episodes that have it."""
-    steps = np.bincount(codes(table, "episode_id")[bools(table, f"stratum_{index}") & admitted])
-    return int(np.median(steps[steps > 0]))
-
-
-def _less_often(taker: ResolvedStratum, steps: int) -> str:
-    """Return what leaves nominal more than a condition that holds nearly everywhere does."""
-    name = taker.name
-    in_mixture = (
-        f'under [[strata]] give {name} unit = "step", or min_steps = {steps + 1} (half of its'
-        f" episodes have {counted(steps, 'such step')} or fewer); "
-        if taker.rule.unit == "episode"
-        else ""
-    )
-    at_source = (
-        "make its `where` stricter"
-        if taker.rule.where is not None
-        else "raise its threshold in the profile and run `restock store label`"
-    )
-    return (
-        f"{in_mixture}{at_source}; or list the other conditions under [[strata]] in place of"
-        " [each_condition]"
-    )
 
 
 # A share of the gradient this much below the natural one is no rounding.
@@ -167,15 +93,14 @@ def plan_source(
     source: SourceRows,
     natural: F64 | None = None,
     unknown: Mapping[str, str] | None = None,
-    taken: Mapping[str, str] | None = None,
 ) -> SourcePlan:
     """Plan the shares, weights and report lines of one source.
 
     `natural` (S,) are the shares that its rows stand for, where that is not their own; `unknown`
-    the conditions that none of them tells, and why; `taken` the strata that another one empties.
+    the conditions that none of them tells, and why.
 
     Raises:
-        MixtureError: too few rows, bounds of [adaptive] that no shares keep, or weights that take a
+        MixtureError: too few rows, or weights that take a
             stratum below its natural share, where the mixture refuses that.
     """
     size = len(strata)
@@ -191,7 +116,7 @@ def plan_source(
         if not count and rule.where is None and (why := (unknown or {}).get(rule.name))
     }
     empty = [rule for rule, count in zip(rules, rows, strict=True) if not count]
-    lacking = {rule.name: no_rows(rule) for rule in empty} | dict(taken or {})
+    lacking = {rule.name: no_rows(rule) for rule in empty}
     shares = plan_shares(
         mixture,
         rules,
