@@ -339,11 +339,3 @@ class Panel:
         """Return the row numbers of each stratum, in order of `strata`."""
         code = self.stratum_code
         return [np.flatnonzero(code == index) for index in range(len(self.strata))]
-
-    def tensor(self) -> Any:
-        """Return the packed rows as a memory-mapped torch tensor (n, W), for `gather_rows`."""
-        import torch
-
-        return torch.from_file(
-            str(self.path / ROWS), shared=False, size=self.rows.size, dtype=torch.float32
-        ).view(self.rows.shape)
