@@ -235,7 +235,7 @@ class TableCommits(StoreReader):
                     configuration={"delta.checkpointInterval": str(CHECKPOINT_COMMITS)},
                     description=FORMAT,
                 )
-            table = self.path.open_table(name)
+            table = self._listing(name).table
             expect_writable(table, where=str(self.path))
             have = {field.name: field for field in table.schema().fields}
             refuse_other_signals(have, schema, str(self.path))
@@ -276,8 +276,8 @@ class TableCommits(StoreReader):
         rewritten: list[AddedFile] = []
 
         def attempt() -> int:
-            table = self.path.open_table(name)
-            active = self._listed(name, table).files
+            listing = self._listing(name)
+            table, active = listing.table, listing.files
             if {file.path for file in added} <= {file.path for file in active}:
                 return table.version()  # by the attempt before, whose answer was lost
             self._still(instead_of)
@@ -293,8 +293,7 @@ class TableCommits(StoreReader):
                 # itself: the transaction id makes it one.
                 turns = _turns(table, recordings)
             self.transact(table, actions, turns)
-            table.update_incremental()
-            return table.version()
+            return self._read_on(name, table)
 
         with self.discarded_on_failure(name, rewritten):
             return self.again_on_conflict(attempt), replaced
@@ -314,8 +313,8 @@ class TableCommits(StoreReader):
         before: list[int] = []
 
         def attempt() -> int:
-            table = self.path.open_table(TRANSITIONS)
-            active = self._listed(TRANSITIONS, table).files
+            listing = self._listing(TRANSITIONS)
+            table, active = listing.table, listing.files
             self.discard_uncommitted(TRANSITIONS, rewritten)  # of an attempt before
             rewritten.clear()
             if before and not _held(active, ingests):
@@ -325,8 +324,7 @@ class TableCommits(StoreReader):
             now_ms = time.time_ns() // 1_000_000
             actions = self._without(active, ingests, rewritten, now_ms)
             self.transact(table, actions, _turns(table, sorted(ingests)), operation)
-            table.update_incremental()
-            return table.version()
+            return self._read_on(TRANSITIONS, table)
 
         with self.discarded_on_failure(TRANSITIONS, rewritten):
             version = self.again_on_conflict(attempt)
@@ -409,15 +407,16 @@ class TableCommits(StoreReader):
         """Take files out of a table, those that are still in it."""
 
         def attempt() -> None:
-            table = self.path.open_table(name)
+            listing = self._listing(name)
             now_ms = time.time_ns() // 1_000_000
             actions = [
                 RemoveAction(file.path, True, now_ms)
-                for file in self._listed(name, table).files
+                for file in listing.files
                 if file.path in paths
             ]
             if actions:
-                self.transact(table, actions, [])
+                self.transact(listing.table, actions, [])
+                self._read_on(name, listing.table)
 
         if paths:
             self.again_on_conflict(attempt)

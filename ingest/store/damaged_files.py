@@ -14,7 +14,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -255,7 +255,7 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
             if (one.recording_id not in known if name == TRANSITIONS else one.ingest_id in untold)
         ]
         if kept:
-            found.append(replace(file, rows=sum(one.rows for one in kept), ingests=tuple(kept)))
+            found.append(file._replace(rows=sum(one.rows for one in kept), ingests=tuple(kept)))
     complete = name == RECORDINGS or sum(file.rows for file in found) == rows
     return found if complete else []
 

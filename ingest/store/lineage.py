@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -30,7 +30,7 @@ from restock.ingest.store.summary import UNREADABLE, Hashes, Sketch, read_sketch
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import DOCUMENTS, recording_schema
 
-OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
+OWN_PATH = re.compile(r"([0-9a-f]{16})/([^/]+)\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
 READERS = 16  # of small files at once, which on S3 are a wait each
 _COLUMNS = ("recording_id", "ingest_id")
@@ -44,8 +44,7 @@ class Ingest(NamedTuple):
     rows: int
 
 
-@dataclass(frozen=True)
-class StoredFile:
+class StoredFile(NamedTuple):
     """An active file of a table."""
 
     path: str  # in the table
@@ -206,10 +205,8 @@ def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
 
 def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
     """Return what a file holds by its name, if that says it."""
-    if rows is None or not OWN_PATH.fullmatch(path):
-        return None
-    recording_id, file = path.split("/")
-    return (Ingest(recording_id, file.removesuffix(".parquet"), rows),)
+    ids = OWN_PATH.fullmatch(path)
+    return (Ingest(ids[1], ids[2], rows),) if ids and rows is not None else None
 
 
 @lru_cache(maxsize=4096)  # files never change
@@ -242,7 +239,8 @@ def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bo
     return tuple(held), False
 
 
-_SKETCHES: dict[tuple[Location, str], Sketch] = {}  # by ingest, which never changes; 2 kB each
+# Of each store by ingest, which never changes; 2 kB each.
+_SKETCHES: defaultdict[Location, dict[str, Sketch]] = defaultdict(dict)
 
 
 @dataclass(frozen=True)
@@ -429,20 +427,30 @@ class StoreReader:
         return self._listing(name).files
 
     def _listing(self, name: str) -> _Listing:
-        """Return what the newest version of a table has; its log is read again if it went on."""
+        """Return what the newest version of a table has; it is opened again if its log went on."""
         known = self._listings.get(name)
-        if known is not None and not self.path.goes_on(name, known.table, known.at[1]):
-            return known
-        return self._listed(name, self.path.open_table(name))
+        if known is None or self.path.goes_on(name, known.table):
+            return self._listed(name, self.path.open_table(name))
+        if known.at[1] != known.table.version():  # after a commit of its own
+            return self._listed(name, known.table)
+        return known
 
     def _listed(self, name: str, table: DeltaTable) -> _Listing:
-        """Return what a table that was just opened has."""
+        """Return what a table has that was just opened, or read on."""
         known, at = self._listings.get(name), (str(table.metadata().id), table.version())
         if known is None or known.at != at:
             same = known.files if known is not None and known.at[0] == at[0] else ()
             known = _Listing(table, at, stored_files(self.path, name, table, known=same))
             self._listings[name] = known
         return known
+
+    def _read_on(self, name: str, table: DeltaTable) -> int:
+        """Return the version of a table that this store has just made by a commit to it."""
+        before = table.version()
+        table.update_incremental()
+        if table.version() != before + 1:  # others' commits are checked when it is opened again
+            self._listings.pop(name, None)
+        return table.version()
 
     def shown(self, version: Version | None = None) -> list[Ingest]:
         """Return the ingests whose transitions are in the store."""
@@ -455,20 +463,19 @@ class StoreReader:
         """Read their sketches, each once, however many recordings ask for them."""
         names = ("recording_id", "ingest_id", "sketch")
         schema = pa.schema([(name, pa.string()) for name in names])
-        new = {one.ingest_id: one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES}
+        kept = _SKETCHES[self.path]
+        new = {one.ingest_id: one for one in ingests if one.ingest_id not in kept}
         # What cannot be read is another recording's, which `restock sql` reports.
         for part in self._manifest_files(list(new.values()), schema, skip=UNREADABLE):
             columns = (part[name].to_pylist() for name in names)
             for recording_id, ingest_id, text in zip(*columns, strict=True):
                 if ingest_id in new:
-                    sketch = Sketch(recording_id, ingest_id, read_sketch(text or ""))
-                    _SKETCHES[self.path, ingest_id] = sketch
-        keys = [(self.path, one.ingest_id) for one in ingests]
-        return [_SKETCHES[key] for key in keys if key in _SKETCHES]
+                    kept[ingest_id] = Sketch(recording_id, ingest_id, read_sketch(text or ""))
+        return [kept[one.ingest_id] for one in ingests if one.ingest_id in kept]
 
     def remember(self, recording_id: str, ingest_id: str, contents: Hashes) -> None:
         """Keep the sketch of an ingest that was just written: it need not be read."""
-        _SKETCHES[self.path, ingest_id] = Sketch.of(recording_id, ingest_id, contents)
+        _SKETCHES[self.path][ingest_id] = Sketch.of(recording_id, ingest_id, contents)
 
 
 def frame_files(manifests: pa.Table) -> list[str]:

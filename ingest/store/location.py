@@ -249,10 +249,12 @@ class Location:
                 where=self.text,
             ) from error
 
-    def goes_on(self, name: str, table: DeltaTable, version: int) -> bool:
-        """Return whether a table has commits after a version, at which it was opened."""
-        if self.folder is not None:  # looked for by its name, a commit costs a hundredth
-            return Path(f"{self.folder}/{name}/{LOG}/{version + 1:020}.json").exists()
+    def goes_on(self, name: str, table: DeltaTable) -> bool:
+        """Return whether a table has commits after those that were read of it, or others."""
+        version = table.version()
+        if self.folder is not None:  # looked for by their names, commits cost a hundredth
+            here, after = (f"{name}/{LOG}/{one:020}.json" for one in (version, version + 1))
+            return (self.folder / after).exists() or not (self.folder / here).exists()
         with self.translate_errors():
             table.update_incremental()
         return bool(table.version() != version)

@@ -373,9 +373,12 @@ def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
     if not len(mine):
         return []
     hashes = np.concatenate([one.hashes for one in sketches] or [mine[:0]])
-    nearest = mine[np.minimum(np.searchsorted(mine, hashes), len(mine) - 1)]
-    which = np.repeat(np.arange(len(sketches)), [len(one.hashes) for one in sketches])
-    shared = np.bincount(which[nearest == hashes], minlength=len(sketches))
+    marked = np.zeros(1 << 16, np.bool_)  # most have other low bits, which are quick to look up
+    marked[mine.astype(np.uint16)] = True
+    at = np.flatnonzero(marked[hashes.astype(np.uint16)])
+    at = at[mine[np.minimum(np.searchsorted(mine, hashes[at]), len(mine) - 1)] == hashes[at]]
+    ends = np.cumsum([len(one.hashes) for one in sketches])
+    shared = np.bincount(np.searchsorted(ends, at, "right"), minlength=len(sketches))
     return [sketches[place] for place in np.flatnonzero(shared >= MIN_HASHES).tolist()]
 
 

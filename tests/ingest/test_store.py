@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -371,3 +372,22 @@ def test_a_secret_in_an_address_is_refused_and_not_repeated(scheme, secret):
 
 def test_a_version_of_a_store_on_s3_is_no_secret():
     assert str(Location.of("s3://bucket/a@2026-11-01T08:00Z")) == "s3://bucket/a"
+
+
+def test_a_writer_opens_a_table_again_only_after_commits_of_others(tmp_path, monkeypatch):
+    writer, opened = StoreWriter(tmp_path / "s"), []
+    open_table = Location.open_table
+    monkeypatch.setattr(
+        Location, "open_table", lambda self, *of: opened.append(of) or open_table(self, *of)
+    )
+    writer.write(*one(1))
+    assert sorted(opened) == [(RECORDINGS,), (TRANSITIONS,)]
+    writer.write(*one(2))
+    assert len(opened) == 2
+    StoreWriter(tmp_path / "s").write(*one(3))
+    opened.clear()
+    writer.write(*one(1, "again"))
+    assert sorted(opened) == [(RECORDINGS,), (TRANSITIONS,)]
+    shutil.rmtree(tmp_path / "s")
+    with pytest.raises(StoreError, match="cannot be opened"):
+        writer.write(*one(4))
