@@ -23,7 +23,6 @@ from importlib.resources.abc import Traversable
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, cast
-from xml.etree import ElementTree
 
 import duckdb
 import pyarrow as pa
@@ -184,35 +183,33 @@ def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
 
 def junit_suites(suites: Mapping[str, Sequence[Finding]], failing: Collection[str]) -> str:
     """Write suites of findings as JUnit XML; those whose status is in `failing` fail."""
-    root = ElementTree.Element("testsuites")
-    root.extend(_suite(findings, name, failing) for name, findings in suites.items())
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
+    from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-
-def _suite(
-    findings: Sequence[Finding], suite: str, failing: Collection[str]
-) -> ElementTree.Element:
-    suite = _printable(suite)
-    root = ElementTree.Element(
-        "testsuite",
-        name=suite,
-        tests=str(len(findings)),
-        failures=str(sum(finding.status in failing for finding in findings)),
-        errors="0",
-        skipped=str(sum(finding.status == "skipped" for finding in findings)),
-    )
-    for finding in findings:
-        case = ElementTree.SubElement(root, "testcase", classname=suite, name=finding.audit.name)
-        lines = [f"{finding.rows} rows. {finding.audit.advice}", *map(str, finding.sample)]
-        text = _printable("\n".join(lines))
-        if finding.status in failing:
-            ElementTree.SubElement(case, "failure", message=finding.audit.doc).text = text
-        elif finding.status == "skipped":
-            ElementTree.SubElement(case, "skipped", message=f"needs a {finding.audit.needs}")
-        elif finding.rows:
-            ElementTree.SubElement(case, "system-out").text = text
-    return root
+    root = Element("testsuites")
+    for name, findings in suites.items():
+        suite = SubElement(
+            root,
+            "testsuite",
+            name=_printable(name),
+            tests=str(len(findings)),
+            failures=str(sum(finding.status in failing for finding in findings)),
+            errors="0",
+            skipped=str(sum(finding.status == "skipped" for finding in findings)),
+        )
+        for finding in findings:
+            case = SubElement(
+                suite, "testcase", classname=_printable(name), name=finding.audit.name
+            )
+            lines = [f"{finding.rows} rows. {finding.audit.advice}", *map(str, finding.sample)]
+            text = _printable("\n".join(lines))
+            if finding.status in failing:
+                SubElement(case, "failure", message=finding.audit.doc).text = text
+            elif finding.status == "skipped":
+                SubElement(case, "skipped", message=f"needs a {finding.audit.needs}")
+            elif finding.rows:
+                SubElement(case, "system-out").text = text
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n"
 
 
 def _printable(text: str) -> str:

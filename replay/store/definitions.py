@@ -189,10 +189,12 @@ class Definitions:
         connection: that of a store.
         observation_type: what observations are cast to.
         summaries: take the common views from `stored_summaries`.
+        tables: what makes a `stored_…` when a text, or a view that one names, names it.
         replaced: names of tables -> what makes them when a text names one, in place of views that
             take too long to make for a list.
 
-    `computed` are table macros that Python computes, in the same form.
+    `computed` are table macros that Python computes, in the same form; `made` are the names of the
+    views and macros that there are.
     """
 
     def __init__(
@@ -201,8 +203,10 @@ class Definitions:
         observation_type: str,
         *,
         summaries: bool = False,
+        tables: Mapping[str, Callable[[], None]] | None = None,
         replaced: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
     ) -> None:
+        self._tables = dict(tables or {})
         self._connection, self.summaries = connection, summaries
         self._statements = dict(
             _statements(_of_store(observation_type, (*VIEWS, FRAMES_SQL, *MACROS)))
@@ -212,7 +216,7 @@ class Definitions:
         self.computed: dict[tuple[str, ...], Callable[[], None]] = {}
         self._replaced: dict[tuple[str, ...], Callable[[], None]] = dict(replaced or {})
         self._replaced[("same_drives",)] = partial(install_same_drives, connection)
-        self._made: set[str] = set()
+        self.made: set[str] = set()
         self._held: list[str] = []
         _OF[connection] = ref(self)
         make_on_demand(connection, self)
@@ -237,25 +241,29 @@ class Definitions:
         self._make(self._statements)
         for names in list(self.computed):
             self.computed.pop(names)()
-        if "columns" not in self._made:
+        if "columns" not in self.made:
             install_columns(self._connection)
-            self._made.add("columns")
+            self.made.add("columns")
 
     def _make(self, names: Iterable[str]) -> None:
         order: dict[str, None] = {}
         seen: set[str] = set()
         for name in sorted(names):
             self._follow(name, order, seen)
-        missing = [name for name in order if name not in self._made]
+        for table in sorted(seen & self._tables.keys()):
+            self._tables.pop(table)()
+        missing = [name for name in order if name not in self.made]
         if missing:
             self._connection.execute("\n".join(self._statements[name] for name in missing))
-            self._made.update(missing)
+            self.made.update(missing)
 
     def _follow(self, name: str, order: dict[str, None], seen: set[str]) -> None:
         """Put one after all that it names."""
-        if name in seen or name not in self._statements:
+        if name in seen:
             return
         seen.add(name)
+        if name not in self._statements:
+            return
         for other in sorted(_named_in(self._statements[name])):
             self._follow(other, order, seen)
         order[name] = None
@@ -356,6 +364,15 @@ def stored_rows(connection: duckdb.DuckDBPyConnection) -> int:
 def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
     """Return whether it is that of a store without transitions."""
     return connection in _OF and not stored_rows(connection)
+
+
+def is_own(connection: duckdb.DuckDBPyConnection, view: str) -> bool:
+    """Return whether a name means a store's view, and none that a query made in its place."""
+    made = _of(connection)
+    if made is None or view not in made.made:
+        return made is not None
+    views = "SELECT 1 FROM duckdb_views() WHERE view_name = $1"
+    return bool(connection.execute(views, [view]).fetchall())
 
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:

@@ -13,12 +13,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import duckdb
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from restock.arrays import F32, Ints
 from restock.errors import StoreError
@@ -33,6 +32,7 @@ NEAREST = 10  # of them
 NOVEL_SHARE = 0.01  # of a task's rows are `novel`, those of the largest novelty
 QUICK_ROWS = 100_000  # measured within seconds
 KEPT = "novelty.parquet"  # in a store: the table `novelty` of the files that it names
+T = TypeVar("T", pa.Table, pa.RecordBatch)
 _BATCH_ROWS = 65_536
 _AT_A_TIME = 512  # rows that are compared
 _ENTRIES = 3  # of an observation that are named as what is strange about it
@@ -104,6 +104,8 @@ class Reference:
         novelty = np.full(len(observation), np.nan, np.float32)
         if len(self.observation) < NEAREST:
             return near, novelty
+        import pyarrow.compute as pc  # slow to import
+
         own = pc.index_in(episode_id, value_set=self.episodes).fill_null(-1).to_numpy()
         square = np.square(self.observation).sum(axis=1)
         for begin in range(0, len(observation), _AT_A_TIME):
@@ -128,7 +130,7 @@ def read_novelty(connection: duckdb.DuckDBPyConnection) -> pa.Table:
     rows = connection.sql(f"SELECT {_COLUMNS} FROM transitions").to_arrow_reader(_BATCH_ROWS)
     for batch in rows:
         for number, (task, reference) in enumerate(references.items()):
-            part = batch.filter(pc.equal(batch["task_hash"], task))
+            part = _of_task(batch, task)
             _, novelty = reference.compare(_observations(part), part["episode_id"])
             # A copy: any column of DuckDB's batch holds all of it, observations too.
             ids = part["transition_id"].to_numpy().copy()
@@ -219,7 +221,13 @@ def _read_references(connection: duckdb.DuckDBPyConnection) -> dict[str, Referen
     """Return the reference of each task."""
     rows = connection.sql(_REFERENCE).to_arrow_table()
     tasks = rows["task_hash"].unique().to_pylist()
-    return {task: Reference.of(rows.filter(pc.equal(rows["task_hash"], task))) for task in tasks}
+    return {task: Reference.of(_of_task(rows, task)) for task in tasks}
+
+
+def _of_task(rows: T, task: str) -> T:
+    import pyarrow.compute as pc  # slow to import
+
+    return rows.filter(pc.equal(rows["task_hash"], task))
 
 
 def _observations(rows: pa.Table | pa.RecordBatch) -> F32:

@@ -134,7 +134,7 @@ def _view_of_known(
     connection.execute(f'SET VARIABLE "{files_name}" = $1', [[str(file) for file in files]])
     connection.execute(
         f'SET VARIABLE "{types_name}" = MAP {{{fields}}};'
-        f' CREATE OR REPLACE VIEW "{schema}"."{view}" AS FROM read_parquet('
+        f' CREATE OR REPLACE VIEW "{schema}"."{view}" WITH (DEFER_BINDING) AS FROM read_parquet('
         f"getvariable({literal(files_name)}), schema = getvariable({literal(types_name)}))"
     )
 

@@ -36,15 +36,13 @@ def install_shared_rows(
     recording of each ingest whose rows count, and `rows` how many these have.
     """
     observed = MetTwice(rows)
-    for _, lists in _of_ingests(manifests(("ingest_id", CONTENT)), recordings):
-        observed.add(lists.flatten().field("content").to_numpy())
+    for _, _, each in _of_ingests(manifests(("ingest_id", CONTENT)), recordings):
+        observed.add(each.field("content").to_numpy())
     names: list[str] = []
-    parts: dict[str, list[pa.Array]] = {"recording": [], "transition_id": [], "content": []}
-    for of_ingests, lists in _of_ingests(manifests(("ingest_id", ROWS)), recordings):
-        each = lists.flatten()  # structs
+    parts: dict[str, list[Ints]] = {"recording": [], "transition_id": [], "content": []}
+    for of_ingests, ingest, each in _of_ingests(manifests(("ingest_id", ROWS)), recordings):
         at = np.flatnonzero(observed.maybe(each.field("content").to_numpy()))
-        ends = np.cumsum(lists.value_lengths().fill_null(0).to_numpy())
-        parts["recording"].append(np.searchsorted(ends, at, "right") + len(names))
+        parts["recording"].append(ingest[at] + len(names))
         for name in ("transition_id", "content"):
             parts[name].append(each.field(name).to_numpy()[at])
         names += of_ingests
@@ -53,7 +51,7 @@ def install_shared_rows(
         name: np.concatenate([np.empty(0, np.int64), *several]) for name, several in parts.items()
     }
     kept = occurs_again(found["content"])
-    recording = pa.array(names, pa.string()).take(pa.array(found.pop("recording")[kept]))
+    recording = _named(names, found.pop("recording")[kept])
     shared = {"recording_id": recording} | {name: values[kept] for name, values in found.items()}
     # A table of its own: joins must know that it is the small side.
     connection.register("found_shared_rows", pa.table(shared))
@@ -112,14 +110,28 @@ def occurs_again(values: Ints) -> Bools:
 
 def _of_ingests(
     manifests: Iterable[pa.Table], recordings: Mapping[str, str]
-) -> Iterator[tuple[list[str], pa.Array]]:
-    """Yield the recordings of the current ingests with the lists of their distinctive rows."""
+) -> Iterator[tuple[list[str], Ints, pa.StructArray]]:
+    """Yield recordings and their distinctive rows (n,), with the recording's place of each, (n,).
+
+    Ingests that are not current are left out.
+    """
     for table in manifests:
         for part in table.combine_chunks().to_batches():
-            named = [recordings.get(ingest) for ingest in part.column("ingest_id").to_pylist()]
-            kept = [place for place, name in enumerate(named) if name is not None]
-            lists = part.column("distinctive_rows").take(pa.array(kept, pa.int64()))
-            yield [name for name in named if name is not None], lists
+            ingests = part.column("ingest_id").to_pylist()
+            names = [recordings.get(ingest, "") for ingest in ingests]
+            lists = part.column("distinctive_rows")
+            ends = np.asarray(lists.offsets)
+            ingest = np.repeat(np.arange(len(names)), np.diff(ends))
+            each = lists.values.slice(ends[0], ends[-1] - ends[0])
+            if "" in names:
+                current = np.array(names, np.str_)[ingest] != ""
+                ingest, each = ingest[current], each.filter(pa.array(current))
+            yield names, ingest, each
+
+
+def _named(names: Sequence[str], which: Ints) -> pa.DictionaryArray:
+    """Return names by their places, without `take`: pyarrow.compute is slow to import."""
+    return pa.DictionaryArray.from_arrays(pa.array(which, pa.int32()), pa.array(names, pa.string()))
 
 
 def _stretches(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
@@ -133,9 +145,10 @@ MIN_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share
 WITHIN_NS = 100_000_000  # of the shift
 FEW = 5  # recordings of one content, up to which all pairs are compared
 _BATCH_ROWS = 100_000
+_NAMED = "SELECT DISTINCT recording_id, hash(recording_id) FROM transitions"
 _MOVING = """
     SELECT
-        recording_id,
+        hash(recording_id) AS recording,
         stamp_ns,
         hash(
             round(command_speed_mps, 3),
@@ -188,11 +201,10 @@ def same_drives(rows: MovingRows) -> pa.Table:
     same = np.add.reduceat(near, begin, dtype=np.int64) if len(begin) else each
     share = same / np.maximum(_smaller(keys, count, distinctive), 1)
     reported = (same >= MIN_ROWS) & (share >= MIN_SHARE)
-    names = pa.array(rows.names, pa.string())
     return pa.table(
         {
-            "recording_id": names.take(pa.array(keys[reported] // count)),
-            "same_as": names.take(pa.array(keys[reported] % count)),
+            "recording_id": _named(rows.names, keys[reported] // count),
+            "same_as": _named(rows.names, keys[reported] % count),
             "rows": same[reported],
             "share": share[reported],
             "later_s": shift[reported] / 1e9,
@@ -201,22 +213,19 @@ def same_drives(rows: MovingRows) -> pa.Table:
 
 
 def _moving_rows(connection: duckdb.DuckDBPyConnection) -> MovingRows:
-    codes: dict[str, int] = {}
+    named = sorted(connection.sql(_NAMED).fetchall())
+    hashes = np.array([number for _, number in named], np.uint64)
+    order = np.argsort(hashes).astype(np.int32)
     recording, content, stamp = [], [], []
     for batch in connection.sql(_MOVING).to_arrow_reader(_BATCH_ROWS):
-        named = batch.column("recording_id").dictionary_encode()
-        names = named.dictionary.to_pylist()
-        of_name = np.array([codes.setdefault(name, len(codes)) for name in names], np.int32)
-        recording.append(of_name[named.indices.to_numpy()])
-        # Copies: any column of DuckDB's batch holds all of it, names too.
+        numbers = batch.column("recording").to_numpy()
+        recording.append(order[np.searchsorted(hashes, numbers, sorter=order)])
+        # Copies: any column of DuckDB's batch holds all of it.
         content.append(batch.column("content").to_numpy().copy())
         stamp.append(batch.column("stamp_ns").to_numpy().copy())
-    names = sorted(codes)
-    rank = np.empty(len(codes), np.int32)
-    rank[[codes[name] for name in names]] = np.arange(len(names))
     return MovingRows(
-        names,
-        rank[_joined(recording, np.int32)],
+        [name for name, _ in named],
+        _joined(recording, np.int32),
         _joined(content, np.uint64),
         _joined(stamp, np.int64),
     )

@@ -138,7 +138,7 @@ class Store:
             self.files = {one.view: one.addresses for one in (self._recordings, self._transitions)}
             self._manifests = self._recordings.read()
             self.changed_by_others = self._count_changed(held)
-            self._present_all(self.bare, "main")
+            self._present_manifests(self.bare, "main")
             self._frames().present(self.bare)
         except StoreError as error:
             if version is None:
@@ -153,11 +153,15 @@ class Store:
         self.observation_type = self._observation_type()
         # Called with a query's text before it runs, to report early what fails as rows are fetched.
         self.checks: list[Callable[[str], None]] = []
-        summaries = self._present_summaries()
+        summaries = self._has_summaries()
         self._definitions = Definitions(
             self.bare,
             self.observation_type,
             summaries=summaries,
+            tables={
+                "stored_transitions": partial(self._present_rows, self.bare, "main"),
+                "stored_summaries": partial(self._summaries.present, self.bare),
+            },
             replaced={("novelty",): self._install_novelty}
             | ({SHARED: self._install_shared_rows} if summaries else {}),
         )
@@ -357,7 +361,8 @@ class Store:
         connection.execute(f"SET disabled_optimizers = '{AS_WRITTEN}'")
         connection.execute(f'CREATE SCHEMA "{schema}"; USE "{schema}"')
         try:
-            self._present_all(connection, schema)
+            self._present_manifests(connection, schema)
+            self._present_rows(connection, schema)
             install_common(connection, self.observation_type)
         finally:
             connection.execute("USE main")
@@ -376,17 +381,11 @@ class Store:
             self._manifests = self._manifests.set_column(place, "transitions", column)
         return sorted(changed)
 
-    def _present_summaries(self) -> bool:
-        """Create `stored_summaries` and return True, unless another tool changed rows.
-
-        If one did, rows are scanned.
-        """
+    def _has_summaries(self) -> bool:
+        """Return whether the summaries are of the rows: other tools changed none."""
         manifests = set(self._manifests["ingest_id"].to_pylist())
         held = self._ingests["ingest_id"].to_pylist()
-        if not held or self.changed_by_others or not manifests.issuperset(held):
-            return False
-        self._summaries.present(self.bare)
-        return True
+        return bool(held) and not self.changed_by_others and manifests.issuperset(held)
 
     def _install_shared_rows(self) -> None:
         """Make `shared_rows` from what the manifests keep, in place of the view over rows."""
@@ -409,13 +408,13 @@ class Store:
         )
         self.bare.unregister("found_novelty")
 
-    def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """Make `stored_ingests`, what the files hold, and a view `stored_…` of each table.
-
-        Manifests are held in memory; transitions on S3 are read at each query.
-        """
+    def _present_manifests(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
+        """Make `stored_ingests`, what the files hold, and `stored_recordings`, in memory."""
         register(connection, "stored_ingests", self._ingests, schema=schema)
         register(connection, self._recordings.view, self._manifests, schema=schema)
+
+    def _present_rows(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
+        """Make `stored_transitions`; on S3 it is read at each query."""
         try:
             self._transitions.present(connection, schema=schema)
         except StoreError as error:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,6 +15,7 @@ from support.stores import TASK, recording_transitions, write_store
 from restock.cli import main
 from restock.errors import MixtureError
 from restock.ingest.store.transitions import replaced
+from restock.replay.store.same_drives import install_shared_rows
 from restock.replay.store.store import Store
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 
@@ -163,3 +165,18 @@ def test_episodes_learnt_under_another_id_are_not_held_out(tmp_path):
     dataset = load_ope_dataset(learnt, TASK, str(logs))
     assert len(dataset.evaluation.rows) == len(other)
     assert f"{2 * len(one['episode_id'].unique())} episodes left out" in dataset.notes[0]
+
+
+def test_rows_of_ingests_that_were_replaced_are_not_looked_at():
+    rows = pa.list_(pa.struct({"transition_id": pa.int64(), "content": pa.int64()}))
+    lists = [
+        [{"transition_id": 10 * place + n, "content": n} for n in (1, 2)] for place in (1, 2, 3)
+    ]
+    manifests = pa.table(
+        {"ingest_id": ["a", "old", "b"], "distinctive_rows": pa.array(lists, rows)}
+    )
+    with duckdb.connect() as connection:
+        current = {"a": "first", "b": "second"}
+        install_shared_rows(connection, lambda _: [manifests.slice(1), manifests[:1]], current, 4)
+        found = connection.sql("FROM shared_rows ORDER BY ALL").fetchall()
+    assert found == [("first", 11, 1), ("first", 12, 2), ("second", 31, 1), ("second", 32, 2)]

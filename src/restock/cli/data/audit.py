@@ -17,7 +17,6 @@ from restock.errors import ConfigError, ExitCode, RestockError, RunError, quoted
 from restock.files import expect_file_place, read_json, write_text
 from restock.ingest.store.location import Location
 from restock.process import interrupts_raised
-from restock.replay.fleet.store_difference import diff_stores
 from restock.replay.places import RUN_CONFIG, beside_of, open_place
 from restock.replay.store.audit import (
     OFFENDED,
@@ -37,7 +36,6 @@ from restock.replay.store.audit import (
 from restock.replay.store.definitions import install_named
 from restock.replay.store.query import rows_of
 from restock.replay.store.store import Store
-from restock.stats import interval_text
 
 
 @dataclass
@@ -188,6 +186,8 @@ class AuditCommand:
         return parts
 
     def _difference(self, old: str) -> list[Finding]:
+        from restock.replay.fleet.store_difference import diff_stores
+
         try:
             with Store(old) as first, Store(self.store) as second:
                 first.verify()
@@ -301,6 +301,8 @@ VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # for a pair 
 
 
 def _interval(value: float, ends: list[float]) -> str:
+    from restock.stats import interval_text
+
     low, high = (None if math.isnan(end) else end for end in ends)
     return interval_text(value, low, high)
 
