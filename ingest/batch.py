@@ -327,9 +327,6 @@ def warm_up() -> None:
 
 def _serve(pipe: Connection, work: Callable[[A], T]) -> None:
     """Run a worker: one recording after the other, until none is left or the parent is gone."""
-    from restock.ingest.containers.mcap_file import ChunkReader
-
-    ChunkReader.ahead = False  # the other workers have the other cores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
     signal.signal(signal.SIGTERM, _stop)
     parent = multiprocessing.parent_process()

@@ -81,7 +81,7 @@ class FileBytes:
         return self._window[: max(stop - start, 0)]
 
     def large(self, start: int, stop: int) -> bytes:
-        """Read a large slice that is needed once; safe to call from several threads.
+        """Read a large slice that is needed once.
 
         Raises:
             RecordingError: the file is shorter than it was when it was opened.

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
-from itertools import cycle
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,36 +35,19 @@ from restock.ingest.containers.storage import (
     unwatched,
 )
 from restock.ingest.decoding.columns import Channel, MessageBatch
-from restock.process import cores
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 _Room: TypeAlias = tuple[Chunk, int, bytes | None]  # its bytes; of the cut one, what it still holds
-_Outcome: TypeAlias = tuple[Chunk, BadChunk | None]  # what is wrong with it
-
-AHEAD = 1  # groups that are decompressed, each on a thread, while the one before is decoded
-
-
-class _Inflated(NamedTuple):
-    """Content of some chunks: where each lies in the buffer, and what was wrong with it."""
-
-    buffer: NDArray[np.uint8]
-    parts: list[_Part]
-    outcomes: list[_Outcome]
 
 
 class ChunkReader:
-    """Reads the chunks of one file. `cut` is the one in which the file ends, if it ends so.
-
-    `ahead` is of the process: one that reads recordings beside others of its kind sets it False.
-    """
-
-    ahead: ClassVar[bool] = True
+    """Reads the chunks of one file. `cut` is the one in which the file ends, if it ends so."""
 
     def __init__(self, file: FileBytes, owner: Storage, cut: Chunk | None) -> None:
         self.walked: dict[int, Positions] = {}  # chunk.at -> its messages, where it has no index
         self.verified = self.unchecked = 0  # chunks and data sections with a CRC, and without one
         self._file, self._owner, self._cut = file, owner, cut
-        self._scratch = _no_scratch()
+        self._scratch = np.zeros(0, np.uint8)  # memory that is used again
 
     def inflate(self, chunk: Chunk) -> bytes:
         """Return one chunk's records; nothing if they cannot be read."""
@@ -97,30 +76,18 @@ class ChunkReader:
         return self.walked[chunk.at]
 
     def read(
-        self, groups: Iterable[list[Chunk]], wanted: set[int], *, ahead: bool = False
+        self, groups: Iterable[list[Chunk]], wanted: set[int]
     ) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield the messages of these channels, group by group; a batch is valid until the next.
-
-        With `ahead`, another thread reads and decompresses the next group meanwhile; what is wrong
-        with it is noted, or raised, in its turn.
-        """
-        works = (partial(self._inflate_group, *self._plausible(group)) for group in groups)
-        for inflated in _ahead(works) if ahead else (work(0) for work in works):
-            for chunk, bad in inflated.outcomes:
-                if bad is None:
-                    self._read(chunk)
-                else:
-                    self._lost(chunk, bad)
-            yield from self._messages(inflated.buffer, inflated.parts, wanted)
-        self._scratch = _no_scratch()  # the file stays open while rows are made
-
-    def _messages(
-        self, buffer: NDArray[np.uint8], parts: list[_Part], wanted: set[int]
-    ) -> Iterator[tuple[int, MessageBatch]]:
-        whole = self._by_index(parts, buffer, wanted)
-        located = [whole] if whole is not None else [self._locate(p, buffer, wanted) for p in parts]
-        for channel in sorted(set().union(*located)):
-            yield channel, batch_of(buffer, [at[channel] for at in located if channel in at])
+        """Yield the messages of these channels, group by group; a batch is valid until the next."""
+        for group in groups:
+            buffer, parts = self._inflate_group(group)
+            whole = self._by_index(parts, buffer, wanted)
+            located = (
+                [whole] if whole is not None else [self._locate(p, buffer, wanted) for p in parts]
+            )
+            for channel in sorted(set().union(*located)):
+                yield channel, batch_of(buffer, [at[channel] for at in located if channel in at])
+        self._scratch = np.zeros(0, np.uint8)  # the file stays open while rows are made
 
     def _by_index(
         self, parts: list[_Part], buffer: NDArray[np.uint8], wanted: set[int]
@@ -143,10 +110,9 @@ class ChunkReader:
                 located[channel] = messages
         return located
 
-    def _plausible(self, group: list[Chunk]) -> tuple[list[_Room], list[_Outcome]]:
-        """Return the room that these chunks need, and which are refused."""
+    def _inflate_group(self, group: list[Chunk]) -> tuple[NDArray[np.uint8], list[_Part]]:
+        """Decompress these chunks into one memory, leaving out bad ones."""
         rooms: list[_Room] = []
-        refused: list[_Outcome] = []
         for chunk in group:
             if chunk is self._cut:
                 torn = chunks.inflate_partly(chunk, self._file)
@@ -154,22 +120,15 @@ class ChunkReader:
                 continue
             try:
                 chunks.refuse_implausible(chunk)
-            except BadChunk as bad:
-                refused.append((chunk, bad))
-            else:
                 rooms.append((chunk, chunk.size, None))
-        return rooms, refused
-
-    def _inflate_group(self, rooms: list[_Room], refused: list[_Outcome], place: int) -> _Inflated:
-        """Decompress these chunks into one of the reused memories, leaving out bad ones."""
+            except BadChunk as bad:
+                self._lost(chunk, bad)
         needed = sum(size for _, size, _ in rooms)
-        if len(self._scratch[place]) < needed:
-            self._scratch[place] = np.empty(needed, np.uint8)
-        scratch, outcomes = self._scratch[place], [*refused]
-        parts: list[_Part] = []
-        at = 0
+        if len(self._scratch) < needed:
+            self._scratch = np.empty(needed, np.uint8)
+        parts, at = list[_Part](), 0
         for chunk, size, torn in rooms:
-            room = scratch[at : at + size]
+            room = self._scratch[at : at + size]
             if torn is not None:
                 room[:] = np.frombuffer(torn, np.uint8)
             else:
@@ -177,13 +136,13 @@ class ChunkReader:
                     stored = self._file.large(chunk.start, chunk.stop)
                     chunks.inflate_into(chunk, stored, room)
                 except BadChunk as bad:
-                    outcomes.append((chunk, bad))
+                    self._lost(chunk, bad)
                     continue
-                outcomes.append((chunk, None))
+                self._read(chunk)
             if size:
                 parts.append((chunk, at, size))
                 at += size
-        return _Inflated(scratch[:at], parts, outcomes)
+        return self._scratch[:at], parts
 
     def _locate(
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
@@ -213,28 +172,6 @@ class ChunkReader:
         return positions
 
 
-def _no_scratch() -> list[NDArray[np.uint8]]:
-    return [np.zeros(0, np.uint8) for _ in range(AHEAD + 1)]
-
-
-def _ahead(works: Iterable[Callable[[int], _Inflated]]) -> Iterator[_Inflated]:
-    """Yield the results of these works in order, doing the next AHEAD while one is used.
-
-    Each gets the number of a memory that no other running work has.
-    """
-    pool = ThreadPoolExecutor(AHEAD, thread_name_prefix="inflate")
-    waiting: deque[Future[_Inflated]] = deque()
-    try:
-        for place, work in zip(cycle(range(AHEAD + 1)), works):
-            waiting.append(pool.submit(work, place))
-            if len(waiting) > AHEAD:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
     """Join messages from several places of one buffer to one batch."""
     return MessageBatch(
@@ -246,7 +183,6 @@ def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
     )
 
 
-MIN_GROUPS = 5  # to decompress ahead
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 
 
@@ -392,20 +328,7 @@ class McapFile(Storage):
             self._check_loose()
         for channel, buffer, messages in self._loose(loose):
             yield channel, batch_of(buffer, [messages])
-        yield from self._chunks.read(self._groups(wanted), wanted, ahead=self._ahead(wanted))
-
-    def _ahead(self, wanted: set[int]) -> bool:
-        """Return whether decompressing on other threads pays: enough work, and a free core.
-
-        Several chunks far larger than a group would take too much memory at once.
-        """
-        sizes = [sum(chunk.size for chunk in group) for group in self._groups(wanted)]
-        return (
-            ChunkReader.ahead
-            and cores() > 1
-            and len(sizes) >= MIN_GROUPS
-            and max(sizes) <= 2 * GROUP_BYTES
-        )
+        yield from self._chunks.read(self._groups(wanted), wanted)
 
     def _loose(
         self, channels: Collection[int]
