@@ -6,6 +6,7 @@ rerun-sdk and mcap-ros2-support are left out where they are not installed.
 from __future__ import annotations
 
 import sqlite3
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,10 @@ from restock.ingest.containers.chunks import crc32
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Leaf, Ragged, equal, join, take
 from restock.ingest.decoding.definitions import message_type
-from restock.ingest.decoding.row_by_row import RowDecoder
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from support.rosbags_columns import RowDecoder
 
 NOT_INSTALLED: set[str] = set()
 try:

@@ -29,6 +29,8 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
 try:
     import atheris
 except ImportError:
@@ -39,13 +41,13 @@ with (
 ):
     import numpy as np
     from seeds import seeds, small_mcap
+    from support.rosbags_columns import RowDecoder
 
     from restock.cli.data.info import describe_recording
     from restock.errors import RestockError
     from restock.ingest.containers.open_recording import open_recording
     from restock.ingest.decoding.columns import CannotDecode, Channel, MessageBatch, equal, take
     from restock.ingest.decoding.decoders import ColumnDecoder, decoder_of, type_of
-    from restock.ingest.decoding.row_by_row import RowDecoder
 
 MAX_INPUT = 1 << 14
 SECONDS_EACH = 30

@@ -8,11 +8,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.bag_samples import STORE
+from support.rosbags_columns import RowDecoder
 
 from restock.ingest.decoding.columns import CannotDecode, Channel, Leaf, MessageBatch, equal
 from restock.ingest.decoding.decoders import ColumnDecoder
 from restock.ingest.decoding.definitions import RosType, message_type
-from restock.ingest.decoding.row_by_row import RowDecoder
 
 PRIMITIVES = [
     *("bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32"),
