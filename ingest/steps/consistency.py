@@ -8,7 +8,7 @@ Ingest, `profile new` and `profile check` share these findings; the store keeps 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -36,12 +36,6 @@ MIN_STEPS = 5
 JUMP_M = 0.2  # further than that, less is the localiser's noise
 LEADS, SURE = 0.03, 0.8  # of a correlation: how much better it is, and how good
 MAX_LEAD_S = 1.0
-# Of turns by scans: a correlation, how much may be left of the variance that is unexplained as
-# stamped, and how late: a lidar takes a tenth of a second or two to turn.
-SCAN_SURE, SCAN_LEFT, SCAN_LATE_S = 0.5, 0.8, 0.3
-MIN_SECTORS = 12
-_AT_ONCE = 16_384
-HARMONICS = slice(1, 5)  # of clearance around the robot
 MIN_FOLLOWED = 150  # steps: in fewer, two unrelated motions may look alike
 
 
@@ -136,8 +130,7 @@ def findings_of(
             turned, ("gyro", topics["imu"], "its yaw rate", topics["pose"]), len(problem)
         )
     found += _spikes(aligned.inputs, drive)
-    found += _order(drive, topics["command"], topics.get("wheels", topics["pose"]), period_s)
-    return found + _scans(drive, [*profile.inputs.scans], topics, period_s)
+    return found + _order(drive, topics["command"], topics.get("wheels", topics["pose"]), period_s)
 
 
 def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
@@ -326,50 +319,6 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
                 )
             ]
     return []
-
-
-def _scans(
-    drive: Drive, scans: Sequence[str], topics: Mapping[str, str], period_s: float
-) -> list[Finding]:
-    """Find lidars that turn at another time than the poses."""
-    sectors = np.asarray(drive.signals["sector_clearance_m"], np.float64)
-    if not scans or sectors.shape[1] < MIN_SECTORS:
-        return []
-    known = np.isfinite(sectors).all(axis=1)
-    seen = drive.joined & known & np.roll(known, 1)
-    yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
-    by_poses, by_scans = wrap_angle(yaw - np.roll(yaw, 1)), _turned(sectors)
-    by_lag, most = _by_lag(by_poses, by_scans, seen, period_s)
-    best = int(np.argmax(by_lag))
-    late_s = (best - most) * period_s
-    left, as_stamped = 1 - by_lag[best] ** 2, 1 - max(by_lag[most], 0.0) ** 2
-    if abs(late_s) < SCAN_LATE_S or by_lag[best] < SCAN_SURE or left > SCAN_LEFT * as_stamped:
-        return []
-    return [
-        Finding(
-            "order",
-            ", ".join(topics[name] for name in scans if name in topics),
-            f"what it sees turns {abs(late_s):.1f} s {'after' if late_s > 0 else 'before'} the"
-            f" poses of {topics['pose']} (correlation {by_lag[best]:.2f}, {by_lag[most]:.2f} as"
-            " stamped)",
-            len(yaw),
-            "its stamps are of another clock, or not of the time of measurement",
-            'set [clock] alignment = "log_time" in the profile, and synchronise the clocks',
-        )
-    ]
-
-
-def _turned(sectors: F64) -> F64:
-    """Return the angle (T,) by which a robot turned since the step before, by clearance (T, K).
-
-    It is the turn of the one that fits the other best, over their lowest harmonics.
-    """
-    near = np.fft.rfft(np.log(np.maximum(sectors, 0.05)), axis=1)[:, HARMONICS]
-    product = near * np.roll(near, 1, axis=0).conj()  # (T, H)
-    turns = np.linspace(-0.6, 0.6, 61)
-    waves = np.exp(1j * np.outer(np.arange(HARMONICS.start, HARMONICS.stop), -turns))  # (H, turns)
-    parts = np.array_split(product, len(product) // _AT_ONCE + 1)  # bounds memory
-    return np.concatenate([turns[np.argmax((part @ waves).real, axis=1)] for part in parts])
 
 
 def _by_lag(requested: F64, did: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:

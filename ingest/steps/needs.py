@@ -348,7 +348,6 @@ def _skipped(topic: str, available: Mapping[str, Any]) -> str:
 
 
 MAX_TRANSFORMS = 500  # messages of a topic; what places a lidar is published all the time
-_ENDS = ("tf", "tf_static", "robot_description")
 
 
 def unknown_directions(recording: Recording, profile: Profile) -> list[str]:

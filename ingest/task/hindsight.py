@@ -1,10 +1,9 @@
 """Goals in hindsight: the place that a drive reached is its goal (arXiv:1707.01495).
 
 For recordings without a goal topic. A drive is cut into missions, and each one's goal is the place
-where it ended: where the robot stood still, where it turned back, a place that it visited often, or
-as far as an episode may go. Where the drive passed that place on its way, left it and came back,
-the mission ends at the first pass, and the rest is cut again. The route is the way that was driven,
-thinned and without its loops.
+where it ended: where the robot stood still, where it turned back, or as far as an episode may go.
+Where the drive passed that place on its way, left it and came back, the mission ends at the first
+pass, and the rest is cut again. The route is the driven way, thinned and without its loops.
 
 Goal and route are from the future, by definition; nothing else here is. Every mission arrives, by
 construction: its success says nothing of who drove.
@@ -32,7 +31,6 @@ NOWHERE = f"{NO_MISSION}, nowhere far enough"
 _SHORTEST = 3.0  # goal radii from start to goal, at least
 _WAIT_S = 10.0  # standing before the start, at most, that belongs to the mission
 _BACK = 0.6  # of the farthest from its start: nearer again, the robot has turned back
-_OFTEN = 3  # visits
 _LIMIT = 0.9  # of the task's time limit
 
 GoalSource = Literal["logged", "hindsight"]
@@ -117,9 +115,7 @@ class _Cutting:
         self.leg = leg
         self.shortest_m = shortest_m(task)
         self.longest_s = _LIMIT * task.time_limit_steps * task.control_period_s
-        self.arc_m = driven_m(xy_m, leg, self.radius_m / 2)
         self.standing = self._standing()  # and, after the cutting, in no mission
-        self.visits = self._visits()
         self.mission = np.full(len(xy_m), -1, np.int64)
         self.goals: list[F64] = []
         self.routes: list[F64] = []
@@ -137,7 +133,7 @@ class _Cutting:
             self.routes,
             self.ended_at,
             self.standing,
-            float(self.arc_m[-1]) if len(self.arc_m) else 0.0,
+            driven_m(self.xy_m, self.leg, self.radius_m / 2),
             self.shortest_m,
         )
 
@@ -181,14 +177,9 @@ class _Cutting:
             start = self._add(start, goal, why, last=goal == stop)
 
     def _way_point(self, start: int, away: F64) -> tuple[int, str]:
-        """Return where to end a drive that goes on: the most visited place, or the limit."""
-        visits = self.visits[start : start + len(away)]
-        visits = np.where(away >= max(self.shortest_m, away.max() / 2), visits, 0)
-        most = int(visits.max())
-        if most >= _OFTEN:
-            return start + int(np.flatnonzero(visits == most)[-1]), "visited often"
-        far = away >= self.shortest_m
-        return start + (int(np.flatnonzero(far)[-1]) if far.any() else len(away) - 1), "far enough"
+        """Return where to end a drive that goes on: the last place that is far enough."""
+        far = np.flatnonzero(away >= self.shortest_m)
+        return start + (int(far[-1]) if len(far) else len(away) - 1), "far enough"
 
     def _add(self, start: int, end: int, why: str, *, last: bool) -> int:
         """Add the mission that ends at tick `end`; where the next one starts."""
@@ -231,36 +222,17 @@ class _Cutting:
         np.add.at(edges, ended[still] + 1, -1)
         return np.cumsum(edges)[:count] > 0
 
-    def _visits(self) -> Ints:
-        """Count how often (T,) the robot came to its current place in the whole recording."""
-        cell = np.floor(self.xy_m / (2 * self.radius_m)).astype(np.int64)
-        _, place = np.unique(cell, axis=0, return_inverse=True)
-        order = np.lexsort([np.arange(len(place)), place])
-        # Another visit: it drove a mission's length since it was last here.
-        again = np.diff(self.arc_m[order], prepend=-np.inf) >= self.shortest_m
-        again |= np.diff(place[order], prepend=-1) != 0
-        counts: Ints = np.bincount(place, _weights(again, order))[place].astype(np.int64)
-        return counts
 
-
-def driven_m(xy_m: F64, leg: Ints, band_m: float) -> F64:
-    """Return the distance driven (N,), counting only steps of more than `band_m`, not noise."""
-    arc, driven, here = 0.0, [], (math.nan, math.nan, -1)
+def driven_m(xy_m: F64, leg: Ints, band_m: float) -> float:
+    """Return the distance driven, counting only steps of more than `band_m`, not noise."""
+    driven, here = 0.0, (math.nan, math.nan, -1)
     for x, y, number in zip(xy_m[:, 0].tolist(), xy_m[:, 1].tolist(), leg.tolist(), strict=True):
         step = math.hypot(x - here[0], y - here[1])
         if number != here[2]:
             here = (x, y, number)
         elif step > band_m:
-            arc, here = arc + step, (x, y, number)
-        driven.append(arc)
-    return np.array(driven)
-
-
-def _weights(chosen: Bools, order: Ints) -> F64:
-    """Return `chosen` of the sorted rows in the rows' own order."""
-    weights = np.zeros(len(order))
-    weights[order] = chosen
-    return weights
+            driven, here = driven + step, (x, y, number)
+    return driven
 
 
 def route_of(driven_m: F64, goal_m: F64, spacing_m: float) -> F64:

@@ -65,19 +65,6 @@ def _ranges(count: int) -> dict[str, Any]:
     return {"range_min": np.full(count, 0.1), "range_max": np.full(count, 10.0)}
 
 
-def in_a_hall(topics: Topics, seen_s: float = 0.0) -> Topics:
-    """Return the same within four walls, seen so much before the stamps of the scans."""
-    scan = topics["/scan"]
-    time_s = (np.asarray(scan.fields["header.stamp"]) - START_NS) / NS - seen_s
-    x, y, yaw = poses(np.clip(time_s, 0, DURATION_S))
-    bearing = yaw[:, None] - np.pi + 2 * np.pi * np.arange(BEAMS) / BEAMS
-    ranges = np.full(bearing.shape, np.inf)
-    for at, along in ((x, np.cos(bearing)), (y, np.sin(bearing))):
-        walls = np.where(along > 0, at.max() + 1.5, at.min() - 1.0)
-        ranges = np.fmin(ranges, (walls - at[:, None]) / along)
-    return {**topics, "/scan": replace(scan, fields={**scan.fields, **scans(ranges)})}
-
-
 def shifted(topics: Topics, name: str, seconds: float) -> Topics:
     """Return the same, with the stamps of a topic ahead by so much."""
     one = topics[name]
@@ -258,18 +245,6 @@ def test_what_contradicts_itself_is_kept_and_said(profile, tmp_path, case):
     assert (one.topic, one.repaired) == (topic, False)
     assert words in str(one)
     assert 0 < one.steps <= len(steps["stamp_ns"])
-
-
-@pytest.mark.parametrize("seen_s", [-0.4, 0.1, 0.8])
-def test_scans_that_turn_before_or_after_the_poses(profile, tmp_path, seen_s):
-    found, _ = found_in(in_a_hall(winding(), seen_s), profile, tmp_path)
-    if abs(seen_s) < 0.3:  # a lidar takes time to turn, and its messages to arrive
-        assert found == []
-        return
-    (one,) = found
-    assert (one.kind, one.topic, one.repaired) == ("order", "/scan", False)
-    when = "after" if seen_s > 0 else "before"
-    assert f"turns {abs(seen_s):.1f} s {when} the poses of /odom" in one.what
 
 
 def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
