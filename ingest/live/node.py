@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -141,42 +142,23 @@ def with_node_topics(profile: Profile) -> Profile:
     )
 
 
-@dataclass(frozen=True)
-class Ros:
-    """rclpy of a sourced ROS 2: Jazzy or later, whose Python is 3.12."""
+def quality(ros: Any, depth: int, *, reliable: bool = True, latched: bool = False) -> Any:
+    """Return a quality of service; one that is not reliable matches whatever a publisher offers.
 
-    rclpy: Any  # the module
-    LifecycleNode: Any
-    TransitionCallbackReturn: Any
-    QoSProfile: Any
-    ReliabilityPolicy: Any
-    DurabilityPolicy: Any
-    MutuallyExclusiveCallbackGroup: Any
-    MultiThreadedExecutor: Any
-    Clock: Any
-    ClockType: Any
-    SignalHandlerOptions: Any
-    Duration: Any
-    get_message: Any  # "std_msgs/msg/Bool" -> its class
-
-    def sensor_qos(self) -> Any:
-        """Return a quality of service that matches whatever a publisher offers."""
-        return self._qos(10, self.ReliabilityPolicy.BEST_EFFORT, self.DurabilityPolicy.VOLATILE)
-
-    def command_qos(self) -> Any:
-        """Return a quality of service that delivers the newest message alone, reliably."""
-        return self._qos(1, self.ReliabilityPolicy.RELIABLE, self.DurabilityPolicy.VOLATILE)
-
-    def latched_qos(self) -> Any:
-        """Return a quality of service that also gives late subscribers the last message."""
-        return self._qos(1, self.ReliabilityPolicy.RELIABLE, self.DurabilityPolicy.TRANSIENT_LOCAL)
-
-    def _qos(self, depth: int, reliability: Any, durability: Any) -> Any:
-        return self.QoSProfile(depth=depth, reliability=reliability, durability=durability)
+    A latched one also gives late subscribers the last message.
+    """
+    reliability, durability = ros.ReliabilityPolicy, ros.DurabilityPolicy
+    return ros.QoSProfile(
+        depth=depth,
+        reliability=reliability.RELIABLE if reliable else reliability.BEST_EFFORT,
+        durability=durability.TRANSIENT_LOCAL if latched else durability.VOLATILE,
+    )
 
 
-def load_ros() -> Ros:
-    """Import the ROS 2 that is sourced.
+def load_ros() -> SimpleNamespace:
+    """Import rclpy of the ROS 2 that is sourced (Jazzy or later), and its classes by their names.
+
+    `get_message` gives the class of a message type.
 
     Raises:
         ConfigError: there is none.
@@ -196,7 +178,7 @@ def load_ros() -> Ros:
             for module, each in names.items()
             for name in each
         }
-        return Ros(rclpy=import_module("rclpy"), get_message=_message_class, **found)
+        return SimpleNamespace(rclpy=import_module("rclpy"), get_message=_message_class, **found)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
             f"needs ROS 2, whose rclpy cannot be imported: {error}",
@@ -222,7 +204,7 @@ NAME = "restock_policy"
 class PolicyNode:
     """Behaviour of a lifecycle node in its transitions; `node` is an rclpy LifecycleNode."""
 
-    def __init__(self, ros: Ros, node: Any, policy: Path, *, drive: bool = False) -> None:
+    def __init__(self, ros: Any, node: Any, policy: Path, *, drive: bool = False) -> None:
         self.ros, self.node = ros, node
         self.pilot: Pilot | None = None
         self.active = False
@@ -290,7 +272,7 @@ class PolicyNode:
             name: self.node.create_lifecycle_publisher(
                 self._classes[name],
                 topic,
-                self.ros.latched_qos() if name == "behaviour" else self.ros.command_qos(),
+                quality(self.ros, 1, latched=name == "behaviour"),
             )
             for name, (topic, _) in kinds.items()
         }
@@ -298,7 +280,7 @@ class PolicyNode:
         self._reports = self.node.create_publisher(status, "/diagnostics", 10)
         self.pilot = pilot
         self._subscriptions = {
-            topic: self._subscribe(topic, kind, self.ros.sensor_qos())
+            topic: self._subscribe(topic, kind, quality(self.ros, 10, reliable=False))
             for topic, kind in heard.items()
         }
         self._latching = {topic: heard[topic] for topic in sorted(pilot.latched)}
@@ -376,7 +358,9 @@ class PolicyNode:
             offers = self.node.get_publishers_info_by_topic(self.node.resolve_topic_name(topic))
             offered = any(one.qos_profile.durability == keeps for one in offers)
             if offered and topic not in self._latched:
-                self._latched[topic] = self._subscribe(topic, kind, self.ros.latched_qos())
+                self._latched[topic] = self._subscribe(
+                    topic, kind, quality(self.ros, 1, latched=True)
+                )
             elif not offered and topic in self._latched:
                 self.node.destroy_subscription(self._latched.pop(topic))
 
@@ -538,7 +522,7 @@ class PolicyNode:
         self.node.get_logger().info(text)
 
 
-def lifecycle_node(ros: Ros, policy: Path, *, drive: bool = False) -> Any:
+def lifecycle_node(ros: Any, policy: Path, *, drive: bool = False) -> Any:
     """Make the node, unconfigured.
 
     Its transitions return SUCCESS, or FAILURE if it cannot be configured: it then stays
@@ -588,7 +572,7 @@ def lifecycle_node(ros: Ros, policy: Path, *, drive: bool = False) -> Any:
     return Node()
 
 
-def run_node(ros: Ros, policy: Path, *, drive: bool = False, activate: bool = False) -> int:
+def run_node(ros: Any, policy: Path, *, drive: bool = False, activate: bool = False) -> int:
     """Spin the node until SIGINT or SIGTERM; it stops the robot before it goes. Returns 0."""
     import signal
 

@@ -224,14 +224,14 @@ def _align(
         refuse_still_log_time(reference, stamped[reference])
     edges = _edges(stamped[reference], round(JUMP_S * NS))
     report.jumps += len(edges)
-    drifts = _Drifts(clock, round(tolerance_s * NS), simulated, report)
+    drifts = _Drifts(round(tolerance_s * NS), simulated, report)
     segments = []
     for index in range(len(edges) + 1):
         inside = {name: _during(edges, index, columns) for name, columns in topics.items()}
         clock_map, middle = drifts.map_of(topics, stamped, reference, inside, edges, index)
         drifts.place_commands(topics, commands - stamped.keys(), inside, clock_map)
         segments.append(
-            _segment(topics, inside, every, clock_map, middle, clock, latched, transforms, report)
+            _segment(topics, inside, every, clock_map, middle, latched, transforms, report)
         )
     if report.mapped_by is None:
         report.spread_ns = max(report.spread_ns, spread_ns(delay_ns(topics[reference])))
@@ -360,7 +360,6 @@ def _ordered(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
 class _Drifts:
     """Decides for each segment between a constant offset and a piecewise map."""
 
-    clock: Clock
     tolerance_ns: int
     simulated: TopicColumns | None  # `/clock`, where it was read
     report: ClockReport
@@ -448,7 +447,6 @@ def _segment(
     every: NDArray[np.intp],
     clock_map: ClockMap,
     middle: int,
-    clock: Clock,
     latched: frozenset[str],
     transforms: frozenset[str],
     report: ClockReport,

@@ -13,7 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from restock.ingest.live.node import Ros
 from restock.train.twin.recording.bag_writer import build, serialise, stamp, typestore
 
 Reliability = Enum("Reliability", "RELIABLE BEST_EFFORT")
@@ -68,12 +67,12 @@ class Graph:
             if timer.steady == steady:
                 timer.callback()
 
-    def ros(self) -> Ros:
+    def ros(self) -> SimpleNamespace:
         class Bound(LifecycleNode):
             def __init__(bound, name: str) -> None:
                 super().__init__(self, name)
 
-        return Ros(
+        return SimpleNamespace(
             rclpy=None,
             LifecycleNode=Bound,
             TransitionCallbackReturn=Returned,
