@@ -317,13 +317,7 @@ class Recording:
         self._expect_open()
         reading = TopicReading(self.topics[topic], fields)
         for storage in self._storages:
-            decoders: dict[int, Decoder] = {}
-            for stream in self._channels(topic):
-                if stream.storage is storage:
-                    try:
-                        decoders[stream.channel.id] = self._decoder(topic, stream, fields)
-                    except CannotDecode as reason:
-                        reading.skip(str(reason), storage.counts.get(stream.channel.id, 0))
+            decoders = self._decoders(storage, topic, reading)
             for channel, batch in storage.batches(list(decoders)):
                 for plain, decoded in reading.decoded(decoders[channel].decode, batch):
                     yield plain.log_time_ns[decoded.rows], decoded.fields
@@ -371,21 +365,26 @@ class Recording:
         decoders: dict[int, Decoder] = {}
         topics: dict[int, str] = {}
         for topic, reading in readings.items():
-            for stream in self._streams[topic]:
-                if stream.storage is not storage:
-                    continue
-                reading.interleaved |= topic in topics.values()
-                topics[stream.channel.id] = topic
-                try:
-                    decoder = self._decoder(topic, stream, reading.paths)
-                    reading.use(decoder.empty())
-                    decoders[stream.channel.id] = decoder
-                except CannotDecode as reason:
-                    count = storage.counts.get(stream.channel.id, 0)
-                    reading.skip(str(reason), count)
+            found = self._decoders(storage, topic, reading)
+            for decoder in found.values():
+                reading.use(decoder.empty())
+            reading.interleaved |= len(found) > 1
+            decoders |= found
+            topics |= dict.fromkeys(found, topic)
         for channel, batch in together(storage.batches(list(decoders))):
             readings[topics[channel]].take(decoders[channel].decode, batch)
             yield len(batch)
+
+    def _decoders(self, storage: Storage, topic: str, reading: TopicReading) -> dict[int, Decoder]:
+        """Make the decoders of a topic's channels in one file; skip what cannot be decoded."""
+        decoders: dict[int, Decoder] = {}
+        for stream in self._streams[topic]:
+            if stream.storage is storage:
+                try:
+                    decoders[stream.channel.id] = self._decoder(topic, stream, reading.paths)
+                except CannotDecode as reason:
+                    reading.skip(str(reason), storage.counts.get(stream.channel.id, 0))
+        return decoders
 
     def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
         channel, kind = stream.channel, self._type(stream)
