@@ -8,8 +8,8 @@ nothing.
 
 A recording of its topics has the limiter's rule, the proposed action and what would have been
 driven as columns (`limiter_rule`, `shadow_action`, `shadow_speed_mps`, `shadow_yaw_rate_radps`),
-null in recordings without a node, and of a policy with an alarm, `alarm`. The exposures `limited`
-and `alarmed` label the steps at which the limiter held a command back and the alarm was on.
+null in recordings without a node. The exposure `limited` labels the steps at which the limiter held
+a command back.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from restock.ingest.task.robot import RULES, Limiter, Limits
 
 PROPOSAL, SHADOW = "/restock/proposal", "/restock/shadow_cmd_vel"
 ACTION, LIMITER = "/restock/action", "/restock/limiter"
-ALARM, TAKEOVER = "/restock/alarm", "/restock/takeover"
+TAKEOVER = "/restock/takeover"
 BEHAVIOUR = "/behaviour_policy"
 STRING = "std_msgs/msg/String"
 TWISTS = {  # message type -> where speed and yaw rate are in it
@@ -111,19 +111,14 @@ def with_node_topics(profile: Profile) -> Profile:
         ),
         "shadow_speed_mps": signal(SHADOW, form.type, form.speed, "m/s", f"speed {said}"),
         "limiter_rule": signal(LIMITER, "std_msgs/msg/UInt8", "data", "1", rules),
-        "alarm": signal(ALARM, "std_msgs/msg/Bool", "data", "1", "1 while its alarm is on"),
     }
     if form.wheelbase_m is None:
         signals["shadow_yaw_rate_radps"] = signal(
             SHADOW, form.type, form.turn, "rad/s", f"yaw rate {said}"
         )
-    exposures = [
-        Condition(name=name, timing="pre", kind="exposure", sql=f"coalesce({held}, 0) > 0", doc=doc)
-        for name, held, doc in (
-            ("limited", "limiter_rule", "The limiter held back what the policy proposed."),
-            ("alarmed", "alarm", "The policy's alarm was on."),
-        )
-    ]
+    doc = "The limiter held back what the policy proposed."
+    held = "coalesce(limiter_rule, 0) > 0"
+    limited = Condition(name="limited", timing="pre", kind="exposure", sql=held, doc=doc)
     inputs, people = profile.inputs, profile.command_sources
     if inputs.behaviour_policy is None:
         reported = Input(BEHAVIOUR, STRING, {"text": "data"}, optional=True)
@@ -131,14 +126,13 @@ def with_node_topics(profile: Profile) -> Profile:
     if "operator" not in people:
         button = Input(TAKEOVER, "std_msgs/msg/Bool", {"pressed": "data"})
         people = {**people, "operator": button}
-    names = {one.name for one in exposures}
-    own = [one for one in profile.own_conditions if one.name not in names]
+    own = [one for one in profile.own_conditions if one.name != limited.name]
     return msgspec.structs.replace(
         profile,
         inputs=inputs,
         command_sources=people,
         signals={**signals, **profile.signals},
-        own_conditions=[*own, *exposures],
+        own_conditions=[*own, limited],
     )
 
 
@@ -225,7 +219,6 @@ class PolicyNode:
         self._parameter("shadow", not drive)
         self._parameter("limiter", True)
         self._parameter("takeover_topic", TAKEOVER)
-        self._parameter("alarm_speed_mps", -1.0)  # below 0: the alarm does not slow
 
     # -- transitions ----------------------------------------------------------------------------
 
@@ -251,8 +244,7 @@ class PolicyNode:
             profile, self._value("cmd_vel_topic"), self._value("cmd_vel_type")
         )
         self.shadow = bool(self._value("shadow"))
-        takeover, slow = self._value("takeover_topic"), float(self._value("alarm_speed_mps"))
-        pilot = Pilot(policy, limits, takeover, None if slow < 0 else slow, MAX_AHEAD_S)
+        pilot = Pilot(policy, limits, self._value("takeover_topic"), MAX_AHEAD_S)
         reported = profile.inputs.behaviour_policy
         kinds = {
             "proposal": (PROPOSAL, self.form.type),
@@ -260,8 +252,6 @@ class PolicyNode:
             "limiter": (LIMITER, "std_msgs/msg/UInt8"),
             "shadow": (SHADOW, self.form.type),
         }
-        if policy.alarm is not None:
-            kinds["alarm"] = (ALARM, "std_msgs/msg/Bool")
         if not self.shadow:
             kinds["command"] = (self.form.topic, self.form.type)
             kinds["behaviour"] = (BEHAVIOUR if reported is None else reported.topic, STRING)
@@ -392,10 +382,6 @@ class PolicyNode:
         rule = self._classes["limiter"]()
         rule.data = decision.rule
         self._published["limiter"].publish(rule)
-        if "alarm" in self._published:
-            alarm = self._classes["alarm"]()
-            alarm.data = decision.alarm
-            self._published["alarm"].publish(alarm)
         self._published["shadow"].publish(self._filled("shadow", *decision.command))
         if decision.action is not None:
             action = self._classes["action"]()
@@ -449,11 +435,11 @@ class PolicyNode:
         stalled = self.active and time.monotonic() - self._decided_s > self.watchdog_s
         status = kind()
         status.name, status.hardware_id = f"{NAME}: policy", pilot.policy.version
-        alarm = "alarm: as before logged failures" if pilot.alarm else ""
-        warned = pilot.reason or alarm
-        status.level = kind.ERROR if stalled else kind.WARN if warned else kind.OK
+        status.level = kind.ERROR if stalled else kind.WARN if pilot.reason else kind.OK
         mode = "shadow" if self.shadow else "drives"
-        status.message = "stalled" if stalled else warned or (mode if self.active else "ready")
+        status.message = (
+            "stalled" if stalled else pilot.reason or (mode if self.active else "ready")
+        )
         counts = {**pilot.counts, **{f"unreadable: {k}": n for k, n in pilot.unreadable.items()}}
         counts |= {f"off the clock: {k}": n for k, n in pilot.observer.left_out.items()}
         counts |= {f"ahead of the clock: {k}": n for k, n in pilot.observer.ahead.items()}

@@ -19,9 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from restock.arrays import F32
 from restock.errors import ConfigError, RecordingError, RestockError
-from restock.ingest.live.alarm import APART_S
 from restock.ingest.live.observer import LiveObserver, Observed, value_of
 from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.profile.tables import Input
@@ -46,7 +44,6 @@ class Decision:
     rule: int  # of `restock.ingest.task.robot.RULES`
     reason: str  # why it is a stop, or ""
     taken_over: bool  # a person drives: it is not to be published
-    alarm: bool  # the policy's alarm is on
 
 
 class Pilot:
@@ -58,13 +55,10 @@ class Pilot:
         The profile's
             `command_sources` of OPERATORS count as well: a button that is pressed, or commands of
             the last ACTIVE_S.
-        alarm_speed_mps: the fastest that the limiter allows while the alarm is on; None: as fast as
-            without.
         max_ahead_s: as of `LiveObserver`.
 
     Raises:
-        ConfigError: the profile cannot be observed live, or there is a speed without an alarm or a
-            limiter.
+        ConfigError: the profile cannot be observed live.
     """
 
     def __init__(
@@ -72,19 +66,9 @@ class Pilot:
         policy: PolicyFile,
         limits: Limits | None,
         takeover_topic: str = "",
-        alarm_speed_mps: float | None = None,
         max_ahead_s: float | None = None,
     ) -> None:
         self.policy, self.limits, self.profile = policy, limits, policy.profile
-        self._slow = limits
-        if alarm_speed_mps is not None:
-            if limits is None or policy.alarm is None:
-                raise ConfigError(
-                    "needs a policy with an alarm, and the limiter",
-                    where="alarm_speed_mps",
-                    remedy="restock export RUN --to onnx --alarm 0.1 --out policy.onnx",
-                )
-            self._slow = limits.at_most(alarm_speed_mps)
         self.observer = LiveObserver(self.profile, max_ahead_s)
         self._people = [
             source for name, source in self.profile.command_sources.items() if name in OPERATORS
@@ -102,8 +86,6 @@ class Pilot:
         self.counts: Counter[str] = Counter()  # decisions, and each kind of stop and intervention
         self.unreadable: Counter[str] = Counter()  # messages of another type, by topic
         self._was_taken = False
-        self._alarmed_ns: int | None = None  # when the alarm was last on
-        self.alarm = False  # whether it was on at the last decision
         self.reason = "no decision yet"  # why the last decision was a stop, or ""
 
     @property
@@ -156,7 +138,6 @@ class Pilot:
             else:
                 speed, turn = self.profile.task.actions[action]
                 proposal = float(speed), float(turn)
-        self.alarm = not reason and self._alarmed(observed.observation, now_ns)
         command, rule = self._limit(observed, proposal, unknown=bool(reason))
         taken = self.taken_over(now_ns)
         self.counts["decisions"] += 1
@@ -167,24 +148,13 @@ class Pilot:
         elif rule != NONE:
             self.counts[f"limited: {RULES[rule]}"] += 1
         self._was_taken, self.reason = taken, reason
-        return Decision(observed, action, proposal, command, rule, reason, taken, self.alarm)
-
-    def _alarmed(self, observation: F32, now_ns: int) -> bool:
-        """Return whether the alarm is on, and count it."""
-        alarm, last_ns = self.policy.alarm, self._alarmed_ns
-        if alarm is None or not alarm.on(observation[None])[0]:
-            return False
-        self.counts["alarms"] += last_ns is None or now_ns - last_ns > APART_S * NS
-        self.counts["alarm on"] += 1
-        self._alarmed_ns = now_ns
-        return True
+        return Decision(observed, action, proposal, command, rule, reason, taken)
 
     def _observe(self, now_ns: int) -> tuple[Observed, str]:
         before, self._now_ns = self._now_ns, now_ns
         if before is not None and now_ns < before:
             self.observer.reset()
             self._active_ns.clear()
-            self._alarmed_ns = None
             return self.observer.observe(now_ns), "clock: went back"
         try:
             observed = self.observer.observe(now_ns)
@@ -199,13 +169,15 @@ class Pilot:
     ) -> tuple[tuple[float, float], int]:
         if unknown:
             return (0.0, 0.0), UNKNOWN
-        limits = self._slow if self.alarm else self.limits
-        if limits is None:
+        if self.limits is None:
             return proposal, NONE
         signals = observed.signals
         before = [signals["command_speed_mps"], signals["command_yaw_rate_radps"]]
         limited = limit(
-            limits, np.array([proposal]), signals["sector_clearance_m"], np.stack(before, axis=-1)
+            self.limits,
+            np.array([proposal]),
+            signals["sector_clearance_m"],
+            np.stack(before, axis=-1),
         )
         speed, turn = limited.command[0].tolist()
         return (speed, turn), int(limited.rule[0])
@@ -290,7 +262,6 @@ def summary(pilot: Pilot, played: list[Played]) -> dict[str, Any]:
         },
         "stopped_for": dict(Counter(one.decision.reason for one in played if one.decision.reason)),
         "limited": {rule: count for rule, count in limited.items() if rule != "none"},
-        "alarms": None if pilot.policy.alarm is None else int(pilot.counts["alarms"]),
         "taken_over": sum(one.decision.taken_over for one in played),
         "agreement": round(sum(a == b for a, b in both) / len(both), 4) if both else None,
         "unreadable": dict(pilot.unreadable),

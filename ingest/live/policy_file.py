@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from restock.arrays import F32
 from restock.errors import ConfigError
 from restock.files import first_line
-from restock.ingest.live.alarm import alarm_of
 from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
 from restock.ingest.task.task import Task
 from restock.process import import_extra
@@ -68,7 +67,6 @@ class PolicyFile:
             else load_profile(profile)
         )
         self._file.expect(self.profile.task, f"profile {self.profile.name!r}")
-        self.alarm = alarm_of(metadata, self.profile.task.observation_size, str(path))
 
     def act(self, observation: F32) -> int | None:
         """Return the best action for an observation (D,); None if its value is not finite."""

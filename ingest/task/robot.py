@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Literal
 
@@ -231,11 +231,6 @@ class Limits:
             axle_x_m=robot.axle_x_m,
             sectors=task.sectors,
         )
-
-    def at_most(self, speed_mps: float) -> Limits:
-        """Return these limits with a lower top speed; turning is slowed by the same factor."""
-        factor = min(speed_mps / self.fastest[0], 1.0)
-        return replace(self, fastest=(factor * self.fastest[0], factor * self.fastest[1]))
 
     @property
     def hash(self) -> str:

@@ -14,10 +14,8 @@ from support.ros_graph import VOLATILE, Durability, Graph, QoS, Returned, messag
 from support.twin_robot import TwinRobot, follower_onnx
 
 from restock.cli import main, run_node
-from restock.ingest.live.alarm import Alarm, count_alarms
 from restock.ingest.live.node import (
     ACTION,
-    ALARM,
     LIMITER,
     SHADOW,
     TAKEOVER,
@@ -280,7 +278,6 @@ def test_an_unfit_policy_leaves_it_unconfigured(policy: Path, tmp_path: Path) ->
         ({"watchdog_s": 0.0}, "must be within 0 and 60 s"),
         ({"takeover_topic": "/scan"}, "is an input of profile"),
         ({"limiter_stop_m": 99.0}, "stop_m"),
-        ({"alarm_speed_mps": 0.3}, "needs a policy with an alarm"),
         ({"limiter_max_speed_mps": 0.0}, "max_speed_mps"),
         ({"limiter_stop_m": 1}, "not <class 'float'>"),
     ):
@@ -385,42 +382,3 @@ def test_a_takeover_silences_it_and_its_rows_are_the_operators(policy, tmp_path)
             ).fetchall()
     assert rows["told"] == [("operator", 10), ("restock", 19)]
     assert dict(rows["by the button"])["operator"] == 10
-
-
-def test_an_alarm_is_published_counted_and_ingested(tmp_path: Path) -> None:
-    """It is on while the robot is fast, which shows that it slows the robot as well."""
-    names = PROFILE.task.observation_names
-    weights = [float(name == "localised_speed") for name in names]
-    alarm = Alarm(0.1, weights, 0.6, {"bump": 20}, 3.0, 0.1, 2.0)
-    text = msgspec.json.encode(alarm).decode()
-    policy = follower_onnx(tmp_path / "p.onnx", PROFILE, alarm=text)
-    graph, node = started(policy, alarm_speed_mps=0.4)
-    node.trigger_activate()
-    pilot, live = node.policy.pilot, []
-    decide = pilot.decide
-    pilot.decide = lambda now_ns: live.append(decide(now_ns)) or live[-1]
-    robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=20)
-    for _ in range(60):
-        if live[-1].alarm:
-            break
-        driven(robot, steps=1)
-    on = alarm.on(np.stack([one.observed.observation for one in live]))
-    assert 0 < on.sum() < len(on)
-    assert [message.data for message in graph.of(ALARM)] == on.tolist()
-    assert pilot.counts["alarms"] == count_alarms(on, PROFILE.task.control_period_s)
-    assert all(speed <= 0.4 for (speed, _), held in zip(speeds(graph), on, strict=True) if held)
-    assert max(speeds(graph))[0] == 1.0
-    graph.fire(steady=True)
-    said = graph.of("/diagnostics")[-1].status[0].message
-    assert said == "alarm: as before logged failures"
-    profile, bag = tmp_path / "with_node.toml", graph.write(tmp_path / "bag")
-    assert run_node([str(policy), "--write-profile", str(profile)]) == 0
-    line = ["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "store")]
-    assert main(line) == 0
-    with Store(tmp_path / "store") as store:
-        ((alarmed, otherwise),) = store.sql(
-            "SELECT count(*) FILTER (alarm = 1),"
-            " count(*) FILTER (list_contains(exposures, 'alarmed') != (alarm = 1)) FROM transitions"
-        ).fetchall()
-    assert (alarmed > 0, otherwise) == (True, 0)

@@ -7,13 +7,11 @@ entries in order, the action table in m/s and rad/s, and the control period.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 from torch import nn
@@ -22,40 +20,29 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
-from restock.ingest.live.alarm import KEY as ALARM
-from restock.ingest.live.alarm import WINDOW_S, Alarm, fit_alarm
-from restock.ingest.live.pilot import OPERATORS
 from restock.ingest.live.policy_file import FORMAT, OnnxFile, with_digest
 from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
 from restock.process import import_extra
-from restock.replay.panel.panel import Panel
-from restock.replay.store.parquet_views import passed_in
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposalNetwork
 from restock.train.dqn.network import Ensemble, QNetwork
-from restock.train.evaluation.evaluate import STUCK_RADIUS_M, STUCK_WINDOW_S
-from restock.train.evaluation.ope_dataset import panel_store
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
-from restock.train.run.run_profile import profile_of_run, run_panel
+from restock.train.run.run_profile import profile_of_run
 
 _OPSET = 18
 
 
-def export_onnx(
-    run_path: Path, out: Path, miss_rate: float | None = None, panel: Path | None = None
-) -> dict[str, Any]:
+def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     """Write a run's policy to `out`: input `observation` (N, D), outputs `values` and `action`.
 
     `values` are (N, A), `action` is (N,). With a teacher's filter both networks are in it, and the
-    values of actions that are not plausible are -inf. With a `miss_rate` the file has an alarm,
-    fitted to the episodes of `panel`, or of the run's own.
+    values of actions that are not plausible are -inf.
 
     Raises:
         RunError: no such run, no policy yet, or there is something at `out` already.
-        ConfigError: the extra `onnx` is not installed, `out` lies within a store, a panel or
-            another run, or the panel is of another task or allows no alarm of this miss rate.
-        PanelError, StoreError: the panel of the alarm or its store is not there.
+        ConfigError: the extra `onnx` is not installed, or `out` lies within a store, a panel or
+            another run.
     """
     onnx = _onnx()
     run = Run.open(run_path)
@@ -78,9 +65,6 @@ def export_onnx(
         "trained": "" if agent.origin is None else agent.origin.text,
         "restock_version": __version__,
     }
-    if miss_rate is not None:
-        alarm = logged_alarm(_panel(run, panel, profile.task), miss_rate)
-        metadata[ALARM] = msgspec.json.encode(alarm).decode()
     onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
     try:
@@ -89,24 +73,6 @@ def export_onnx(
         raise RunError(f"its policy {error}", where=str(run.path)) from error
     write_bytes(out, content)
     return {"path": str(out), "bytes": out.stat().st_size, **metadata}
-
-
-def _panel(run: Run, given: Path | None, task: Task) -> Panel:
-    """Return the panel of an alarm; raise ConfigError for none, or one of another task."""
-    panel = run_panel(run.document) if given is None else Panel.open(given)
-    if panel is None:
-        raise ConfigError(
-            "the run did not learn from a panel",
-            where="--alarm",
-            remedy="name a panel after the run",
-        )
-    if panel.task_hash != task.hash:
-        raise ConfigError(
-            f"its rows are of task {panel.task_hash}, the run's is {task.hash}",
-            where=str(panel.path),
-            remedy="ingest the logs again with the run's profile, and mix them",
-        )
-    return panel
 
 
 def to_onnx(network: PolicyNetwork) -> Any:
@@ -244,40 +210,3 @@ def _array(tensor: torch.Tensor) -> F32:
 
 def _onnx() -> Any:
     return import_extra("onnx", "the export of a policy")
-
-
-SAFE_ROWS = 50_000  # at most, of episodes chosen by hash: bounds memory and time
-
-
-def logged_alarm(panel: Panel, miss_rate: float) -> Alarm:
-    """Fit an alarm to the panel's episodes, as its first store has them at the panel's version.
-
-    Raises:
-        ConfigError: no such miss rate, or too few episodes that failed or did not.
-        StoreError: the store is no longer there.
-    """
-    episodes = logged_episodes(panel)
-    failed = [(failure, observation) for failure, observation in episodes if failure is not None]
-    return fit_alarm(
-        [observation for _, observation in failed],
-        [failure for failure, _ in failed],
-        [observation for failure, observation in episodes if failure is None],
-        miss_rate=miss_rate,
-        period_s=panel.task.control_period_s,
-    )
-
-
-def logged_episodes(panel: Panel) -> list[tuple[str | None, F32]]:
-    """Return how each episode failed and its observations (n, D) before; all, if it did not."""
-    query = files(__package__).joinpath("onsets.sql").read_text(encoding="utf-8")
-    settings = {
-        "people": list(OPERATORS),
-        "steps": round(WINDOW_S / panel.task.control_period_s),
-        "stuck_m": STUCK_RADIUS_M,
-        "stuck_s": STUCK_WINDOW_S,
-        "safe_rows": SAFE_ROWS,
-    }
-    wanted = pa.table({"episode_id": panel.meta["episode_id"].unique().cast(pa.string())})
-    with panel_store(panel) as store, passed_in(store.connection, wanted=wanted):
-        rows = store.connection.execute(query, settings).fetchall()
-    return [(failure, np.array(observations, np.float32)) for failure, observations in rows]

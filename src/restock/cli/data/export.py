@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,8 +34,7 @@ class ExportCommand:
     out: Annotated[Path, Option("OUT")]
     """The file or directory to write, which must not exist yet."""
     panel: Annotated[Path | None, Positional("[PANEL]")] = None
-    """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata. With
-    --alarm: the panel to take episodes from, in place of the run's."""
+    """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata."""
     query: Annotated[str | None, Option("SQL")] = None
     """An SQL query that selects transitions of a store, with all columns; for lerobot it may add
     a struct "observation.state" of chosen signals. Default: all transitions."""
@@ -45,17 +43,13 @@ class ExportCommand:
     cameras: Annotated[str, Option("NAMES")] = "all"
     """From a store to lerobot: the cameras whose frames are exported, comma-separated, or all, or
     none. A step that lacks a frame of one of them is left out and counted."""
-    alarm: Annotated[float | None, Option("RATE")] = None
-    """For onnx: add an alarm that is on where logged failures, takeovers and bumps began, and
-    misses at most this share of them, for example 0.1."""
     json: bool = False
     """Print what was written as one JSON document."""
 
     def run(self) -> None:
         """Write the data set and say what is in it."""
         if self.to == "onnx":
-            of_rows = ["query", "action", "cameras"]
-            of_rows += ["panel"] if self.alarm is None else []
+            of_rows = ["query", "action", "cameras", "panel"]
             refuse(
                 self,
                 of_rows,
@@ -64,7 +58,7 @@ class ExportCommand:
             )
             from restock.train.evaluation.onnx_policy import export_onnx
 
-            made = export_onnx(self.source, self.out, self.alarm, self.panel)
+            made = export_onnx(self.source, self.out)
             if self.json:
                 output.print_json(made)
             else:
@@ -73,10 +67,7 @@ class ExportCommand:
                     f" -> {made['path']}"
                     f" ({made['bytes']:,} bytes)"
                 )
-                if "alarm" in made:
-                    output.print_text(_alarm_line(json.loads(made["alarm"])))
             return
-        refuse(self, ["alarm"], "applies only to --to onnx", remedy="leave it out")
         if self.to == "run":
             of_rows = ["query", "action", "cameras", "panel"]
             refuse(self, of_rows, "applies only to a data set", remedy="leave it out")
@@ -124,15 +115,6 @@ class ExportCommand:
             return None
         names = [name.strip() for name in self.cameras.split(",")]
         return [] if names == ["none"] else names
-
-
-def _alarm_line(alarm: dict[str, Any]) -> str:
-    failed = ", ".join(f"{count:,} {how}" for how, count in alarm["failures"].items())
-    return (
-        f"alarm: misses at most {alarm['miss_rate']:g} of episodes that fail like the logged ones"
-        f" ({failed}); without a failure {alarm['false_alarms_per_h']:,.0f} false alarms an hour,"
-        f" on {alarm['on_share']:.1%} of the time (in {alarm['safe_h']:.2f} h)"
-    )
 
 
 def _summary(document: dict[str, Any]) -> list[str]:
