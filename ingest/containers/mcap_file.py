@@ -115,8 +115,8 @@ class ChunkReader:
         rooms: list[_Room] = []
         for chunk in group:
             if chunk is self._cut:
-                torn = chunks.inflate_partly(chunk, self._file)
-                rooms.append((chunk, len(torn), torn))
+                held = chunks.inflate_partly(chunk, self._file)
+                rooms.append((chunk, len(held), held))
                 continue
             try:
                 chunks.refuse_implausible(chunk)

@@ -516,7 +516,7 @@ def lifecycle_node(ros: Any, policy: Path, *, drive: bool = False) -> Any:
     """
     returned = ros.TransitionCallbackReturn
 
-    class Node(ros.LifecycleNode):  # type: ignore[misc, name-defined]
+    class Node(ros.LifecycleNode):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__(NAME)
             self.policy = PolicyNode(ros, self, policy, drive=drive)
