@@ -1,7 +1,6 @@
 """A LeRobot v3.0 data set as a recording: a topic for each feature, a message a frame.
 
     meta/info.json                          features: dtype, shape and names; how many frames
-    meta/episodes/chunk-*/file-*.parquet    which data file each episode is in
     data/chunk-*/file-*.parquet             a row a frame
 
 A numeric feature becomes a topic of its name (`/action`) with a float64 for each of its `names`
@@ -95,15 +94,15 @@ class LeRobotFolder(Storage):
             text = "".join(f"float64 {name}\n" for name in feature.fields).encode()
             kind, form = (_type(feature), "ros2msg") if text else (IMAGE, "")
             self.channels[number] = Channel(number, f"/{feature.name}", kind, "cdr", form, text)
-        self.counts = dict.fromkeys(self.channels, 0)
         self._files = self._opened()
         claimed, held = info.get("total_frames"), self.counts[1]
         if isinstance(claimed, int) and claimed != held:
             what = f"{LEROBOT_INFO} counts {claimed:,} frames, and there are {held:,}"
-            if claimed > held:
-                self._lose(what, claimed - held)
-            else:
+            if claimed < held:
                 self.notes.append(what)
+            else:
+                self.damaged(what, dict.fromkeys(self.channels, claimed - held))
+                self.counts = dict.fromkeys(self.channels, claimed)
         there = [file.stamp_ns for file in self._files if len(file.stamp_ns)]
         self.span_ns = (int(there[0][0]), int(there[-1][-1])) if there else None
 
@@ -137,15 +136,14 @@ class LeRobotFolder(Storage):
             )
 
     def _opened(self) -> list[_Frames]:
-        """Find the data files and the stamps of their frames; a file that is missing is damage."""
-        listed = self._listed()
+        """Find the data files and the stamps of their frames."""
         columns = ("timestamp", *COUNTERS, *(one.name for one in self._features.values()))
         found: list[tuple[Path, str]] = []
         parts: list[tuple[Ints, NDArray[Any]]] = []
-        for path in sorted(self._path.glob(LEROBOT_DATA)):
+        paths = sorted(self._path.glob(LEROBOT_DATA))
+        for done, path in enumerate(paths):
+            self._watch("looking through the data files", done, len(paths))
             name = path.relative_to(self._path).as_posix()
-            frames = listed.pop(name, 0)
-            self._watch("looking through the data files", len(found), len(found) + len(listed) + 1)
             try:
                 file = pq.ParquetFile(path)
                 if lacking := [one for one in columns if one not in file.schema_arrow.names]:
@@ -156,14 +154,10 @@ class LeRobotFolder(Storage):
                 if not (np.abs(seconds) < MAX_S).all():  # False for NaN
                     raise ValueError("a timestamp is not a number, or implausible")
             except UNREADABLE as error:
-                what = f"{name} cannot be read: {first_line(error)}"
-                self._refuse(what)
-                self._lose(what, frames)
+                self._refuse(f"{name} cannot be read: {first_line(error)}")
                 continue
             found.append((path, name))
             parts.append((episode, seconds))
-        for name, frames in listed.items():
-            self._lose(f"{name}, which meta/episodes lists, is missing", frames)
         if not found:
             raise RecordingError("a LeRobot data set without data files", where=str(self._path))
         stamps, problem = stamps_of(*map(np.concatenate, zip(*parts, strict=True)))
@@ -171,11 +165,8 @@ class LeRobotFolder(Storage):
             ends = np.cumsum([len(episode) for episode, _ in parts])
             at = int(np.searchsorted(ends, problem[0], "right"))
             row = problem[0] - (ends[at] - len(parts[at][0]))
-            what = f"{found[at][1]}: row {row:,} {problem[1]}"
-            self._refuse(what)
-            self.damaged(what)
-        for channel in self.channels:
-            self.counts[channel] += len(stamps)
+            self._refuse(f"{found[at][1]}: row {row:,} {problem[1]}")
+        self.counts = dict.fromkeys(self.channels, len(stamps))
         cuts = np.cumsum([len(episode) for episode, _ in parts])[:-1]
         each = np.split(stamps, cuts)
         self.notes.append(
@@ -183,34 +174,15 @@ class LeRobotFolder(Storage):
         )
         return [_Frames(*one, stamp_ns) for one, stamp_ns in zip(found, each, strict=True)]
 
-    def _listed(self) -> Counter[str]:
-        """Return the frames of each data file as meta/episodes lists them."""
-        frames = Counter[str]()
-        columns = ["data/chunk_index", "data/file_index", "length"]
-        try:
-            for file in sorted(self._path.glob("meta/episodes/*/*.parquet")):
-                table = pq.ParquetFile(file).read(columns=columns)
-                for chunk, number, length in zip(
-                    *(table[name].to_pylist() for name in columns), strict=True
-                ):
-                    frames[f"data/chunk-{chunk:03d}/file-{number:03d}.parquet"] += length
-        except UNREADABLE as error:
-            self.notes.append(f"meta/episodes cannot be read: {first_line(error)}")
-        return frames
-
     def _refuse(self, what: str) -> None:
+        """Raise RecordingError, or note the damage if the folder is to be salvaged."""
         if not self._salvage:
             raise RecordingError(
                 what,
                 where=str(self._path),
                 remedy="`--salvage` reads what can still be read of it",
             )
-
-    def _lose(self, what: str, frames: int) -> None:
-        """Count frames that there should be and are not."""
-        for channel in self.channels:
-            self.counts[channel] += frames
-        self.damaged(what, dict.fromkeys(self.channels, frames))
+        self.damaged(what)
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Yield the frames of each data file in order."""
