@@ -50,7 +50,7 @@ MAY_IMPORT = {
         " replay/mixture replay/panel replay/store ingest/profile ingest/task"
         " replay/sampling"
     ),
-    "train/dqn": "twin/missions twin/env twin/physics replay/fleet replay/mixture",
+    "train/dqn": "twin/missions twin/env twin/physics replay/fleet",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/env twin/floors replay/mixture replay/panel"
@@ -114,12 +114,11 @@ MAY_IMPORT = {
         "cli report ingest/profile ingest/store replay replay/fleet replay/mixture replay/trace"
         " train train/judge train/dqn train/evaluation train/run"
         " train/study train/twin/floors train/twin/physics train/view ingest/task"
-        " replay/panel train/feed replay/store train/twin/calibration"
+        " replay/panel train/feed"
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose ingest/task"
-        " replay/mixture replay/panel replay/store replay/trace train/judge train/dqn"
-        " train/evaluation train/run train/twin/calibration"
+        " replay/mixture replay/panel replay/trace train/dqn train/evaluation train/run"
         " train/twin/floors train/twin/missions"
     ),
     "cli/twin": (
