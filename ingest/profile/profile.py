@@ -370,9 +370,7 @@ class NotLive:
 
     takes: str  # "its pose from transforms"
     why: str  # why it is not there
-    topics: str  # the tables of the profile that it needs instead
     remedy: str
-    settings: str = ""  # that it needs with them
 
 
 def not_live(profile: Profile) -> list[NotLive]:
@@ -384,7 +382,6 @@ def not_live(profile: Profile) -> list[NotLive]:
             NotLive(
                 "its pose from transforms ([frames])",
                 "which are not held live",
-                "[inputs.pose]",
                 _POSE,
             )
         )
@@ -393,7 +390,6 @@ def not_live(profile: Profile) -> list[NotLive]:
             NotLive(
                 "its pose from satellite fixes",
                 "whose frame and heading are not computed live",
-                "[inputs.pose]",
                 f"{_POSE}, such as that of robot_localization's navsat_transform_node",
             )
         )
@@ -402,7 +398,6 @@ def not_live(profile: Profile) -> list[NotLive]:
             NotLive(
                 "its pose by dead reckoning",
                 "which is not computed live",
-                "[inputs.pose]",
                 f"{_POSE}, such as that of its odometry",
             )
         )
@@ -411,10 +406,8 @@ def not_live(profile: Profile) -> list[NotLive]:
             NotLive(
                 "its goals in hindsight",
                 "which is not possible live",
-                "[inputs.goal], [inputs.plan]",
                 "name the topics of goal and plan under [inputs.goal] and [inputs.plan], with"
                 ' goal.source = "logged"',
-                'goal.source = "logged"',
             )
         )
     return found

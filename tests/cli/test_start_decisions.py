@@ -1,17 +1,11 @@
 """What `restock start` decides between its stages, and what it says of it at the end."""
 
 import re
-from pathlib import Path
 from typing import Any
 
-import pytest
 from support.driven_robot import Drive, start, up_to_the_panel, write_bag
-from support.profile_texts import WAREHOUSE
 
-from restock.cli.start.decisions import fit_is_worse, node_refuses
-from restock.errors import ConfigError
-from restock.ingest.live.observer import LiveObserver
-from restock.ingest.profile.profile import load_profile
+from restock.cli.start.decisions import fit_is_worse
 
 
 def test_a_worse_fit_is_reported_with_its_figures() -> None:
@@ -47,27 +41,3 @@ def test_a_lidar_that_sees_into_the_robot_stops_it(tmp_path, capsys):
     assert "length_m and width_m of [task.body]" in document["stopped"]["remedies"][0]
     _, document = start(capsys, *argv, "--accept")
     assert document["stages"][-1]["name"] == "mix"
-
-
-def test_a_profile_that_the_node_refuses_is_told_with_the_policy(tmp_path: Path) -> None:
-    """The export was suggested as if it could drive, though the node refuses such a profile."""
-    file = tmp_path / "p.toml"
-    hindsight = '[goal]\nsource = "hindsight"\n'
-    frames = '[frames]\nfixed = "map"\nbase = "base_link"\n'
-    logged = WAREHOUSE.split("[inputs.goal]")[0]
-    for text, needs in (
-        (WAREHOUSE, ()),
-        (f"{logged}\n{hindsight}", ("[inputs.goal], [inputs.plan]", 'goal.source = "logged"')),
-        (f"{WAREHOUSE}\n{frames}", ("[inputs.pose]",)),
-    ):
-        file.write_text(text)
-        profile = load_profile(str(file))
-        reported = node_refuses(file)
-        if not needs:
-            assert reported is None
-            LiveObserver(profile)
-            continue
-        assert reported is not None
-        assert all(each in reported for each in needs)
-        with pytest.raises(ConfigError):
-            LiveObserver(profile)

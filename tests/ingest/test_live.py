@@ -12,6 +12,7 @@ import pytest
 from rosbags.rosbag2 import Writer
 from support.kept_run import kept_network, kept_run
 from support.paths import ROOT
+from support.profile_texts import WAREHOUSE
 
 from restock.cli import run_node
 from restock.errors import ConfigError, RecordingError
@@ -29,6 +30,7 @@ from restock.train.twin.recording.bag_writer import typestore
 BAG = ROOT / "sample_logs" / "amr_tuesday"
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task
+GOALS = ("[inputs.goal]", "[inputs.plan]", 'goal.source = "logged"')
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +166,12 @@ def test_memory_does_not_grow_with_messages():
     assert sum(len(held) for held in observer._buffers.values()) < 30
 
 
-def test_a_profile_that_needs_transforms_is_refused():
+def test_a_profile_of_what_no_robot_gives_is_refused(tmp_path: Path) -> None:
     framed = msgspec.structs.replace(PROFILE, frames=Frames())
-    with pytest.raises(ConfigError, match="from transforms"):
-        LiveObserver(framed)
+    file = tmp_path / "hindsight.toml"
+    without_goals = WAREHOUSE.split("[inputs.goal]")[0]
+    file.write_text(f'{without_goals}\n[goal]\nsource = "hindsight"\n')
+    for profile, needs in ((framed, ("[inputs.pose]",)), (load_profile(str(file)), GOALS)):
+        with pytest.raises(ConfigError) as refused:
+            LiveObserver(profile)
+        assert all(each in str(refused.value) for each in needs)

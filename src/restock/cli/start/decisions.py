@@ -122,21 +122,6 @@ def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
     )
 
 
-def node_refuses(profile: Path | str | None) -> str | None:
-    """Return why the node refuses this profile, and which one it needs; None if it takes it."""
-    from restock.ingest.profile.profile import load_profile, not_live
-
-    if profile is None or not (lacking := not_live(load_profile(str(profile)))):
-        return None
-    takes = " and ".join(one.takes for one in lacking)
-    topics = ", ".join(one.topics for one in lacking)
-    settings = "".join(f" with {one.settings}," for one in lacking if one.settings)
-    return (
-        f"the node on the robot refuses its profile, which takes {takes}. Give the node a profile "
-        f"with the same [task],{settings} and with topics under {topics}"
-    )
-
-
 def horizon(profile: Path | str | None) -> float:
     """Return some 3 s in whole control periods, the horizon of the twin's limits."""
     if (task := _task(profile)) is None:

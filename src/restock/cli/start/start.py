@@ -335,10 +335,6 @@ class StartCommand:
             if not self.dry_run:
                 onnx = f"restock export {quoted(self.out / 'run')} --to onnx --out policy.onnx"
                 say(f"\nThe policy, for the robot: {escape(onnx)} (docs/deploy.md)")
-                if (
-                    needs := decisions.node_refuses(self.profile or self.out / "profile.toml")
-                ) is not None:
-                    say(f"   {escape(needs)} (docs/deploy.md#without-the-node)")
                 say(f"The report: [bold]{escape(str(page))}[/bold] (open it in a browser)")
             return int(ExitCode.OK)
         say(f"\n[bold yellow]Stopped: {escape(stopped.why)}[/bold yellow]")
