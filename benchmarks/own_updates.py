@@ -16,7 +16,7 @@ from restock.train.dqn.learner import Learner
 from restock.train.dqn.network import UpdatePath
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches, LogTerms
-from restock.train.feed.fresh_log import EpisodeLabels
+from restock.train.feed.fresh_labels import EpisodeLabels
 from restock.train.feed.logs import Coded, Logs
 from restock.train.feed.update_blocks import Made, UpdateBlocks
 from restock.train.run.run import Run

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.toy_run import config, run_to_end, tables
 from support.toy_twin import TASK
 
-from restock.train.feed.fresh_log import NEVER, WAITING, EpisodeLabels
+from restock.train.feed.fresh_labels import NEVER, WAITING, EpisodeLabels
 from restock.train.session import Session
 
 # Every batch is audited, so that the sums can be counted from the audited rows.

@@ -68,7 +68,7 @@ def test_dry_run_names_conditions_the_twin_cannot_evaluate(folder, capsys):
 @pytest.mark.long
 def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, capsys):
     capsys.readouterr()
-    assert train(folder, "run", "--flush-fresh", str(folder / "store")) == 0
+    assert train(folder, "run") == 0
     said = capsys.readouterr().err
     assert said.count("condition 'sagging' is not evaluated in the twin") == 1
     assert json.loads((folder / "run" / "config.json").read_text())["not_evaluated"] == {
@@ -88,20 +88,3 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, capsys):
     page = (folder / "run" / "report.html").read_text()
     assert "Conditions of the logs that the twin cannot show" in page
     assert "battery_v" in page
-
-    # The twin's episodes are in the store now; new conditions label what they can of them.
-    text = (folder / "mine.toml").read_text().replace("26.395", "20")
-    (folder / "mine.toml").write_text(text)
-    capsys.readouterr()
-    assert (
-        main(["store", "label", str(folder / "store"), "--profile", str(folder / "mine.toml")]) == 0
-    )
-    query = (
-        "SELECT count(*) FILTER (primary_condition = 'creeping' AND battery_v IS NULL) AS fresh,"
-    )
-    query += " count(*) FILTER (primary_condition = 'sagging') AS sagging FROM transitions"
-    capsys.readouterr()
-    assert main(["sql", str(folder / "store"), query, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["fresh"] > 0
-    assert row["sagging"] == 0

@@ -224,7 +224,6 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
         (["train", "--resume", "{missing}"], "no such run"),
         (["train", "--resume", "{trained}", "--seed", "3"], "own panel, config and seed"),
         (["train", "--out", "{new}", "--panel", "{panel}", "--set", "loss.discount=0.9"], "0.99"),
-        (["train", "--out", "{new}", "--flush-fresh", "{panel}"], "is a panel, not a store"),
         (["eval", "{missing}"], "no such run"),
         (["eval", "{trained}", "--policies", "nobody"], "there is no 'nobody'"),
         (["eval", "{trained}", "--perturbations", "rain"], "choose from none, friction"),

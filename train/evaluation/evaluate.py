@@ -28,7 +28,7 @@ from restock.ingest.task.task import Signals, Task
 from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.learner import Learner, value_lag
 from restock.train.feed.collector import Collector
-from restock.train.feed.fresh_log import values_entries
+from restock.train.feed.fresh_labels import values_entries
 from restock.train.feed.logs import LogFidelity, Probe
 from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec

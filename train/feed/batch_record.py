@@ -34,7 +34,7 @@ from restock.state import Stateful
 from restock.train.dqn.algorithm import Loss
 from restock.train.feed import sampled_rows
 from restock.train.feed.batches import ReplayBatch
-from restock.train.feed.fresh_log import WAITING, EpisodeLabels, FreshPerturbations
+from restock.train.feed.fresh_labels import WAITING, EpisodeLabels, FreshPerturbations
 from restock.train.feed.logs import Logs
 from restock.train.feed.sampled_rows import (
     FRESH,

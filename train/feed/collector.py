@@ -10,7 +10,6 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,16 +32,15 @@ from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.strata import NOMINAL_PRIORITY, ResolvedStratum, assign, rules_of
 from restock.replay.sampling.ring import FreshRing
-from restock.state import Stateful, saved
+from restock.state import Stateful
 from restock.train.dqn.behaviour import UNKNOWN
-from restock.train.feed.fresh_log import EpisodeLabels, FreshLog, FreshPerturbations, values_entries
+from restock.train.feed.fresh_labels import EpisodeLabels, FreshPerturbations, values_entries
 from restock.train.feed.teacher import AskedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
 _EPISODES_PER_QUERY = 32  # planning one takes as long as labelling a thousand of their steps
 _NO_VALUES = ("{}",)  # of a twin that has only a name for them
-_NOT_SAID = ("",)  # of a twin that does not tell situations
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,6 @@ class EndedEpisode:
     signals: Signals  # (steps + 1,) each
     perturbation_values: str = "{}"  # JSON: those that are not nominal
     layout: str = DEFAULT
-    zones: list[str] | None = None  # (steps + 1,) on its layout; None: what the profile says
     arm: int = -1  # of the twin's `mission_arms`; -1: none was chosen
 
 
@@ -124,16 +121,6 @@ class Collector(Stateful):
         self._label: Label | int = UNKNOWN  # what the teacher would have done in the step
         self.perturbations = FreshPerturbations()
         self.labels = EpisodeLabels()  # of the episodes that ended, until the record takes them
-        self.log: FreshLog | None = None
-        self._saved_log: Mapping[str, Any] | None = None
-
-    def keep(self, folder: Path) -> FreshLog:
-        """Keep labelled episodes whole in `folder` from here on, or as in a checkpoint."""
-        longest = self.task.time_limit_steps
-        self.log = FreshLog(folder, self.ring.observation_size, longest, self._steps)
-        if self._saved_log is not None:
-            self.log.load_state_dict(self._saved_log)
-        return self.log
 
     def check_conditions(self) -> None:
         """Raise ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
@@ -218,17 +205,6 @@ class Collector(Stateful):
         )
         if info["invalid"].any():
             self._drop(keys, info["invalid"])
-        if self.log is not None:
-            self.log.begin_step(self._steps, self.observation, acting_step)
-            self.log.end_step(
-                self._steps,
-                action=action,
-                probability=probability,
-                reward=reward,
-                progress_m=info["progress_m"],
-                truth=info["true_condition"],
-                exposure=info.get("true_exposure", _NOT_SAID * self.env.num_envs),
-            )
         self.observation = np.array(observation, copy=True)
         after = info["signals"]
         bumped = np.asarray(after["bumped"], np.bool_)
@@ -253,7 +229,6 @@ class Collector(Stateful):
                     perturbation=str(info["perturbation"][place]),
                     perturbation_values=str(values[place]),
                     layout=str(info["layout"][place]) if "layout" in info else DEFAULT,
-                    zones=self._zones(info, int(place), count),
                     arm=int(info["mission_arm"][place]) if "mission_arm" in info else -1,
                     true_condition=str(info["episode_condition"][place]),
                     block=str(info["block"][place]),
@@ -267,25 +242,10 @@ class Collector(Stateful):
                     },
                 )
             )
-            if self.log is not None:
-                self.log.end_episode(
-                    int(place),
-                    finished[-1],
-                    next_observation[place],
-                    terminated=bool(terminated[place]),
-                    broken=bool(info["invalid"][place]),
-                )
         self._steps[ended], self._return[ended], self._bumps[ended] = 0, 0.0, 0
         self._touching[ended] = False
         self._unlabelled.extend(finished)
         return finished
-
-    def _zones(self, info: Mapping[str, Any], env: int, count: int) -> list[str] | None:
-        """Return `LAYOUT/zone` of an episode's steps; None on the floor of the profile's zones."""
-        if "floor" not in info or (floor := info["floor"][env]).name == DEFAULT:
-            return None
-        x, y = (self._history[f"pose_{axis}_m"][env, : count + 1] for axis in "xy")
-        return [f"{floor.name}/{zone}" for zone in floor.zone_of(x, y)]
 
     def _drop(self, keys: NDArray[np.int64], invalid: NDArray[np.bool_]) -> None:
         """Replace the row of a step whose physics diverged by the row before it."""
@@ -316,8 +276,6 @@ class Collector(Stateful):
         exposures = [] if self.strata is None else self.strata.exposures
         held = label(steps_table(waiting), [*self.conditions, *exposures])
         labels = {condition.name: held[condition.name] for condition in self.conditions}
-        if self.log is not None:
-            self.log.keep_labelled(waiting, labels)
         names = primary(labels, self.conditions)
         codes = np.array([self._codes[name] for name in names] or [], np.int64)
         rows, begin = [], 0
@@ -357,13 +315,12 @@ class Collector(Stateful):
         """Return arrays and JSON values. Call between `finish` and `start`, never during a step."""
         if self._sent is not None:
             raise RuntimeError("a step is under way")
-        return {**super().state_dict(), "log": saved(self.log)}
+        return super().state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the collector; the twin has its own state."""
         super().load_state_dict(state)
         self._unlabelled = [EndedEpisode(**episode) for episode in state["unlabelled"]]
-        self._saved_log = state["log"]
 
 
 def conditions_in_twin(

@@ -23,7 +23,7 @@ from restock import native
 from restock.arrays import F32, F64, Ints
 from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
-from restock.train.feed.fresh_log import WAITING, EpisodeLabels, FreshPerturbations
+from restock.train.feed.fresh_labels import WAITING, EpisodeLabels, FreshPerturbations
 from restock.train.feed.logs import Coded, Logs
 
 _MAX_CELLS = 1 << 22  # of a dense count; wider ranges of episodes are sorted instead

@@ -215,8 +215,8 @@ def _experiment(
         "these symptoms must be gone, and nothing else change",
         "ACTION_COVERAGE": "train again with logged rows of "
         + ", ".join(lacking)
-        + " (record some, or use rows from the twin: `restock train --flush-fresh`): this symptom "
-        "must disappear, and the offline policy must not get worse there",
+        + " (record some; `restock twin record` drives the twin): this symptom must disappear, and "
+        "the offline policy must not get worse there",
         "TARGET": f"train again with the target rule {other_target(rule)} in place of {rule} on "
         "the same panel: the figures of the target must be back within their limits",
         "BOTH": f"first change the target rule alone, from {rule} to {other_target(rule)}, then "

@@ -39,7 +39,7 @@ from restock.train.dqn.algorithm import Loss
 from restock.train.feed.batch_record import FeedRecord, NotFinite, check_fed, row_ids
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.feed.fresh_log import EpisodeLabels, values_entries
+from restock.train.feed.fresh_labels import EpisodeLabels, values_entries
 from restock.train.feed.logs import Logs
 from restock.train.run.run import Rows, Run, check_free, now_ns, panel_document, software_versions
 from restock.train.run.run_profile import profile_document, profile_of_panel

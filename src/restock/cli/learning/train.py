@@ -19,7 +19,6 @@ from restock.process import went_on_after_interrupt
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
     from restock.train.dqn.config import TeacherConfig, TrainConfig
-    from restock.train.feed.fresh_log import Flushed
     from restock.train.loop import TrainResult
     from restock.train.prepare import Prepared
 
@@ -66,9 +65,6 @@ class TrainCommand:
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
     """Device of the network."""
-    flush_fresh: Path | None = None
-    """At the end, write the twin's labelled episodes to this store, as a recording of format
-    `twin`. Until then they are kept in the run's directory."""
     dry_run: bool = False
     """Check everything and print the resolved config; write nothing."""
     json: bool = False
@@ -78,10 +74,6 @@ class TrainCommand:
         from restock.train.dqn.config import apply_overrides, parse_config
         from restock.train.prepare import prepare_new, prepare_resumed
 
-        if self.flush_fresh is not None:  # refused before the training, not after it
-            from restock.ingest.store.writer import StoreWriter
-
-            StoreWriter(self.flush_fresh).expect_folder()
         given = {
             "schedule.env_steps": self.env_steps,
             "schedule.seconds": self.seconds,
@@ -110,15 +102,12 @@ class TrainCommand:
             say(describe_run(prepared))
             print_json(prepared.document)
             return 0
-        outcome, flushed = _train(prepared, self.flush_fresh)
-        _print(prepared, outcome, flushed, as_json=self.json)
+        _print(prepared, _train(prepared), as_json=self.json)
         return 0
 
 
-def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
-    """Train to the end; then flush the twin's episodes if a store is given."""
-    from restock.ingest.store.writer import StoreWriter
-    from restock.train.feed.fresh_log import flush
+def _train(prepared: Prepared) -> TrainResult:
+    """Train to the end of the budget, with a progress bar."""
     from restock.train.loop import TrainingInterrupted, nothing_to_do, train
     from restock.train.run.run import resuming
 
@@ -127,8 +116,6 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     say(describe_run(prepared))
     if prepared.resumed is not None and (why := nothing_to_do(session)) is not None:
         say(f"nothing to do: {why}")
-    if store is not None or (session.run.path / "fresh").is_dir():
-        session.collector.keep(session.run.path / "fresh")
     seconds = config.schedule.seconds
 
     def spent() -> int:
@@ -162,7 +149,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     seen = spent()
 
             try:
-                outcome = train(session, stop=stop, notify=notify)
+                return train(session, stop=stop, notify=notify)
             except KeyboardInterrupt:
                 went_on_after_interrupt()
                 path, kept = session.run.path, session.run.latest.exists()
@@ -175,11 +162,6 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     if kept
                     else "remove it, and train again",
                 ) from None
-        if store is None or (log := session.collector.log) is None:
-            return outcome, None
-        return outcome, flush(
-            session.run.path, StoreWriter(store), prepared.profile, log.dropped_steps
-        )
     finally:
         session.close()
 
@@ -226,9 +208,7 @@ def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
     return f"{wall_s:6.0f} s {values['env_steps']:>9,} steps  success: {cells}{mark}"
 
 
-def _print(
-    prepared: Prepared, outcome: TrainResult, flushed: Flushed | None, *, as_json: bool
-) -> None:
+def _print(prepared: Prepared, outcome: TrainResult, *, as_json: bool) -> None:
     from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls
     from restock.train.run.run import Run
 
@@ -239,13 +219,12 @@ def _print(
             say(f"warning: {why}")
     path = str(prepared.path)
     if as_json:
-        fresh = {"flushed": asdict(flushed)} if flushed is not None else {}
         scores = asdict(outcome)
         for kept in (scores["best"], scores["last"]):
             if kept is not None and not kept["success"]:  # the task has no goal
                 kept["success_mean"] = None
         given = {"run": path, "panel": prepared.document["panel"], "fed": fed}
-        print_json({**given, **scores, **fresh})
+        print_json({**given, **scores})
         return
     rows = []
     for name, result in (("best (kept)", outcome.best), ("last", outcome.last)):
@@ -256,11 +235,6 @@ def _print(
         print_table(rows, title="success on the fixed episodes, greedy")
     if fed:
         print_table(fed_table(fed), title="what the critic was fed: % of all rows")
-    if flushed is not None:
-        say(
-            f"recording {flushed.recording_id}, {flushed.episodes:,} episodes of the twin with"
-            f" {flushed.transitions:,} transitions: {flushed.status}"
-        )
     say(
         f"{outcome.env_steps:,} environment steps and {outcome.gradient_steps:,} updates in"
         f" {outcome.wall_s:.0f} s\nnext: restock eval {quoted(path)}"
