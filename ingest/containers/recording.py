@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-import numpy as np
 from blake3 import blake3
-from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.errors import RecordingError
@@ -40,25 +38,13 @@ from restock.ingest.decoding.columns import (
     CannotDecode,
     Channel,
     Leaf,
-    MessageBatch,
     MessageType,
     TopicColumns,
 )
 from restock.ingest.decoding.decoders import decoder_of, type_of
 from restock.ingest.decoding.row_by_row import Decoder
 
-STATIC_TRANSFORMS = "/tf_static"
 MAX_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
-
-
-@dataclass(frozen=True)
-class RawMessage:
-    """A message as it is in the file, decompressed."""
-
-    channel: Channel
-    log_time_ns: int
-    publish_time_ns: int
-    payload: bytes
 
 
 @dataclass(frozen=True)
@@ -323,31 +309,6 @@ class Recording:
                     yield plain.log_time_ns[decoded.rows], decoded.fields
         self.accounts.setdefault(topic, reading.close(self._lost(topic)))
 
-    def raw_between(self, low_ns: int, high_ns: int) -> list[RawMessage]:
-        """Return messages logged in [low_ns, high_ns] and those in force before, by log time.
-
-        In force are each topic's last message before `low_ns`, and all messages of `/tf_static`, on
-        which several nodes publish.
-        """
-        self._expect_open()
-        before: dict[str, list[RawMessage]] = {}
-        inside: list[RawMessage] = []
-        for storage in self._storages:
-            for number, batch in storage.batches(list(storage.channels)):
-                channel, log_ns = storage.channels[number], batch.log_time_ns
-                inside += _messages(channel, batch, (log_ns >= low_ns) & (log_ns <= high_ns))
-                earlier = np.flatnonzero(log_ns < low_ns)
-                if channel.topic == STATIC_TRANSFORMS:
-                    held = before.setdefault(channel.topic, [])
-                    held += _messages(channel, batch, earlier)
-                elif len(earlier):
-                    latest = earlier[np.argmax(log_ns[earlier])]
-                    held = before.get(channel.topic, [])
-                    if not held or held[0].log_time_ns <= log_ns[latest]:
-                        before[channel.topic] = list(_messages(channel, batch, np.array([latest])))
-        held = [message for messages in before.values() for message in messages]
-        return sorted([*held, *inside], key=lambda message: message.log_time_ns)
-
     def _channels(self, topic: str) -> list[_Stream]:
         if topic not in self._streams:
             has, where = ", ".join(sorted(self._streams)) or "no topics", str(self.path)
@@ -429,13 +390,3 @@ class Recording:
 def _count(damage: Damage) -> int | None:
     """Return how many messages damage cost; None if that is not known."""
     return sum(damage.messages.values()) or None
-
-
-def _messages(channel: Channel, batch: MessageBatch, rows: NDArray[Any]) -> Iterator[RawMessage]:
-    """Yield these rows of a batch (numbers or a mask); skip what cannot be decompressed."""
-    if rows.dtype == np.bool_:
-        rows = np.flatnonzero(rows)
-    for some, _ in decompressed(batch.select(rows)):
-        times = zip(some.log_time_ns.tolist(), some.publish_time_ns.tolist(), strict=True)
-        for payload, (log_ns, publish_ns) in zip(some.payloads(), times, strict=True):
-            yield RawMessage(channel, log_ns, publish_ns, payload)

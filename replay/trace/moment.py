@@ -1,28 +1,19 @@
-"""The moment around a stored row: the steps before and after it, and what the robot saw then."""
+"""What a robot saw at a moment: scans, plan and goal at ticks, and ranges from observations."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 
 from restock.arrays import F32, F64, Ints
-from restock.errors import RecordingError, StoreError
-from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import RawMessage, Recording
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Input
-from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
-from restock.ingest.steps.needs import angle_keys, beam_angles, read_topics
+from restock.ingest.steps.aligned_inputs import AlignedInputs
+from restock.ingest.steps.needs import angle_keys, beam_angles
 from restock.ingest.task.surroundings import outline_reach
 from restock.ingest.task.task import Body, Task
-from restock.replay.store.store import Store
-from restock.replay.trace.origin import Origin, profile_of, rows_of, sql_file
 
 BINS = 720  # of bearings, where scans are put together
 
@@ -45,16 +36,6 @@ class Seen:
     scans: list[SeenScan | None]
     plans_m: list[F64 | None]  # of (P, 2) points in the fixed frame
     goals_m: list[tuple[float, float] | None]
-
-
-def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: int) -> Seen:
-    """Return what the ticks in [low_ns, high_ns] of the alignment clock saw.
-
-    Raises:
-        RecordingError: the recording does not fit the profile.
-    """
-    aligned = align_inputs(profile, read_topics(recording, profile, reduced=False))
-    return seen_of(aligned, low_ns, high_ns)
 
 
 def seen_of(aligned: AlignedInputs, low_ns: int, high_ns: int) -> Seen:
@@ -135,56 +116,6 @@ def _goals(aligned: AlignedInputs, stamps: Ints) -> list[tuple[float, float] | N
     return [(float(goals[row, 0]), float(goals[row, 1])) if ok else None for row, ok in known]
 
 
-NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class Moment:
-    """Some seconds of a recording around one transition, as a store has them.
-
-    `steps` are rows of the store in the order of time, T of them. What is not known is None or
-    empty; `notes` say why.
-    """
-
-    at: dict[str, Any]  # the transition that it is about
-    steps: list[dict[str, Any]]  # T
-    task: Task
-    log_offset_ns: int  # log time less the clock of the steps' stamps, at that transition
-    window_ns: tuple[int, int]  # by log time
-    seen: Seen | None = None  # at the recording's own ticks, where the recording was given
-    messages: list[RawMessage] = field(default_factory=list)  # of the recording, every topic
-    notes: list[str] = field(default_factory=list)
-
-    def column(self, name: str) -> list[Any]:
-        """Return a column of the steps, (T,)."""
-        return [step[name] for step in self.steps]
-
-    @property
-    def observations(self) -> F32:
-        """Return the observations, (T, D) float32."""
-        return np.asarray(self.column("observation"), np.float32)
-
-    @property
-    def log_ns(self) -> list[int]:
-        """Return each step's log time, (T,)."""
-        return [int(stamp) + self.log_offset_ns for stamp in self.column("stamp_ns")]
-
-    def sector_scans(self) -> list[SeenScan]:
-        """Return what the policy saw of the lidar at each step: a range a sector, T of them.
-
-        The observation holds clearances: with the body's reach that way they are ranges again.
-        Empty where the robot has no lidar.
-        """
-        if not self.task.lidar:
-            return []
-        bearing, ranges = sector_ranges(self.task, self.observations)
-        stamps = self.column("stamp_ns")
-        return [
-            SeenScan(int(stamp), row, float(bearing[0]), 2 * np.pi / self.task.sectors)
-            for stamp, row in zip(stamps, ranges, strict=True)
-        ]
-
-
 def sector_ranges(task: Task, observations: F32) -> tuple[F64, F64]:
     """Return the bearing of each sector, (S,), and the ranges in N observations, (N, S); inf: free.
 
@@ -199,79 +130,3 @@ def sector_ranges(task: Task, observations: F32) -> tuple[F64, F64]:
     ranges = np.add(clearance, outline_reach(bearing, task.body))
     ranges[clearance >= task.range_max_m * (1 - 1e-6)] = np.inf
     return bearing, ranges
-
-
-def find_moment(
-    origin: Origin,
-    *,
-    before_s: float = 5.0,
-    after_s: float = 5.0,
-    recording: Path | str | None = None,
-) -> Moment:
-    """Return the seconds around a row of a store.
-
-    Args:
-        origin: of the row, as a trace found it.
-        before_s: seconds before it.
-        after_s: and after it.
-        recording: the recording it is from: scans, plans and all other topics are read from it.
-
-    Raises:
-        StoreError: the store has no manifest of the recording any more.
-        RecordingError: the recording given is not the one the row is of, or cannot be read.
-    """
-    row = origin.transition
-    low = int(row["stamp_ns"]) - round(before_s * NS)
-    high = int(row["stamp_ns"]) + round(after_s * NS)
-    named = {"ingest": row["ingest_id"], "recording": row["recording_id"]}
-    with Store(origin.store["path"], version=origin.store["version"]) as store:
-        steps = rows_of(
-            store.connection, sql_file("trace_moment.sql"), {**named, "low": low, "high": high}
-        )
-        manifests = rows_of(store.connection, sql_file("trace_manifest.sql"), named)
-    if not manifests:
-        raise StoreError(
-            "the manifest of the row's recording no longer exists: its task and clock are not "
-            "known",
-            where=str(origin.store["path"]),
-            remedy="ingest the recording again",
-        )
-    manifest = manifests[0]
-    if (logged := row.get("logged_ns")) is not None:  # the clocks may drift: as far apart as here
-        offset = int(logged) - int(row["stamp_ns"])
-    else:
-        offset = int(manifest["clock_offset_ns"] or 0)
-    moment = Moment(
-        at=row,
-        steps=steps,
-        task=msgspec.json.decode(manifest["task_json"], type=Task),
-        log_offset_ns=offset,
-        window_ns=(low + offset, high + offset),
-    )
-    if recording is None:
-        moment.notes.append(
-            "scans, plans and other topics are only in the recording: give it with"
-            f" --recording {row['source_file']}"
-        )
-        return moment
-    known = profile_of(origin, manifest)
-    with open_recording(recording, salvage=True) as opened:
-        if opened.recording_id != row["recording_id"]:
-            raise RecordingError(
-                f"is recording {opened.recording_id}, the row is of {row['recording_id']}",
-                where=str(recording),
-                remedy="give the recording from which the row was made; the row contains its path "
-                "at the time",
-            )
-        messages = opened.raw_between(*moment.window_ns)
-        seen = None
-        if known is None:
-            moment.notes.extend(note for note in origin.notes if note not in moment.notes)
-        else:
-            try:
-                seen = seen_between(opened, known, low, high)
-            except RecordingError as error:
-                raise RecordingError(
-                    error.what, where=str(recording), remedy=error.remedy
-                ) from error
-    return replace(moment, seen=seen, messages=messages)

@@ -80,7 +80,7 @@ def test_an_assistant_asks_a_store(store, tmp_path):
         rows = await answer(client, "sql", query="SELECT min(transition_id) AS id FROM transitions")
         traced = await answer(client, "trace", row=str(rows["rows"][0]["id"]))
         assert traced["transition"]["step_index"] == 0
-        assert "is not a row" in await answer(client, "trace", row="--view=/tmp/x.mcap")
+        assert "is not a row" in await answer(client, "trace", row="--recording=/tmp/x.mcap")
         assert "restock gate RUN" in await answer(client, "gate")
 
     before = sorted(tmp_path.iterdir())

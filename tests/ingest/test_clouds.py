@@ -18,11 +18,12 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import Ragged, offsets_of
 from restock.ingest.profile.profile import parse_profile
+from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.clouds import BEAM_RAD, cloud_reduction
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
 from restock.replay.store.store import Store
-from restock.replay.trace.moment import seen_between
+from restock.replay.trace.moment import seen_of
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 FIELDS = 'ranges_m = "ranges", angle_min_rad = "angle_min", angle_increment_rad = "angle_increment"'
@@ -211,7 +212,8 @@ def test_a_drive_with_clouds_has_the_clearance_of_its_scans(tmp_path):
     profile = parse_profile(PROFILE, where="cloud.toml")
     with open_recording(bag) as recording:
         start_ns = recording.span_ns[0]
-        seen = seen_between(recording, profile, start_ns, start_ns + 2 * 10**9).scans
+        aligned = align_inputs(profile, read_topics(recording, profile, reduced=False))
+        seen = seen_of(aligned, start_ns, start_ns + 2 * 10**9).scans
     assert all(scan is None or len(scan.ranges_m) == 720 for scan in seen)
     assert any(scan is not None for scan in seen)
 

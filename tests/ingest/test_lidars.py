@@ -19,10 +19,11 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.task.surroundings import MovedMap, outline_reach, with_unseen
-from restock.replay.trace.moment import seen_between
+from restock.replay.trace.moment import seen_of
 
 TASK = load_profile("warehouse_amr").task
 LEFT_M, RIGHT_M = 2.0, 0.2  # y of the walls: the robot drives along y = 1
@@ -211,7 +212,8 @@ def test_a_running_robot_sees_by_all_lidars_what_ingest_stores(tmp_path):
 def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path):
     bag, profile = Corridor().bag(tmp_path / "bag"), parse_profile(two_lidars(), where="p")
     with open_recording(bag) as recording:
-        scans = seen_between(recording, profile, 1_700_000_001 * 10**9, 1_700_000_003 * 10**9).scans
+        aligned = align_inputs(profile, read_topics(recording, profile, reduced=False))
+        scans = seen_of(aligned, 1_700_000_001 * 10**9, 1_700_000_003 * 10**9).scans
     assert len(scans) > 5
     for scan in scans:
         assert scan is not None

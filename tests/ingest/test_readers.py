@@ -277,12 +277,10 @@ def test_a_file_that_is_no_recording_is_refused(content: bytes | None, says: str
 @pytest.mark.parametrize("container", ["mcap, lz4", "sqlite3 bag", "mcap bag, zstd file"])
 def test_a_closed_recording_is_not_an_empty_one(container: str, tmp_path: Path) -> None:
     with open_recording(CONTAINERS[container](tmp_path)) as recording:
-        assert len(recording.raw_between(0, 2**62))
+        assert recording.topics
     recording.close()  # again: nothing happens
     with pytest.raises(RecordingError, match="it is closed"):
         recording.read({"/odom": ["twist.twist.linear.x"]})
-    with pytest.raises(RecordingError, match="it is closed"):
-        recording.raw_between(0, 2**62)
 
 
 def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:

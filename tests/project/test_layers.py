@@ -72,7 +72,6 @@ MAY_IMPORT = {
         " replay/sampling replay/store ingest/profile ingest/task"
     ),
     "train/study": "judge dqn evaluation libraries run replay/panel twin/missions",
-    "train/view": "dqn evaluation run twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "ingest/task",
     "train/twin/missions": "twin/floors",
@@ -113,8 +112,8 @@ MAY_IMPORT = {
     "cli/learning": (
         "cli report ingest/profile ingest/store replay replay/fleet replay/mixture replay/trace"
         " train train/judge train/dqn train/evaluation train/run"
-        " train/study train/twin/floors train/twin/physics train/view ingest/task"
-        " replay/panel train/feed"
+        " train/study train/twin/floors train/twin/physics ingest/task"
+        " replay/panel train/feed replay/store train/twin/calibration"
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose ingest/task"

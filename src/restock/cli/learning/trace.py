@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from restock.cli import output
-from restock.cli.words import Option, Positional, refuse
-from restock.errors import ConfigError, quoted
+from restock.cli.words import Option, Positional
+from restock.errors import quoted
 
 if TYPE_CHECKING:
     from restock.replay.trace import trace as tracing
@@ -30,10 +30,6 @@ class TraceCommand:
 
     Without ROW, it lists rows: of a RUN, the audited ones with the largest TD errors; of a STORE,
     the strangest of twenty episodes, with what is strange about each.
-
-    A view is an MCAP file of five seconds before and after the row: the store's columns of each
-    step, labels, the critic's value and TD error, and, if the recording is given, scans, plans and
-    every topic of it.
     """
 
     place: Annotated[str, Positional("RUN|PANEL|STORE")]
@@ -43,11 +39,6 @@ class TraceCommand:
     store."""
     recording: Annotated[Path | None, Option("PATH")] = None
     """The recording of the row: also show the messages from which the row was made."""
-    view: Annotated[Path | None, Option("FILE")] = None
-    """Also write the seconds around the row for Foxglove and Rerun: FILE.mcap, and a layout
-    beside it."""
-    critic: Annotated[str | None, Option("RUN|none")] = None
-    """The run whose critic --view shows, or none. Default for a row of a RUN: that run."""
     json: bool = False
     """Print one JSON document (without ROW: a list)."""
 
@@ -55,7 +46,6 @@ class TraceCommand:
         """Trace, and print what was found."""
         from restock.replay.trace.trace import listed_rows, trace_row
 
-        self._check_view()
         if self.row is None:
             listed = listed_rows(self.place)
             if self.json:
@@ -69,38 +59,10 @@ class TraceCommand:
                 )
             return
         trace = trace_row(self.place, self.row, recording=self.recording)
-        written = self._write_view(trace)
         if self.json:
-            shown = {} if written is None else {"view": written}
-            output.print_json(document(trace) | shown)
+            output.print_json(document(trace))
             return
         _print(trace, self.recording is not None)
-        if written is not None:
-            _print_view(written)
-
-    def _check_view(self) -> None:
-        if self.view is None:
-            refuse(self, ("critic",), "has no effect without --view", remedy="give --view FILE")
-            return
-        from restock.train.view.mcap_view import check_view
-
-        check_view(self.view)
-        if self.row is None:
-            raise ConfigError(
-                "needs one row",
-                where="--view",
-                remedy=f"give ROW: `restock trace {quoted(self.place)}` lists some of them",
-            )
-
-    def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:
-        if self.view is None:
-            return None
-        from restock.train.view.mcap_view import ViewOptions, write_view
-
-        own = self.place if trace.audit is not None else None  # of a run
-        critic = None if self.critic == "none" else self.critic or own
-        options = ViewOptions(recording=self.recording, critic=critic)
-        return write_view(trace, self.view, options)
 
 
 def document(trace: tracing.Trace) -> dict[str, Any]:
@@ -180,15 +142,6 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
         if not with_messages:
             file = origin.transition["source_file"]
             output.say(f"--recording {file} shows the messages from which it was made")
-
-
-def _print_view(written: dict[str, Any]) -> None:
-    rows = [{"topic": topic, "messages": count} for topic, count in written["topics"].items()]
-    output.print_text()
-    output.print_table(rows, title=f"{written['path']}, {written['seconds']:g} s")
-    for note in written["notes"]:
-        output.print_text(f"note: {note}")
-    output.say(f"open it in Foxglove and import the layout {written['layout']}")
 
 
 def _section(title: str, values: dict[str, Any] | None) -> None:

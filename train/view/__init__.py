@@ -1,1 +1,0 @@
-"""Show a moment of a recording in Foxglove and Rerun."""
