@@ -54,7 +54,7 @@ MAY_IMPORT = {
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/env twin/floors replay/mixture replay/panel"
-        " replay/plan replay/sampling ingest/task ingest/profile ingest/store"
+        " replay/plan replay/sampling ingest/task ingest/profile"
         " replay/fleet twin/physics"
     ),
     "train/evaluation": (
@@ -68,10 +68,9 @@ MAY_IMPORT = {
         " ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (
-        "train dqn evaluation feed run twin/floors twin/physics replay/panel"
-        " replay/sampling replay/store ingest/profile ingest/task"
+        "dqn feed run replay/panel replay/sampling replay/store ingest/profile ingest/task"
     ),
-    "train/study": "judge dqn evaluation libraries run replay/panel twin/missions",
+    "train/study": "judge dqn evaluation run replay/panel twin/missions",
     "train/twin": "",
     "train/twin/floors": "ingest/task",
     "train/twin/missions": "twin/floors",

@@ -155,13 +155,12 @@ def test_a_changed_study_says_what_is_different(tmp_path: Path, capsys) -> None:
 def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
     out = study_of_two_comparisons(tmp_path)
     dueling = Difference("config.network.layer_norm", "algorithm", True, False)
-    own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
 
     def compared(first, second, *, treatment):
         requested.append((first[0].name, second[0].name, treatment))
         if treatment == "algorithm":
             return Comparison(treatment, "incomparable", [dueling], [dueling], [], [], None, [])
-        return Comparison(treatment, "comparable", [dueling, *own], [], [], [], "evaluation", [])
+        return Comparison(treatment, "comparable", [dueling], [], [], [], "evaluation", [])
 
     requested: list[tuple[str, str, str]] = []
     monkeypatch.setattr(study_run, "compare", compared)
@@ -180,7 +179,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     page = (out / "study.md").read_text()
     assert "differ in config.network.layer_norm, which treatment algorithm does not" in page
     assert "## again against dueling" in page
-    assert "Not held: the algorithm (network.layer_norm, library.arguments)." in page
+    assert "Not held: the algorithm (network.layer_norm)." in page
 
 
 def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypatch) -> None:
@@ -271,8 +270,6 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     ("text", "said"),
     [
         ("arms = []", "arms must be two or more"),
-        ('[[arms]]\nname = "a"\nlibrary = "sb3-sac"\n[[arms]]\nname = "b"', "sb3-sac"),
-        ('[[arms]]\nname = "a"\narguments = { n = 3 }\n[[arms]]\nname = "b"', "need a library"),
         ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "but the study has no store"),
         ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "`baseline`"),
         (

@@ -10,7 +10,7 @@ gradient that is NaN or infinite makes every value NaN within an update. `restoc
 the loss of every update, which costs nothing because it is summed anyway. A gradient that is not
 finite under a finite loss shows in the parameters: they are checked before an interval is closed, a
 policy is evaluated and a checkpoint is written. Another library's loop is its own: there the rows
-and TD errors that its buffer sees are checked, and the parameters before they are evaluated.
+and TD errors that its buffer sees are checked.
 """
 
 from __future__ import annotations
@@ -469,17 +469,6 @@ def check_fed(
         if bad_td.all():
             why += ", after an update that left no parameter whole"
         refuse(what, bad_td, why, TRAIN_SLOWER, rows(), run, steps)
-
-
-def check_kept(parameters: bool, run: Path, steps: Mapping[str, int]) -> None:
-    """Check that all parameters of another library's policy are finite before it is evaluated.
-
-    Raises:
-        NotFinite: one is not.
-    """
-    if not parameters:
-        what = "the gradient was not finite, and with it the network's parameters"
-        refuse(what, np.zeros(0, np.bool_), "", TRAIN_SLOWER, [], run, steps)
 
 
 def refuse(

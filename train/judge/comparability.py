@@ -299,8 +299,6 @@ _KINDS: dict[str, Kind] = {
     "config.env.layouts": "environment",
     "config.env.missions": "practice",
     "config.env.missions_share": "practice",
-    "library.replay": "feed",
-    "library.target": "target",
     "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often
     "panel.store": "store",
     "panel.store_version": "store",

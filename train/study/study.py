@@ -24,7 +24,6 @@ from restock.train.dqn.config import (
 )
 from restock.train.evaluation.eval_run import FIRST_SEED, refuse_unknown, wrong_seed
 from restock.train.judge.comparability import Treatment
-from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import unknown_measure
 from restock.train.twin.missions import KINDS
 
@@ -36,8 +35,6 @@ class ArmConfig(Checked, frozen=True):
     mixture: str | None = None  # name of a shipped mixture, or a TOML file
     panel: str | None = None  # an existing panel
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # keys of `restock train --set`
-    library: Library | None = None  # library whose algorithm learns; None: Restock
-    arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # arguments of that algorithm
     treatment: Treatment | None = None  # None: the study's treatment
     baseline: str | None = None  # arm to compare with; None: the first
 
@@ -48,12 +45,6 @@ class ArmConfig(Checked, frozen=True):
             raise ValueError(f"name must begin with a letter or a digit, got {self.name!r}")
         if self.mixture is not None and self.panel is not None:
             raise ValueError("panel must not be given beside mixture: choose one")
-        if self.library is None and self.arguments:
-            raise ValueError("arguments need a library")
-        if self.library is not None and (self.mixture is not None or self.panel is not None):
-            raise ValueError(
-                "library: its arm learns without logs, so do not give mixture or panel"
-            )
 
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -193,8 +184,6 @@ def load_study(path: Path | str) -> Study:
 
 def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str) -> None:
     """Refuse an arm that makes no update, before its runs are trained."""
-    if arm.library == "sb3-ppo":  # it has no warm-up
-        return
     has_logs = arm.mixture is not None or arm.panel is not None
     if (has_logs and schedule.offline_updates) or schedule.env_steps > schedule.warmup_env_steps:
         return
@@ -282,14 +271,11 @@ class StudyPlan:
     def _request(self, job: StudyJob) -> dict[str, Any]:
         """Return a run's request with the panel by its name, so that a study may be moved."""
         own = None if job.arm.mixture is None else f"panels/{job.arm.name}"
-        request = {
+        return {
             "settings": self.settings(job.arm, job.seed),
             "panel": own if job.arm.panel is None else job.arm.panel,
             "evaluation": msgspec.to_builtins(self.study.evaluation),
         }
-        if job.arm.library is not None:
-            request |= {"library": job.arm.library, "arguments": job.arm.arguments}
-        return request
 
 
 def check_jobs(plan: StudyPlan) -> None:

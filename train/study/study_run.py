@@ -23,16 +23,10 @@ import numpy as np
 
 from restock.errors import RestockError, RunError
 from restock.files import write_text
-from restock.process import ended_with_us, expect_installed, interrupt_running, kill_as_interrupt
+from restock.process import ended_with_us, interrupt_running, kill_as_interrupt
 from restock.replay.panel.build import plan_only
 from restock.stats import paired_t
 from restock.train.judge.compare import Comparison, compare
-from restock.train.libraries.library_arm import (
-    TRAINED,
-    Library,
-    LibraryArm,
-    resolve,
-)
 from restock.train.run.kept_evaluations import (
     cell_name,
     mission_of,
@@ -72,12 +66,7 @@ def run_study(
 
     Raises:
         RunError: a run failed (its log says why), or was made by another version of the study.
-        ConfigError: a library that an arm trains with is not installed.
     """
-    for arm in plan.study.arms:
-        if arm.library is not None:
-            expect_installed("an arm of a library", "stable_baselines3")
-            resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
     check_jobs(plan)
     for arm in plan.study.arms:
         _build(plan, arm, say)
@@ -179,10 +168,9 @@ def check_mixtures(plan: StudyPlan) -> None:
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
     """Train and evaluate one run, from its checkpoint if it has one."""
     log = plan.out / "logs" / f"{job.path.name}.log"
-    if job.arm.library is not None:
-        _train_library(plan, job, job.arm.library, log, say)
-    else:
-        _train(plan, job, log, say)
+    settings = plan.settings(job.arm, job.seed)
+    say(f"{job.path.name}: training")
+    restock_verb(train_words(job.path, settings, plan.panel(job.arm)), log)
     evaluation = plan.study.evaluation
     perturbations = ",".join(evaluation.perturbations)
     say(f"{job.path.name}: evaluating")
@@ -221,26 +209,6 @@ def _drive_references(plan: StudyPlan, say: Say) -> None:
     write_text(done, requested)
 
 
-def _train_library(plan: StudyPlan, job: StudyJob, library: Library, log: Path, say: Say) -> None:
-    """Train another library's run; it has no checkpoints, so a run that was cut begins again."""
-    if (job.path / TRAINED).exists():
-        return
-    if job.path.exists():
-        shutil.rmtree(job.path)
-    settings = tuple(plan.settings(job.arm, job.seed))
-    library_arm = LibraryArm(str(job.path), library, settings, job.arm.arguments)
-    say(f"{job.path.name}: training with {library}")
-    _command(
-        "restock.train.libraries.library_arm", [msgspec.json.encode(library_arm).decode()], log
-    )
-
-
-def _train(plan: StudyPlan, job: StudyJob, log: Path, say: Say) -> None:
-    settings = plan.settings(job.arm, job.seed)
-    say(f"{job.path.name}: training")
-    restock_verb(train_words(job.path, settings, plan.panel(job.arm)), log)
-
-
 def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) -> list[str]:
     """Return the command that trains the run at a path, from its checkpoint if there is one.
 
@@ -257,17 +225,12 @@ def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) 
 
 def restock_verb(arguments: Sequence[str], log: Path) -> None:
     """Run a verb in its own process, with its output in a log."""
-    _command("restock", arguments, log)
-
-
-def _command(module: str, arguments: Sequence[str], log: Path) -> None:
-    what = f"{module} {arguments[0]}" if module == "restock" else module
     log.parent.mkdir(parents=True, exist_ok=True)
     with kill_as_interrupt(), log.open("a", encoding="utf-8") as file:
-        file.write(f"$ {module} {' '.join(arguments)}\n")
+        file.write(f"$ restock {' '.join(arguments)}\n")
         file.flush()
         process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
+            [sys.executable, "-m", "restock", *arguments],
             stdout=file,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
@@ -281,7 +244,8 @@ def _command(module: str, arguments: Sequence[str], log: Path) -> None:
     if process.returncode not in (0, 3):
         last = [line for line in log.read_text(encoding="utf-8").splitlines() if line.strip()][-3:]
         raise RestockError(
-            f"`{what}` failed with exit code {process.returncode}: " + " / ".join(last),
+            f"`restock {arguments[0]}` failed with exit code {process.returncode}: "
+            + " / ".join(last),
             where=str(log),
             remedy="correct it and run the study again: finished runs are kept",
         )

@@ -136,8 +136,6 @@ def _treatment(found: dict[str, Any]) -> str:
     names: dict[str, list[str]] = {}  # by kind
     for row in found["differences"]:
         name = row["setting"].removeprefix("config.")
-        if name.startswith("library.arguments."):
-            name = "library.arguments"
         kind = names.setdefault(row["kind"], [])
         if name not in kind:
             kind.append(name)
