@@ -49,7 +49,6 @@ from restock.train.resolve import (
     resolve_teacher,
     without_twin,
 )
-from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import (
     Run,
     RunLock,
@@ -84,7 +83,6 @@ class Prepared:
     panel: Panel | None
     document: dict[str, Any]  # config.json
     resumed: Run | None = None
-    from_env_steps: int | None = None  # of an earlier checkpoint than the latest
     teacher: Any = None  # that Python code passed in
     requested: AskedTeacher | None = None  # that a new run's config names
 
@@ -125,8 +123,6 @@ class Prepared:
             return Run.create(self.path, self.document)
         self.resumed.remove_leftovers()
         (self.path / STOPPED).unlink(missing_ok=True)
-        if self.from_env_steps is not None:
-            go_back(self.resumed.latest, self.from_env_steps)
         return self.resumed
 
     def _session(
@@ -260,12 +256,8 @@ def prepare_new(
     return Prepared(out, config, profile, panel, written, requested=requested)
 
 
-def prepare_resumed(
-    path: Path, overrides: Sequence[str] = (), from_env_steps: int | None = None
-) -> Prepared:
+def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
     """Check a run to go on with; `overrides` may extend its budget or move it to another device.
-
-    `from_env_steps` names an earlier checkpoint than the latest: `Prepared.open` goes back to it.
 
     Raises:
         RunError: no such run or checkpoint, or its panel or task changed since.
@@ -289,9 +281,7 @@ def prepare_resumed(
     panel = run_panel(run.document)  # refused if it is gone or has been replaced
     if panel is not None:
         panel = open_panel(panel.path, config, profile)
-    if from_env_steps is not None:
-        check_earlier(run.latest, from_env_steps)
-    return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
+    return Prepared(path, config, profile, panel, run.document, run)
 
 
 def conditions_of_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:

@@ -35,13 +35,11 @@ from restock.train.feed.teacher import AskedTeacher, Imitation
 from restock.train.feed.update_blocks import UpdateBlocks
 from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
-from restock.train.run.checkpoint import keep, newest_whole
 from restock.train.run.events import Events, tracker_sinks
 from restock.train.run.run import Run, RunLock
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
-KEPT_CHECKPOINTS = 3  # the latest and those before it; the best policy is kept besides
 _MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # as `train --resume` may
 
 
@@ -176,8 +174,6 @@ class Session(Stateful):
 
     def save(self) -> None:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
-        if self.progress.env_steps != self.progress.checkpointed_at:
-            keep(self.run.latest, self.progress.checkpointed_at, KEPT_CHECKPOINTS)
         self.progress.checkpointed_at = self.progress.env_steps
         self.progress.wall_s, self._started = self.wall_s, time.monotonic()
         self.run.flush()
@@ -207,7 +203,7 @@ class Session(Stateful):
             RunError: no such checkpoint, the policy that was kept is missing or damaged, or
                 config.json or the logs' rows are not those that the run began with.
         """
-        state = self._latest()
+        state = checkpoint.load(self.run.latest)
         _refuse_edited(self.run, state.get("config"))
         if kept_one(state):
             load_kept(self.run)
@@ -225,18 +221,6 @@ class Session(Stateful):
             self.plan()  # the budget was extended
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
-
-    def _latest(self) -> dict[str, Any]:
-        try:
-            return checkpoint.load(self.run.latest)
-        except RunError as error:
-            if (whole := newest_whole(self.run.latest)) is None:
-                raise
-            raise RunError(
-                error.what,
-                where=error.where,
-                remedy=f"use an earlier one: --from-env-steps {whole}",
-            ) from error
 
     def save_best(self, results: Score) -> None:
         """Keep the current policy as the run's best."""

@@ -1,14 +1,13 @@
 """Which policy of a run drives: the best that it evaluated, or the latest of an interrupted one."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from support.toy_run import config, run_to_end, session
+from support.toy_run import config, session
 
 from restock.cli import main
 from restock.errors import RunError
@@ -64,10 +63,13 @@ def test_a_run_interrupted_before_it_learned_in_the_twin(phase, chosen, step, tm
 
 
 def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
-    settings = config(record={"checkpoint_every_env_steps": 700})
-    live = run_to_end(tmp_path / "a", settings)
-    folder = live.run.latest.parent
-    shutil.copy(folder / "env_steps_000000700.safetensors", live.run.latest)
+    live = session(tmp_path / "a", config())
+    interrupted(live, lambda: live.progress.env_steps >= 700)
+    before = live.run.latest.read_bytes()
+    resumed = session(live.run.path, config(), resume=True)
+    train(resumed)
+    resumed.close()
+    live.run.latest.write_bytes(before)
     now = kept_policy(Run.open(live.run.path))
     assert now is not None
     assert now.chosen == "best"

@@ -25,9 +25,8 @@ from restock.train.evaluation.evaluate import EvaluationBuffer, fixed_episodes
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.feed.batches import LogTerms
 from restock.train.feed.logs import Coded, Logs
-from restock.train.loop import TrainingInterrupted, nothing_to_do, train
+from restock.train.loop import nothing_to_do, train
 from restock.train.run import checkpoint
-from restock.train.run.checkpoint import earlier
 from restock.train.run.run import Run
 from restock.train.session import Session
 
@@ -312,25 +311,11 @@ def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path)
 
     before = files()
     assert any("tensorboard" in file.parts for file in before)
-    assert sorted(earlier(done.run.latest)) == [400, 800]
     for _ in range(2):
         again = session(done.run.path, settings, resume=True)
         assert train(again).env_steps == outcome.env_steps == 1200
         again.close()
     assert files() == before
-
-
-def test_interrupted_resume_keeps_earlier_checkpoints(undisturbed: Session, tmp_path: Path) -> None:
-    path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
-    latest = path / "checkpoints" / undisturbed.run.latest.name
-    kept = list(earlier(latest))
-    assert kept
-    for _ in range(3):
-        live = session(path, config(schedule={"env_steps": 2400}), resume=True)
-        with pytest.raises(TrainingInterrupted):
-            train(live, stop=lambda: True)
-        live.close()
-    assert list(earlier(latest)) == kept
 
 
 def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:

@@ -14,7 +14,6 @@ from support.stores import recording_transitions
 from support.toy_run import assert_same_run, config, logs, run_to_end, session
 
 from restock.cli import main
-from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.train.feed.batch_record import STOPPED, NotFinite
@@ -161,19 +160,3 @@ def test_a_damaged_checkpoint_is_refused_by_name(panel, tmp_path, capsys, at):
         said = capsys.readouterr().err
         assert f"{file}: is damaged" in said
         assert "restore it from a copy, or train again" in said
-
-
-def test_going_back_to_a_damaged_checkpoint_changes_nothing(tmp_path: Path) -> None:
-    live = run_to_end(tmp_path / "run", config())
-    latest = live.run.latest
-    (older, first), (newer, second) = checkpoint.earlier(latest).items()
-    before = latest.read_bytes()
-    assert checkpoint.newest_whole(latest) == newer
-    second.write_bytes(second.read_bytes()[:-9])
-    assert checkpoint.newest_whole(latest) == older  # what a failed resume proposes
-    first.write_bytes(b"half")
-    assert checkpoint.newest_whole(latest) is None
-    with pytest.raises(RunError, match="is damaged"):
-        checkpoint.go_back(latest, older)
-    assert latest.read_bytes() == before
-    assert list(checkpoint.earlier(latest)) == [older, newer]

@@ -11,11 +11,10 @@ import pytest
 from support.long import one_in
 from support.panels import LIMITED
 from support.stores import CONDITIONS, recording_transitions
-from support.toy_run import assert_same_run, config, run_to_end, session, tables
+from support.toy_run import assert_same_run, config, run_to_end, session
 from support.toy_twin import CONDITIONS as TOY_CONDITIONS
 from support.toy_twin import TASK
 
-from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.mixture.share_controller import PlannedDraws
@@ -25,7 +24,6 @@ from restock.train.evaluation.evaluate import EpisodeResult
 from restock.train.feed.logs import Logs
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.run import checkpoint
-from restock.train.run.checkpoint import earlier, go_back
 from restock.train.session import Session
 
 # So few logged rows that fresh ones fill the quotas too.
@@ -179,21 +177,3 @@ def test_a_killed_run_goes_on_from_its_checkpoint(undisturbed, settings, tmp_pat
     live.close()
     assert 0 < checkpoint.load(live.run.latest)["progress"]["env_steps"] < live.progress.env_steps
     assert_same_run(undisturbed, resumed(path, settings))
-
-
-def test_an_earlier_checkpoint_leads_to_the_same_end(tmp_path: Path) -> None:
-    settings = config(schedule={"env_steps": 800}, record={"checkpoint_every_env_steps": 200})
-    path = tmp_path / "run"
-    live = run_to_end(path, settings)
-    before = tables(path)
-    kept = earlier(live.run.latest)
-    assert list(kept) == [400, 600]
-    with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
-        go_back(live.run.latest, 7)
-    live.run.latest.write_bytes(b"half a file")
-    with pytest.raises(RunError, match="--from-env-steps 600"):
-        session(path, settings, resume=True)
-    go_back(live.run.latest, 400)
-    assert earlier(live.run.latest) == {}
-    resumed(path, settings)
-    assert all(table.equals(before[name]) for name, table in tables(path).items())

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ FORMAT = "restock-checkpoint/5"
 _EARLIER = tuple(f"restock-checkpoint/{number}" for number in (1, 2, 3, 4))
 _ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
 _RESTORE = "restore it from a copy, or train again"
-_PREFIX, _SUFFIX = "env_steps_", ".safetensors"
 
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
@@ -143,81 +141,3 @@ def _put_together(value: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
     if isinstance(value, list):
         return [_put_together(item, tensors) for item in value]
     return value
-
-
-def earlier(latest: Path) -> dict[int, Path]:
-    """Return the checkpoints before the latest, oldest first, by their environment steps."""
-    kept = {}
-    for path in latest.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
-        steps = path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX)
-        if steps.isdigit():
-            kept[int(steps)] = path
-    return dict(sorted(kept.items()))
-
-
-def newest_whole(latest: Path) -> int | None:
-    """Return the steps of the newest earlier checkpoint that is not damaged, or None."""
-    for steps, path in reversed(earlier(latest).items()):
-        try:
-            load(path)
-        except RunError:
-            continue
-        return steps
-    return None
-
-
-def keep(latest: Path, env_steps: int, count: int) -> None:
-    """Keep the latest checkpoint, taken after `env_steps`, as an earlier one, of `count` in all.
-
-    It stays in place until it is replaced, so a kill at any instant leaves a latest one.
-    """
-    if count > 1 and latest.exists():
-        named = latest.with_name(f"{_PREFIX}{env_steps:09d}{_SUFFIX}")
-        _put(latest, named)
-    for path in list(earlier(latest).values())[: -(count - 1) or None]:
-        path.unlink()
-
-
-def check_earlier(latest: Path, env_steps: int) -> dict[int, Path]:
-    """Return the earlier checkpoints, one of which must be of these environment steps.
-
-    Raises:
-        RunError: no such checkpoint; names those that are kept.
-    """
-    kept = earlier(latest)
-    if env_steps not in kept:
-        names = ", ".join(f"{steps}" for steps in kept) or "none"
-        raise RunError(
-            f"no earlier checkpoint was taken after {env_steps} environment steps",
-            where=str(latest.parent),
-            remedy=f"those that are kept: {names}",
-        )
-    return kept
-
-
-def go_back(latest: Path, env_steps: int) -> None:
-    """Make an earlier checkpoint the latest; those after it are forgotten.
-
-    Raises:
-        RunError: see `check_earlier`; or it is damaged: then nothing is changed.
-    """
-    kept = check_earlier(latest, env_steps)
-    load(kept[env_steps])
-    _put(kept[env_steps], latest)
-    for steps, path in kept.items():
-        if steps >= env_steps:
-            path.unlink()
-
-
-def _put(source: Path, target: Path) -> None:
-    """Link a file under another name atomically; copy it if the disk has no hard links."""
-    temporary = temporary_name(target)
-    temporary.unlink(missing_ok=True)
-    try:
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copyfile(source, temporary)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)

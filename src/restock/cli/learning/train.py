@@ -52,9 +52,6 @@ class TrainCommand:
     """Set one key of the config, e.g. --set optimizer.learning_rate=1e-4. May be repeated."""
     resume: Path | None = None
     """Continue this run from its latest checkpoint."""
-    from_env_steps: int | None = None
-    """With --resume: continue from the checkpoint taken after N environment steps; the last three
-    are kept. Everything after it is discarded."""
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
@@ -91,10 +88,8 @@ class TrainCommand:
                     "--resume continues with the run's own panel, config and seed",
                     remedy="with --resume, give only --env-steps, --seconds or --device",
                 )
-            prepared = prepare_resumed(self.resume, overrides, self.from_env_steps)
+            prepared = prepare_resumed(self.resume, overrides)
         else:
-            if self.from_env_steps is not None:
-                raise RestockError("--from-env-steps needs --resume RUN")
             if self.out is None:
                 raise RestockError("no --out given", remedy="give --out RUN (or --resume RUN)")
             prepared = prepare_new(self.out, self.panel, self.config, overrides)
