@@ -45,7 +45,6 @@ from restock.train.resolve import (
     mirrors,
     planned_draws,
     resolve_config,
-    resolve_ring_capacity,
     resolve_teacher,
     without_twin,
 )
@@ -245,14 +244,12 @@ def prepare_new(
     config = resolve_teacher(config, profile, panel)
     drivers = None if panel is None else sorted(rows_by_policy(panel))
     refuse_nothing_to_learn(config.teacher, drivers)
-    config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
+    config = resolve_config(config, panel)
     check_new_run(config, profile.task, panel)
     requested = None
     if config.teacher.source != GIVEN:  # made once: it may be large
         requested = open_teacher(config.teacher, profile.task, seed=config.seed)
     written = _document(config, profile, panel)
-    if ring is not None:
-        written["ring_capacity"] = ring
     return Prepared(out, config, profile, panel, written, requested=requested)
 
 

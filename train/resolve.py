@@ -7,9 +7,7 @@ without effect, and a run that the machine's memory cannot hold.
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
 from itertools import pairwise
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -21,7 +19,6 @@ from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.packed_rows import row_width
 from restock.replay.sampling.ring import META
-from restock.replay.store.audit import capacity_of_rows
 from restock.toml import changed
 from restock.train.dqn.config import PLANNER, TeacherConfig, TrainConfig, refuse_untaught
 from restock.train.feed.batches import check_terms
@@ -136,36 +133,7 @@ def mirrors(teacher: TeacherConfig, task: Task) -> bool:
     return teacher.mirror is True or teacher.source == "operator"
 
 
-MAX_BYTES = 2 << 30  # of a ring that "auto" chooses
 _SLOT_BYTES = 18  # of a row's stratum, its place there, and its age
-
-
-def resolve_ring_capacity(
-    config: TrainConfig, panel: Panel | None
-) -> tuple[TrainConfig, dict[str, Any] | None]:
-    """Choose the ring's number of rows, and return how it was chosen for `config.json`.
-
-    Raises:
-        ConfigError: it is to be chosen, and there is no panel to choose it by.
-    """
-    if config.replay.ring_capacity != "auto":
-        return config, None
-    if panel is None:
-        raise ConfigError(
-            'replay.ring_capacity = "auto" is chosen from the rows of a panel, but there is none',
-            remedy="give --panel, or a number of rows",
-        )
-    capacity = capacity_of_rows(panel.meta)
-    rows, reason = capacity.recommended, capacity.reason
-    least = max(config.replay.batch_size, config.env.num_envs * config.loss.n_step)
-    most = MAX_BYTES // row_bytes(panel.observation_size)
-    if rows < least:
-        rows, reason = least, f"{reason}; a batch and the environments' steps need {least:,}"
-    if rows > most:
-        rows, reason = most, f"{reason}; {MAX_BYTES >> 30} GiB hold {most:,}"
-    replay = msgspec.structs.replace(config.replay, ring_capacity=rows)
-    chosen = {"asked": "auto", "ring_rows": rows, "reason": reason, **asdict(capacity)}
-    return msgspec.structs.replace(config, replay=replay), chosen
 
 
 def row_bytes(observation_size: int) -> int:
@@ -209,7 +177,7 @@ def _refuse_too_large(config: TrainConfig, task: Task) -> None:
     """Raise ConfigError if the run's largest arrays exceed the machine's memory."""
     critic = _parameters(task.observation_size, config.network.hidden, len(task.actions))
     taken = {
-        "replay.ring_capacity": config.replay.ring_rows * row_bytes(task.observation_size),
+        "replay.ring_capacity": config.replay.ring_capacity * row_bytes(task.observation_size),
         "network.hidden": 4 * _CRITICS * critic,
     }
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -282,9 +282,9 @@ def open_session(
     strata = None
     if logs is not None and logs.panel is not None:
         strata = FreshStrata.of(logs.panel, [*conditions, *exposures])
-    reserved = int(config.replay.ring_rows * config.replay.ring_reserved / len(names))
+    reserved = int(config.replay.ring_capacity * config.replay.ring_reserved / len(names))
     ring = FreshRing(
-        config.replay.ring_rows,
+        config.replay.ring_capacity,
         env.num_envs,
         task.observation_size,
         discount=config.loss.discount,

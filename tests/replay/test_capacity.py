@@ -8,17 +8,14 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
-from restock.replay.store.audit import capacity_of_rows, recommend_capacity
+from restock.replay.store.audit import recommend_capacity
 from restock.replay.store.store import Store
-from restock.train import resolve
-from restock.train.prepare import prepare_new
 
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
 
@@ -100,33 +97,6 @@ def test_the_verb_recommends(store_path, capsys):
     assert document["curve"][-1]["cells_share"] == 1.0
     assert cli.main(["audit", str(store_path), "--capacity"]) == 0
     assert f"{document['recommended']:,} rows: " in capsys.readouterr().out
-
-
-def test_a_run_takes_the_number_and_says_why(panel, tmp_path):
-    auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
-    prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
-    chosen = prepared.document["ring_capacity"]
-    found = capacity_of_rows(panel.meta)
-    assert chosen["ring_rows"] == prepared.config.replay.ring_rows == found.recommended
-    assert prepared.document["config"]["replay"]["ring_capacity"] == found.recommended
-    assert chosen["reason"] == found.reason
-    assert chosen["curve"][-1]["capacity"] == found.rows == len(panel)
-    assert f"a ring of {found.recommended:,} rows" in describe_run(prepared)
-    # A ring that could not hold a batch would be refused: it is as large as one.
-    wide = [*auto, f"replay.batch_size={len(panel) + 1}"]
-    least = prepare_new(tmp_path / "run", panel.path, None, wide)
-    assert least.config.replay.ring_rows == len(panel) + 1
-    with pytest.raises(ConfigError, match="from the rows of a panel, but there is none"):
-        prepare_new(tmp_path / "run", None, None, auto)
-
-
-def test_a_ring_that_is_chosen_stays_in_memory(panel, tmp_path, monkeypatch):
-    size = resolve.row_bytes(panel.observation_size)
-    monkeypatch.setattr(resolve, "MAX_BYTES", 40 * size)
-    auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
-    prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
-    assert prepared.config.replay.ring_rows == 40
-    assert "GiB hold 40" in prepared.document["ring_capacity"]["reason"]
 
 
 @pytest.mark.parametrize(("share", "episodes"), [(2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)])

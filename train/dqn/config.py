@@ -100,22 +100,15 @@ class OptimizerConfig(Checked, frozen=True):
 class ReplayConfig(Checked, frozen=True):
     batch_size: Count = 128
     logs_share: Share | None = None  # share of each online batch; None: the mixture's
-    ring_capacity: int | Literal["auto"] = 100_000  # fresh rows kept; "auto": by their diversity
+    ring_capacity: int = 100_000  # fresh rows kept
     ring_reserved: Share = 0.0  # share of it reserved for conditions, in equal parts
 
     def check(self) -> None:
-        if self.ring_capacity != "auto" and self.ring_capacity < self.batch_size:
+        if self.ring_capacity < self.batch_size:
             raise ValueError(
                 f"ring_capacity must hold at least a batch of {self.batch_size},"
                 f" got {self.ring_capacity}"
             )
-
-    @property
-    def ring_rows(self) -> int:
-        """Return the capacity as a number; raise ValueError if it is still to be chosen."""
-        if self.ring_capacity == "auto":
-            raise ValueError('ring_capacity = "auto" was not resolved')
-        return self.ring_capacity
 
 
 class ScheduleConfig(Checked, frozen=True):
@@ -234,7 +227,7 @@ class TrainConfig(Checked, frozen=True):
 
     def check(self) -> None:
         capacity, waiting = self.replay.ring_capacity, self.env.num_envs * self.loss.n_step
-        if capacity != "auto" and capacity < waiting:
+        if capacity < waiting:
             raise ValueError(
                 f"replay.ring_capacity must be at least env.num_envs x loss.n_step = {waiting:,}"
                 f" rows, got {capacity:,}"

@@ -259,8 +259,6 @@ def describe_run(prepared: Prepared) -> str:
     ]
     if panel is not None:
         lines += describe_forecast(document["panel"], config)
-    if ring := document.get("ring_capacity"):
-        lines.append(f"a ring of {ring['ring_rows']:,} rows: {ring['reason']}")
     if config.teacher.filters:
         lines.append(_teacher(config.teacher, panel))
     elif config.teacher.source == PLANNER:
