@@ -142,7 +142,6 @@ def row_bytes(observation_size: int) -> int:
     return row_width(observation_size) * 4 + meta + _SLOT_BYTES
 
 
-_NATURAL = ("floor",)
 _CRITICS = 6  # copies of the network: online, target, averaged, a gradient, Adam's two
 
 
@@ -158,13 +157,6 @@ def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
 
 
 def _refuse_no_effect(config: TrainConfig) -> None:
-    practice = config.practice
-    if practice.rule == "natural" and (keys := changed(practice, _NATURAL)):
-        raise ConfigError(
-            f'has no effect under the rule "{practice.rule}"',
-            where=f"practice.{keys[0]}",
-            remedy="leave it out, or set practice.rule",
-        )
     if config.env.missions is None and changed(config.env, ("missions_share",)):
         raise ConfigError(
             "has no effect without missions",

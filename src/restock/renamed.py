@@ -13,7 +13,6 @@ def _now(name: str) -> str:
 _AT = "it was removed: name the version in the store's place, as in STORE@12"
 
 TRAINING_KEYS = {
-    "practice.floors": "it was removed: use practice.floor",
     "practice.shares": "it was removed: set the shares of kinds in env.conditions",
     "network.ensemble": "it was removed: network.members is the mean of so many",
     "loss.margin_policies": "it was removed: set teacher.policies",

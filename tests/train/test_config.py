@@ -64,7 +64,6 @@ def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> 
     [
         ("replay.ring_capacity=99999999999", r"of them for replay\.ring_capacity; this machine"),
         ("network.hidden=[9000000, 9000000]", r"of them for network\.hidden; this machine"),
-        ("practice.floor=0.1", r'practice\.floor: has no effect under the rule "natural"'),
         ("teacher={source='none', ratio=0.2}", r"teacher\.ratio: has no effect where .* \"none\""),
         ("teacher={source='none', mirror=true}", r"teacher\.mirror: has no effect where"),
         ("env.missions_share=0.9", r"env\.missions_share: has no effect without missions"),

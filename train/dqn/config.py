@@ -184,7 +184,6 @@ class PracticeConfig(Checked, frozen=True):
     """Which missions the twin gives next: see `restock.train.feed.practice`."""
 
     rule: Literal["natural", "even", "success"] = "natural"
-    floor: Share | None = None  # least share of an arm; None: FLOOR if shares move, else 0
 
 
 class EvaluationConfig(Checked, frozen=True):

@@ -36,7 +36,7 @@ from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
-FLOOR = 0.05  # of an arm under the rule "success", unless the config says otherwise
+FLOOR = 0.05  # least share of an arm under the rule "success"
 WHERE = "practice"
 HALF_LIFE_EPISODES = 20.0  # an arm's episode that is this old counts half
 MAX_CHANGE = 0.1  # of a share per interval
@@ -48,7 +48,7 @@ class Practice(Stateful):
     """A counter of ended missions by arm, which sets the twin's shares at each interval's end.
 
     Raises:
-        ConfigError: the rule's floors do not fit the arms, or it lacks what it needs.
+        ConfigError: the rule lacks what it needs.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("names",)
@@ -72,7 +72,9 @@ class Practice(Stateful):
         count = len(self.arms)
         self.names = [arm.name for arm in self.arms]
         self.natural: F64 = np.array([arm.share for arm in self.arms])
-        self.floor = self._resolved_floor()
+        # Many arms leave less for each: half is always free to move.
+        least = FLOOR if config.rule == "success" else 0.0
+        self.floor = min(least, 0.5 / max(count, 1))
         if config.rule == "success" and not goal:
             raise ConfigError(
                 'the rule "success" needs success, but the task has no goal',
@@ -239,20 +241,6 @@ class Practice(Stateful):
             return np.ones(len(self.arms))
         return None
 
-    def _resolved_floor(self) -> float:
-        config, count = self.config, len(self.arms)
-        if config.floor is None:
-            # Many arms (orders) leave less for each: half is always free to move.
-            least = FLOOR if config.rule == "success" else 0.0
-            return min(least, 0.5 / max(count, 1))
-        if count * config.floor > 1 + 1e-9:
-            raise ConfigError(
-                f"the floors of {count} arms sum to {count * config.floor:.3g}, above 1",
-                where=f"{WHERE}.floor",
-                remedy=f"give at most {1 / count:.3g}",
-            )
-        return config.floor
-
 
 def with_floor(weights: F64, floor: float) -> F64:
     """Return shares (K,) in proportion to weights, none below `floor`; they sum to 1.
@@ -344,7 +332,7 @@ def check_missions(config: TrainConfig, profile: Profile) -> None:
     """Refuse missions that the twin cannot drive, before anything is written.
 
     Raises:
-        ConfigError: an order, arm or floor of practice that the floors cannot hold.
+        ConfigError: an order or arm that the floors cannot hold.
     """
     if not mission_orders(config) and config.practice == PracticeConfig():
         return
