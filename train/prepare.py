@@ -33,7 +33,6 @@ from restock.train.dqn.config import (
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.network import update_path
 from restock.train.evaluation.evaluate import evaluation_time_s
-from restock.train.evaluation.logged_ways import ways_to_evaluate
 from restock.train.feed.batch_record import STOPPED
 from restock.train.feed.collector import FreshStrata, conditions_in_twin
 from restock.train.feed.logs import Logs
@@ -67,7 +66,7 @@ from restock.train.session import Session, open_session
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.missions import KINDS
-from restock.train.twin.physics.episode import EpisodeSpec, refuse_unfit
+from restock.train.twin.physics.episode import refuse_unfit
 
 _EVALUATION_ENVS = 16
 
@@ -100,12 +99,11 @@ class Prepared:
         if teacher is not None and self.resumed is None:  # refused before anything is written
             teacher.ask(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
-        episodes = ways_to_evaluate(self.config, layouts, self.panel)
         lock = RunLock(self.path)
         try:
             run = self._run()
             try:
-                session = self._session(run, env, teacher, layouts, episodes)
+                session = self._session(run, env, teacher, layouts)
             except BaseException:
                 if self.resumed is None:  # leave no folder of a run that never began
                     shutil.rmtree(self.path, ignore_errors=True)
@@ -124,14 +122,7 @@ class Prepared:
         (self.path / STOPPED).unlink(missing_ok=True)
         return self.resumed
 
-    def _session(
-        self,
-        run: Run,
-        env: Twin,
-        teacher: AskedTeacher | None,
-        layouts: str,
-        episodes: list[EpisodeSpec] | None,
-    ) -> Session:
+    def _session(self, run: Run, env: Twin, teacher: AskedTeacher | None, layouts: str) -> Session:
         profile = self.profile
         conditions, exposures = conditions_of_twin(profile)
         session = open_session(
@@ -148,7 +139,6 @@ class Prepared:
                 nthread=0,
                 layouts=layouts,
             ),
-            episodes=episodes,
             logs=_logs(self.panel, self.config, self.document) if self.panel is not None else None,
             teacher=teacher,
             resume=self.resumed is not None,

@@ -110,7 +110,7 @@ class Session(Stateful):
     ring: FreshRing
     batches: Batches
     collector: Collector
-    fixed_episodes: Sequence[EpisodeSpec]  # that evaluations drive
+    fixed_episodes: Sequence[EpisodeSpec]  # that evaluations drive: every named kind
     feed: FeedRecord
     events: Events
     probe: Probe | None
@@ -251,12 +251,6 @@ def _refuse_edited(run: Run, before: Mapping[str, Any] | None) -> None:
             )
 
 
-def drawn_episodes(config: TrainConfig) -> list[EpisodeSpec]:
-    """Draw the fixed episodes of every named kind, including those with a share of 0."""
-    chosen = config.evaluation
-    return fixed_episodes(list(config.env.conditions), chosen.episodes, chosen.seed)
-
-
 def open_session(
     run: Run,
     config: TrainConfig,
@@ -268,15 +262,11 @@ def open_session(
     logs: Logs | None,
     teacher: AskedTeacher | None = None,
     resume: bool = False,
-    episodes: Sequence[EpisodeSpec] | None = None,
     exposures: Sequence[Condition] = (),
 ) -> Session:
-    """Build the parts of a run, new or from its latest checkpoint.
-
-    `episodes` are what evaluations drive, None: as drawn by the config's seeds.
-    """
+    """Build the parts of a run, new or from its latest checkpoint."""
     torch.set_num_threads(config.threads)
-    seed = config.seed
+    seed, judged = config.seed, config.evaluation
     learner = make_learner(config, task)
     names = ring_conditions(conditions)
     strata = None
@@ -315,7 +305,7 @@ def open_session(
         ring=ring,
         batches=batches,
         collector=collector,
-        fixed_episodes=drawn_episodes(config) if episodes is None else episodes,
+        fixed_episodes=fixed_episodes(list(config.env.conditions), judged.episodes, judged.seed),
         feed=FeedRecord(
             run,
             logs,

@@ -16,6 +16,7 @@ TRAINING_KEYS = {
     "practice.shares": "it was removed: set the shares of kinds in env.conditions",
     "network.ensemble": "it was removed: network.members is the mean of so many",
     "loss.margin_policies": "it was removed: set teacher.policies",
+    "evaluation.missions": "it was removed: restock eval --missions logged drives them afterwards",
     "record.tensorboard": "it was removed: record.trackers names tensorboard, or does not",
 }
 STUDY_KEYS = {

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -17,9 +16,7 @@ from restock.arrays import F64
 from restock.cli import main
 from restock.cli.start.decisions import no_ways
 from restock.cli.start.stages import Settings
-from restock.files import read_table
 from restock.replay.panel.panel import Panel
-from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.twin.floors.floor_files import write_floor
@@ -28,7 +25,6 @@ from restock.train.twin.floors.floors import open_floors
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.4\n"
 (FLOOR,) = open_floors("default")
 STARTS = FLOOR.goals[[0, 5, 11, 17]]
-LOGGED_TRAINING = ["train", "--set", "evaluation.missions=logged"]
 
 
 def rows_toward(goal: F64, places: F64) -> F64:
@@ -151,27 +147,3 @@ def test_eval_drives_the_ways_of_the_logs(panel, tmp_path, capsys):
     without = kept_run(tmp_path / "without")
     assert main(["eval", str(without), "--missions", "logged"]) == 2
     assert "did not learn from logs" in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_a_runs_evaluations_drive_logged_ways_on_request(panel: Panel, tmp_path: Path) -> None:
-    line = [*LOGGED_TRAINING, "--panel", str(panel.path)]
-    line += ["--set", "env.num_envs=4", "--set", "schedule.offline_updates=2"]
-    line += ["--set", "network.hidden=[8]", "--set", "replay.batch_size=16"]
-    line += ["--set", "evaluation.episodes=2", "--set", "record.trackers=[]"]
-    line += ["--set", "env.conditions={nominal=1.0}", "--env-steps", "40"]
-    assert main([*line, "--out", str(tmp_path / "run")]) == 0
-    driven = read_table(tmp_path / "run" / "evaluations.parquet").to_pylist()
-    made = logged_missions(panel, (FLOOR,), ("nominal",))
-    ways = {spec.seed for spec in made.specs["nominal"][:2]}
-    assert {row["episode_seed"] for row in driven} == ways
-    (_, said) = plan_evaluation(tmp_path / "run", missions="logged").warnings
-    assert "selected on such routes" in said
-
-
-def test_a_run_on_another_floor_cannot_evaluate_on_them(panel, tmp_path, capsys):
-    write_floor(replace(FLOOR, name="away", map_origin=(900.0, 0.0, 0.0)), tmp_path / "away.toml")
-    other = [f"--set=env.layouts={tmp_path / 'away.toml'}", "--out", str(tmp_path / "other")]
-    assert main([*LOGGED_TRAINING, "--panel", str(panel.path), *other]) == 2
-    assert "is in another frame than the floor" in capsys.readouterr().err
-    assert not (tmp_path / "other").exists()

@@ -191,9 +191,6 @@ class EvaluationConfig(Checked, frozen=True):
     episodes: Count = 10  # episodes per condition
     seed: Seed = 90_000  # seed of the first fixed episode; not used in training
     layouts: str | None = None  # None: env.layouts (generated:train: its validation floors)
-    # Where the fixed episodes start and end: by their seeds, or as the logged episodes that the
-    # panel holds out (all of them) did, each way at most once.
-    missions: Literal["drawn", "logged", "logged:all"] = "drawn"
     off_policy: bool = False  # evaluate the offline policy on logs, before it drives
 
 

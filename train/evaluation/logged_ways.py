@@ -26,9 +26,7 @@ from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
-from restock.train.dqn.config import TrainConfig
 from restock.train.evaluation.ope_dataset import held_out_of, panel_store
-from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
 from restock.train.twin.floors.placed import logged_drives, placed_on
@@ -230,32 +228,3 @@ def _has_room(spec: EpisodeSpec, floor: Warehouse, planner: Planner) -> bool:
 def _seed(way: Way) -> int:
     """Return the seed of a way's mission: the same in every run, and different for another way."""
     return zlib.crc32(np.asarray(way, np.float64).tobytes()) >> 1
-
-
-def ways_to_evaluate(
-    config: TrainConfig, layouts: str, panel: Panel | None
-) -> list[EpisodeSpec] | None:
-    """Return the logged routes that a run's evaluations drive; None if missions are drawn.
-
-    Raises:
-        ConfigError: ways are asked for, and there are no logs, no goal, or none of them can be
-            driven.
-    """
-    chosen, kinds = config.evaluation, list(config.env.conditions)
-    if chosen.missions == "drawn" or not config.env.twin:
-        return None
-    floors = open_floors(layouts)
-    why = None
-    if panel is None:
-        why = "the run does not learn from logs"
-    elif panel.task.goal == "none":
-        why = "the task has no goal"
-    if panel is None or why is not None:
-        raise ConfigError(
-            str(why), where="evaluation.missions", remedy='leave it out, or set "drawn"'
-        )
-    every = chosen.missions == EVERY
-    specs = logged_missions(panel, floors, kinds, every=every).specs
-    fitting = [kind for kind in kinds if kind in specs]
-    most = min(max(len(specs[kind]) for kind in fitting), chosen.episodes)
-    return [specs[kind][at] for at in range(most) for kind in fitting if at < len(specs[kind])]
