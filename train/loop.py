@@ -72,8 +72,8 @@ def train(
     Args:
         stop: called between steps and while the policy is evaluated; True ends the run with a
             checkpoint. An evaluation under way is abandoned, and made by the run that goes on.
-        notify: called with every row of `progress`, every evaluation, a teacher without opinions,
-            and the notes of an off-policy evaluation on its logs.
+        notify: called with every row of `progress`, every evaluation, and the notes of an
+            off-policy evaluation on its logs.
 
     Raises:
         TrainingInterrupted: `stop` said so.
@@ -181,7 +181,6 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
     if progress.evaluated_at != progress.env_steps:
         _evaluate(session, notify, stop)
-    _note_silence(session, notify)
     _save(session)
     session.write_held()
     return _result(session)
@@ -378,17 +377,6 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     session.events.scalars(progress.env_steps, "train", row)
     session.interval = Interval(env_steps_before=progress.env_steps, wall_s_before=wall_s)
     notify("progress", row)
-    if not session.silence_noted:
-        _note_silence(session, notify)
-
-
-def _note_silence(session: Session, notify: Notify) -> None:
-    """Notify that the teacher has answered nothing so far."""
-    teacher = session.collector.teacher
-    if teacher is None or teacher.answered or teacher.requested == session.silence_noted:
-        return
-    session.silence_noted = teacher.requested
-    notify("teacher", {"asked": teacher.requested, "answered": 0})
 
 
 def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:

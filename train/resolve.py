@@ -7,7 +7,6 @@ without effect, and a run that the machine's memory cannot hold.
 from __future__ import annotations
 
 import os
-from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -142,9 +141,6 @@ def row_bytes(observation_size: int) -> int:
     return row_width(observation_size) * 4 + meta + _SLOT_BYTES
 
 
-_CRITICS = 6  # copies of the network: online, target, averaged, a gradient, Adam's two
-
-
 def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
     """Refuse what would fail, or have no effect, once the run has begun.
 
@@ -166,25 +162,18 @@ def _refuse_no_effect(config: TrainConfig) -> None:
 
 
 def _refuse_too_large(config: TrainConfig, task: Task) -> None:
-    """Raise ConfigError if the run's largest arrays exceed the machine's memory."""
-    critic = _parameters(task.observation_size, config.network.hidden, len(task.actions))
-    taken = {
-        "replay.ring_capacity": config.replay.ring_capacity * row_bytes(task.observation_size),
-        "network.hidden": 4 * _CRITICS * critic,
-    }
+    """Raise ConfigError if the ring exceeds the machine's memory.
+
+    Its pages are taken as it fills, so the run would be killed hours after it began.
+    """
+    needed = config.replay.ring_capacity * row_bytes(task.observation_size)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    needed, largest = sum(taken.values()), max(taken, key=taken.__getitem__)
     if needed > memory:
         raise ConfigError(
-            f"the run needs at least {needed / 1e9:,.1f} GB of memory, {taken[largest] / 1e9:,.1f}"
-            f" of them for {largest}; this machine has {memory / 1e9:,.1f}",
-            where=largest,
+            f"needs {needed / 1e9:,.1f} GB of memory; this machine has {memory / 1e9:,.1f}",
+            where="replay.ring_capacity",
             remedy="give less",
         )
-
-
-def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
-    return sum((a + 1) * b for a, b in pairwise((inputs, *hidden, outputs)))
 
 
 def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:

@@ -126,7 +126,6 @@ class Session(Stateful):
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
     last: Score | None = None
-    silence_noted: int = 0  # states that the teacher had answered none of, when that was noted
     _started: float = field(default_factory=time.monotonic)
 
     @property

@@ -88,12 +88,6 @@ def median(values: NDArray[Any]) -> float:
     return float(np.median(values))
 
 
-def paired_improvement(better: NDArray[Any], worse: NDArray[Any]) -> float:
-    """Return P(a value of `better` (n,) beats its partner in `worse`), ties counting half."""
-    difference = np.asarray(better, np.float64) - np.asarray(worse, np.float64)
-    return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
-
-
 def improvement_of_arms(
     better: NDArray[Any],
     worse: NDArray[Any],

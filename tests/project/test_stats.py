@@ -15,7 +15,6 @@ from restock.stats import (
     for_few_clusters,
     holm,
     improvement_of_arms,
-    paired_improvement,
     paired_t,
     percentiles,
     wilson,
@@ -63,7 +62,6 @@ def test_the_interval_of_an_improvement_holds_seeds_and_episodes() -> None:
     alone = improvement_of_arms(np.ones((1, 9)), np.zeros((3, 9)), rng=rng)
     assert alone.value == 1.0
     assert np.isnan(alone.low)
-    assert paired_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == 0.75
 
 
 def test_quantiles_count_clusters_not_rows() -> None:

@@ -5,10 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from restock.train.judge.comparability import Check, ComparabilityLimits, Feed, check_feeds, worst
+from restock.train.judge import comparability
+from restock.train.judge.comparability import Check, Feed, check_feeds, worst
 
 CELLS = ["logs/nominal", "logs/wheel_slip", "logs/rare", "fresh/nominal", "fresh/wheel_slip"]
-LIMITS = ComparabilityLimits(resamples=300)
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        comparability, "LIMITS", dataclasses.replace(comparability.LIMITS, resamples=300)
+    )
 
 
 def feed(
@@ -40,11 +47,11 @@ def feed(
 
 
 def verdict(first: Feed, second: Feed) -> str:
-    return worst([c.verdict for c in check_feeds(first, second, LIMITS, np.random.default_rng(0))])
+    return worst([c.verdict for c in check_feeds(first, second, np.random.default_rng(0))])
 
 
 def failing(first: Feed, second: Feed) -> list[Check]:
-    checks = check_feeds(first, second, LIMITS, np.random.default_rng(0))
+    checks = check_feeds(first, second, np.random.default_rng(0))
     return [check for check in checks if check.verdict == "incomparable"]
 
 

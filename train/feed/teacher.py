@@ -113,7 +113,6 @@ class AskedTeacher(Stateful):
 
     def __init__(self, teacher: Teacher, task: Task, name: str) -> None:
         self._teacher, self._actions, self._name = teacher, task.action_names, name
-        self.requested = self.answered = 0  # states since this process began
 
     def ask(self, env: Any, observation: F32) -> Label:
         """Return the teacher's action in each environment, (N,); UNKNOWN if it has no opinion.
@@ -142,8 +141,6 @@ class AskedTeacher(Stateful):
                 f"returned action {int(label[env_index])} for environment {env_index}: the task's"
                 f" are 0 to {len(self._actions) - 1}"
             )
-        self.requested += count
-        self.answered += int((label != UNKNOWN).sum())
         return label.astype(np.int16)
 
     def _refused(self, what: str) -> TeacherFailed:

@@ -48,6 +48,9 @@ class ComparabilityLimits:
     resamples: int = 1000
 
 
+LIMITS = ComparabilityLimits()
+
+
 @dataclass(frozen=True)
 class Feed:
     """What one arm's critics were fed: draws by cell (source/condition), tenth and episode.
@@ -94,17 +97,15 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
     return max(verdicts, key=_ORDER.index, default="comparable")
 
 
-def check_feeds(
-    first: Feed, second: Feed, limits: ComparabilityLimits, rng: np.random.Generator
-) -> list[Check]:
+def check_feeds(first: Feed, second: Feed, rng: np.random.Generator) -> list[Check]:
     """Run all checks. Both feeds must name the same cells in the same order."""
     checks = []
-    totals = [_resampled(feed, limits, rng) for feed in (first, second)]
+    totals = [_resampled(feed, rng) for feed in (first, second)]
     # Without importance weights the mix after weights is the mix.
     weighted = any(not np.array_equal(feed.drawn, feed.weight) for feed in (first, second))
     for kind, name in enumerate(("mix", "mix after weights")[: 1 + weighted]):
         for tenth in (None, *range(10)):
-            limit = limits.distance if tenth is None else limits.tenth_distance
+            limit = LIMITS.distance if tenth is None else LIMITS.tenth_distance
             part = "whole run" if tenth is None else f"tenth {tenth + 1}"
             cells = slice(None) if tenth is None else slice(tenth, tenth + 1)
             a, b = (total[:, kind, cells].sum(1) for total in totals)
@@ -115,26 +116,24 @@ def check_feeds(
                 continue
             with np.errstate(invalid="ignore"):  # a resample without a row: NaN, so inconclusive
                 a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
-            checks.append(_distance(name, part, a, b, limit, limits))
+            checks.append(_distance(name, part, a, b, limit))
             if tenth is None:
-                checks += _ratios(first.cells, name, a, b, limits)
-    return checks + _unlabelled(first, second, limits) + _episodes(first, second, limits)
+                checks += _ratios(first.cells, name, a, b)
+    return checks + _unlabelled(first, second) + _episodes(first, second)
 
 
-def _ratios(
-    cells: Sequence[str], name: str, a: F64, b: F64, limits: ComparabilityLimits
-) -> list[Check]:
+def _ratios(cells: Sequence[str], name: str, a: F64, b: F64) -> list[Check]:
     after = " after weights" if name.endswith("weights") else ""
     checks = []
     for index, cell in enumerate(cells):
         shares = float(a[0, index]), float(b[0, index])
-        if max(shares) < limits.share_floor:
+        if max(shares) < LIMITS.share_floor:
             continue
-        checks.append(_ratio(f"share of {cell}{after}", a[:, index], b[:, index], limits))
+        checks.append(_ratio(f"share of {cell}{after}", a[:, index], b[:, index]))
     return checks
 
 
-def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
+def _unlabelled(first: Feed, second: Feed) -> list[Check]:
     """Check the share of rows drawn before they had labels: they may be of any condition."""
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
@@ -143,23 +142,23 @@ def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[
         unknown = [name == "fresh/unlabelled" for name in feed.cells]
         shares.append(float(drawn[unknown].sum() / max(drawn[fresh].sum(), 1e-12)))
     most = max(shares)
-    if most <= limits.unlabelled:
+    if most <= LIMITS.unlabelled:
         return []
     name = "unlabelled share of fresh rows"
-    return [Check(name, "whole run", shares[0], shares[1], most, 0.0, most, limits.unlabelled)]
+    return [Check(name, "whole run", shares[0], shares[1], most, 0.0, most, LIMITS.unlabelled)]
 
 
-def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
+def _episodes(first: Feed, second: Feed) -> list[Check]:
     """Compare the numbers of episodes that each cell was drawn from; these are not random."""
     checks = []
     totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
     for index, cell in enumerate(first.cells):
-        if max(total[index] for total in totals) < limits.share_floor:
+        if max(total[index] for total in totals) < LIMITS.share_floor:
             continue
         one, other = _episodes_a_run(first, index), _episodes_a_run(second, index)
         value = max(one, other) / min(one, other) if min(one, other) else math.inf
         name = f"episodes of {cell}"
-        checks.append(Check.exact(name, one, other, value, limits.episode_ratio))
+        checks.append(Check.exact(name, one, other, value, LIMITS.episode_ratio))
     return checks
 
 
@@ -170,13 +169,11 @@ def _episodes_a_run(feed: Feed, cell: int) -> float:
     return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
 
 
-def _distance(
-    name: str, part: str, a: F64, b: F64, limit: float, limits: ComparabilityLimits
-) -> Check:
+def _distance(name: str, part: str, a: F64, b: F64, limit: float) -> Check:
     """Return the total variation distance of mixes (1 + R, C): the figure, then its resamples."""
     values = np.abs(a - b).sum(1) / 2
     value = float(values[0])
-    low, high, lowest, highest = _interval(values[1:], limits)
+    low, high, lowest, highest = _interval(values[1:])
     # Two resamples are further apart than their originals, by noise alone; mirrored about the
     # figure the interval errs to the other side. The wider of the two at each end says neither
     # "same" nor "different" for noise.
@@ -184,12 +181,12 @@ def _distance(
     return Check(name, part, None, None, value, max(low, 0.0), high, limit)
 
 
-def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
+def _ratio(name: str, a: F64, b: F64) -> Check:
     """Return the larger share over the smaller; a, b (1 + R,) are the figure, then resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)
     logs[np.isnan(logs)] = 0.0  # none in both
-    low, high, lowest, highest = _interval(logs[1:], limits)
+    low, high, lowest, highest = _interval(logs[1:])
     nearest = 0.0 if lowest <= 0 <= highest else min(abs(lowest), abs(highest))
     return Check(
         name,
@@ -199,17 +196,17 @@ def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
         float(np.exp(abs(logs[0]))),
         math.exp(nearest) if nearest < 700 else math.inf,
         math.exp(max(abs(low), abs(high))) if max(abs(low), abs(high)) < 700 else math.inf,
-        limits.share_ratio,
+        LIMITS.share_ratio,
     )
 
 
-def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, float, float]:
+def _interval(values: F64) -> tuple[float, float, float, float]:
     """Return the interval that shows "the same", and the wider one that must hold for "different".
 
     All checks must pass for the same, but any one of them makes a difference: its interval is
     widened for their number (Bonferroni), or noise would make one of thirty now and then.
     """
-    tail = (1 - limits.confidence) / 2
+    tail = (1 - LIMITS.confidence) / 2
     # By order, not interpolated: between two infinite ratios there is nothing to interpolate.
     low, high = np.quantile(values, [tail, 1 - tail], method="nearest")
     if not np.isfinite(values).all():
@@ -220,7 +217,7 @@ def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, f
     return float(low), float(high), centre - reach, centre + reach
 
 
-def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator) -> F64:
+def _resampled(feed: Feed, rng: np.random.Generator) -> F64:
     """Return draws and weights by tenth and cell, (1 + R, 2, 10, C): the originals, then resamples.
 
     A fresh episode is resampled as a whole: in all tenths and cells that it was drawn in.
@@ -232,7 +229,7 @@ def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator
     amounts = (feed.drawn, feed.weight)
     counts = [np.bincount(place, a, 10 * cells).astype(np.float64) for a in amounts]
     total = np.stack(counts).reshape(2, 10, cells)
-    sums: F64 = np.repeat(total[None], 1 + limits.resamples, axis=0)
+    sums: F64 = np.repeat(total[None], 1 + LIMITS.resamples, axis=0)
     random = np.array([name.startswith("fresh/") for name in feed.cells])
     fresh = random[feed.cell]
     if not fresh.any():
@@ -242,8 +239,8 @@ def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator
     matrices = [
         csr_array((a[fresh], (episode, place[fresh])), (episodes, 10 * cells)) for a in amounts
     ]
-    for start in range(0, limits.resamples, 100):
-        stop = min(start + 100, limits.resamples)
+    for start in range(0, LIMITS.resamples, 100):
+        stop = min(start + 100, LIMITS.resamples)
         # Poisson times each: the multinomial's, but for the total, which shares do not have.
         times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
         for kind, matrix in enumerate(matrices):

@@ -40,7 +40,6 @@ from restock.train.judge.comparability import (
     ALLOWED,
     Arm,
     Check,
-    ComparabilityLimits,
     Difference,
     Treatment,
     Verdict,
@@ -140,7 +139,6 @@ def compare(
     second: Sequence[Path | str],
     *,
     treatment: Treatment = "algorithm",
-    limits: ComparabilityLimits = ComparabilityLimits(),  # noqa: B008  (frozen)
     seed: int = 0,
 ) -> Comparison:
     """Compare the runs of two arms.
@@ -162,7 +160,7 @@ def compare(
     allowed = ALLOWED[treatment] | {"software"}
     refused = [difference for difference in differing if difference.kind not in allowed]
     totals = [_total(name, *(arm.totals[name] for arm in arms)) for name in arms[0].totals]
-    checks = check_feeds(*feeds(*arms), limits, rng)
+    checks = check_feeds(*feeds(*arms), rng)
     deciding = _deciding(treatment, totals, checks)
     verdict = "incomparable" if refused else worst([check.verdict for check in deciding])
     if identical:  # what was fed is the same by identity: there is nothing to estimate

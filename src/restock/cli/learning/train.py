@@ -130,12 +130,6 @@ def _train(prepared: Prepared) -> TrainResult:
                 nonlocal seen
                 if event == "evaluation":
                     say(_evaluation_line(values, session.wall_s))
-                elif event == "teacher":
-                    say(
-                        "warning: the teacher had no opinion (-1) in any of the"
-                        f" {values['asked']:,} states in which it was asked, so nothing was learnt"
-                        " from it in the twin"
-                    )
                 elif event == "off_policy":
                     for note in values["notes"]:
                         say(f"off-policy evaluation: {note}")

@@ -21,7 +21,7 @@ from restock.report.look.blocks import (
 )
 from restock.report.run.facts import Facts, mean_success
 from restock.report.run.twin_gap import find_gap
-from restock.train.evaluation.regression import EVERY, read_run_evaluation, regression
+from restock.train.evaluation.regression import read_run_evaluation, regression
 from restock.train.twin.calibration.twin_gap import TRUSTED
 
 BASELINES = {
@@ -92,7 +92,7 @@ def compared(facts: Facts, name: str | None = None) -> Rows:
             rows = regression(read_run_evaluation(facts.run, name), read_run_evaluation(facts.run))
         except RunError:  # the episodes have no success that can be compared
             rows = []
-        facts.compared[name] = [row for row in rows if row["condition"] != EVERY]
+        facts.compared[name] = rows
     return facts.compared[name]
 
 
