@@ -49,10 +49,9 @@ class ExportCommand:
     def run(self) -> None:
         """Write the data set and say what is in it."""
         if self.to == "onnx":
-            of_rows = ["query", "action", "cameras", "panel"]
             refuse(
                 self,
-                of_rows,
+                ["query", "action", "cameras", "panel"],
                 "applies only to a data set",
                 remedy="leave it out: a policy has no rows",
             )
