@@ -323,7 +323,9 @@ def open_session(
         executor=executor,
         logs=logs,
         log_terms=LogTerms.of(config, logs, learner.device),
-        practice=Practice.of(config.practice, env, config.env.conditions, goal=task.goal != "none"),
+        practice=Practice(
+            config.practice, env.mission_arms(), env.set_mission_shares, goal=task.goal != "none"
+        ),
         imitation=Imitation(
             config.teacher,
             logs,

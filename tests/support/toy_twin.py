@@ -5,13 +5,14 @@ of `wheel_slip` a forward step fails half the time, and the wheels turn all the 
 is fully determined by its spec, as in the real one.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import STORED_SIGNALS, Body, Task
+from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.physics.episode import EpisodeSpec
 
 CELLS = 6
@@ -57,8 +58,13 @@ class ToyTwin:
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
         self._fixed, self._taken = list(specs), 0
 
-    def set_conditions(self, conditions: Mapping[str, float]) -> None:
-        self._names, self._shares = list(conditions), np.array(list(conditions.values()))
+    def mission_arms(self) -> list[MissionArm]:
+        shares = zip(self._names, self._shares.tolist(), strict=True)
+        return [MissionArm(name, name, share) for name, share in shares if share]
+
+    def set_mission_shares(self, shares: Sequence[float]) -> None:
+        self._names = [arm.name for arm in self.mission_arms()]
+        self._shares = np.array(shares)
 
     def _next(self, place: int) -> EpisodeSpec:
         self.number[place] = -1

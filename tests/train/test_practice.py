@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.toy_run import config, session
-from support.toy_twin import ToyTwin
 
 from restock.errors import ConfigError, RunError
 from restock.replay.fleet.missions_file import MissionOrder
@@ -147,23 +146,9 @@ def test_success_of_a_task_without_a_goal_is_refused() -> None:
 # -- in a run -------------------------------------------------------------------------------------
 
 
-class KindsToy(ToyTwin):
-    """The corridor, with shares that can be set."""
-
-    def set_conditions(self, conditions: dict[str, float]) -> None:
-        self._names = list(conditions)
-        self._shares = np.array(list(conditions.values()))
-
-
 PRACTICE = {"rule": "success"}
 
 
-@pytest.fixture
-def with_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("support.toy_run.ToyTwin", KindsToy)
-
-
-@pytest.mark.usefixtures("with_shares")
 def test_a_run_of_other_arms_is_not_resumed(tmp_path: Path) -> None:
     first = session(tmp_path / "run", config(practice=PRACTICE))
     first.save()

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,7 +30,7 @@ from restock.state import Stateful
 from restock.train.dqn.config import PracticeConfig, TrainConfig
 from restock.train.feed.collector import EndedEpisode
 from restock.train.twin.env.episode_queue import MissionArm, MissionArms, MissionOrders
-from restock.train.twin.env.interface import ArmedTwin, Info, KindsTwin, Step, Twin
+from restock.train.twin.env.interface import Info, Step, Twin
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
@@ -91,34 +90,6 @@ class Practice(Stateful):
             self.natural if config.rule == "natural" else with_floor(self.weights, self.floor)
         )
         self._tell()
-
-    @classmethod
-    def of(
-        cls, config: PracticeConfig, env: Twin, conditions: Mapping[str, float], *, goal: bool
-    ) -> Practice:
-        """Make the practice of a twin with `conditions` (`env.conditions`).
-
-        Raises:
-            ConfigError: the twin cannot be given shares, or as the class.
-        """
-        kinds = [
-            MissionArm(kind, kind, share / sum(conditions.values()))
-            for kind, share in conditions.items()
-            if share
-        ]
-        if isinstance(env, ArmedTwin):
-            return cls(config, list(env.mission_arms()), env.set_mission_shares, goal=goal)
-        if isinstance(env, KindsTwin):
-            tell = partial(_set_kinds, env, [arm.kind for arm in kinds])
-            return cls(config, kinds, tell, goal=goal)
-        if config.rule != "natural":
-            raise ConfigError(
-                f'the rule "{config.rule}" chooses missions, and {type(env).__name__} cannot be'
-                " given shares",
-                where=f"{WHERE}.rule",
-                remedy='give it `set_conditions(shares)`, or use "natural"',
-            )
-        return cls(config, kinds, goal=goal)
 
     # -- what happens ---------------------------------------------------------------------------
 
@@ -292,10 +263,6 @@ def unordered(arms: Sequence[MissionArm]) -> list[MissionArm]:
     return own
 
 
-def _set_kinds(env: KindsTwin, kinds: Sequence[str], shares: Sequence[float]) -> None:
-    env.set_conditions(dict(zip(kinds, shares, strict=True)))
-
-
 MISSIONS = "env.missions"
 
 
@@ -381,6 +348,12 @@ class NoTwin:
         return {}
 
     def set_episodes(self, specs: Iterable[Any], /) -> None:
+        raise RuntimeError("a run on the logs alone does not drive")
+
+    def mission_arms(self) -> list[MissionArm]:
+        return []
+
+    def set_mission_shares(self, shares: Sequence[float], /) -> None:
         raise RuntimeError("a run on the logs alone does not drive")
 
     def reset(self, *, seed: int | None = None) -> tuple[F32, Info]:

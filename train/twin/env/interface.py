@@ -6,8 +6,8 @@ a trained network, an ONNX file, a script, one of your own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, runtime_checkable
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self
 
 import numpy as np
 from msgspec import Meta
@@ -33,35 +33,23 @@ Step = tuple[F32, F32, Bools, Bools, Info]
 
 
 class Twin(Protocol):
-    """The vectorised environment that training and evaluation need (`WarehouseVectorEnv`)."""
+    """The vectorised environment that training and evaluation need (`WarehouseVectorEnv`).
+
+    Its missions can be chosen by arm, as `[practice]` does: once shares were set,
+    `info["mission_arm"]` (N,) of a step is the arm of each episode.
+    """
 
     num_envs: int
 
     @property
     def signals(self) -> Signals: ...
     def set_episodes(self, specs: Iterable[EpisodeSpec], /) -> None: ...
+    def mission_arms(self) -> Sequence[MissionArm]: ...
+    def set_mission_shares(self, shares: Sequence[float], /) -> None: ...
     def reset(self, *, seed: int | None = None) -> tuple[F32, Info]: ...
     def step(self, actions: NDArray[Any], /) -> Step: ...
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any], /) -> None: ...
-
-
-@runtime_checkable
-class ArmedTwin(Protocol):
-    """A twin whose missions can be chosen by arm, as `[practice]` does.
-
-    `info["mission_arm"]` (N,) of a step is the arm of each episode, -1 if none was chosen.
-    """
-
-    def mission_arms(self) -> Sequence[MissionArm]: ...
-    def set_mission_shares(self, shares: Sequence[float], /) -> None: ...
-
-
-@runtime_checkable
-class KindsTwin(Protocol):
-    """A twin that takes only shares per kind of episode."""
-
-    def set_conditions(self, conditions: Mapping[str, float], /) -> None: ...
 
 
 class Policy(Protocol):
