@@ -47,8 +47,7 @@ MAY_IMPORT = {
     "replay/export": ("replay panel plan store ingest/steps ingest/profile ingest/task"),
     "train": (
         "dqn evaluation feed run twin/missions twin/env twin/floors twin/physics"
-        " replay/mixture replay/panel replay/store ingest/profile ingest/task"
-        " replay/sampling"
+        " replay/mixture replay/panel replay/sampling ingest/profile ingest/task"
     ),
     "train/dqn": "twin/missions twin/env twin/physics replay/fleet",
     "train/run": "replay replay/panel ingest/profile ingest/task",
