@@ -10,11 +10,13 @@ def _now(name: str) -> str:
     return f"it is now called {name}: rename it"
 
 
+_MEAN = "it was removed: restock export FOLDER --to run writes the mean of several runs"
 _AT = "it was removed: name the version in the store's place, as in STORE@12"
 
 TRAINING_KEYS = {
     "practice.shares": "it was removed: set the shares of kinds in env.conditions",
-    "network.ensemble": "it was removed: network.members is the mean of so many",
+    "network.ensemble": _MEAN,
+    "network.members": _MEAN,
     "loss.margin_policies": "it was removed: set teacher.policies",
     "evaluation.missions": "it was removed: restock eval --missions logged drives them afterwards",
     "record.tensorboard": "it was removed: record.trackers names tensorboard, or does not",

@@ -21,7 +21,6 @@ from restock.ingest.task.task import nearest_action, proposal_reader
 from restock.train.dqn.behaviour import ProposalNetwork, make_policy, plausible_actions
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.network import members_of
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.policies import load_agent, make_learner, save_agent, write_mean
 from restock.train.loop import train
@@ -33,7 +32,7 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 TASK = load_profile("warehouse_amr").task
 KNOWN = TASK.observation_names.index("nav_known")
-BY_PLANNER = {"teacher": {"source": "planner"}, "network": {"members": 2}}
+BY_PLANNER = {"teacher": {"source": "planner"}}
 
 
 def observed(command: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -57,19 +56,18 @@ def test_reads_the_action_nearest_to_the_proposal(seed: int) -> None:
     assert ((observation @ says) == known).all()
 
 
-def learner(margin: float, *, members: int = 3, path: str | None = None) -> Learner:
+def learner(margin: float, *, path: str | None = None) -> Learner:
     document = {"teacher": {"source": "planner", "margin": margin}}
-    document["network"] = {"hidden": [16], "members": members}
+    document["network"] = {"hidden": [16]}
     return make_learner(parse_config(document, where="test"), TASK, path=path)
 
 
 def values(one: Learner, q: list[float]) -> None:
     """Let Q be `q` (A,) in every state."""
     for network in (one.network, one.target_network, one.policy_network):
-        for member in members_of(network):
-            with torch.no_grad():
-                member.advantage.weight.zero_()
-                member.advantage.bias.copy_(tensor(q))
+        with torch.no_grad():
+            network.advantage.weight.zero_()
+            network.advantage.bias.copy_(tensor(q))
 
 
 def test_deviates_only_where_q_is_better_by_the_margin() -> None:
@@ -113,28 +111,6 @@ def test_with_constant_values_it_drives_as_the_planner_does() -> None:
     assert len(set(taken)) > 3
 
 
-@pytest.mark.parametrize("path", ["native", "autograd"])
-def test_each_member_learns_as_if_it_were_alone(path: str) -> None:
-    both = learner(0.3, path=path)
-    alone = [learner(0.3, members=1, path=path) for _ in range(3)]
-    for one, member in zip(alone, members_of(both.network), strict=True):
-        for network in (one.network, one.target_network):
-            network.load_state_dict(member.state_dict())
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(5, 64, 2 * TASK.observation_size + 3)).astype(np.float32)
-    rows[:, :, -3] = rng.integers(len(TASK.actions), size=(5, 64))
-    for batch in torch.from_numpy(rows):
-        losses = [one.update(batch).td for one in alone]
-        td = both.update(batch).td
-        torch.testing.assert_close(td, torch.stack(losses).mean(dim=0))
-        for one in (both, *alone):
-            one.target.after(one.gradient_steps)
-    observation = torch.from_numpy(rows[0, :, : TASK.observation_size])
-    of_each = torch.stack([one.network(observation) for one in alone])
-    assert (of_each.std(dim=0) > 0).all()
-    torch.testing.assert_close(both.network(observation), of_each.mean(dim=0))
-
-
 def test_onnx_deviates_where_torch_does() -> None:
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
@@ -153,7 +129,7 @@ def test_onnx_deviates_where_torch_does() -> None:
 
 def kept(path, seed, **teacher):
     """Write a run with a policy of random weights; return the policy."""
-    document = {"teacher": teacher, "network": {"hidden": [16], "members": 2}, "seed": seed}
+    document = {"teacher": teacher, "network": {"hidden": [16]}, "seed": seed}
     config = parse_config(document, where="test")
     torch.manual_seed(seed)
     network = make_learner(config, TASK).policy

@@ -31,7 +31,7 @@ from torch.nn import functional
 
 from restock.arrays import F32
 from restock.errors import ConfigError
-from restock.train.dqn.network import Ensemble, QNetwork
+from restock.train.dqn.network import QNetwork
 
 if TYPE_CHECKING:
     from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
@@ -211,14 +211,10 @@ def make_network(
     observation_size: int,
     actions: int,
     generator: torch.Generator | None = None,
-) -> QNetwork | Ensemble:
-    """Return the network of a run's algorithm, or an ensemble of them."""
-    make = make_algorithm(config.loss).make_network
-    members = [
-        make(config.network, observation_size, actions, generator)
-        for _ in range(config.network.members)
-    ]
-    return members[0] if len(members) == 1 else Ensemble(members)
+) -> QNetwork:
+    """Return the network of a run's algorithm."""
+    made = make_algorithm(config.loss)
+    return made.make_network(config.network, observation_size, actions, generator)
 
 
 def td_target(

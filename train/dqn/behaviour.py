@@ -17,6 +17,7 @@ G has a network of its own: imitation and values pull one network apart.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -148,13 +149,17 @@ def make_policy(
     config: TrainConfig, observation_size: int, actions: int, *, runs: int = 1
 ) -> PolicyNetwork:
     """Return a run's policy network, or that of a mean of runs, to load weights into."""
-    values = make_network(config, observation_size, actions)
+    values = _of_runs([make_network(config, observation_size, actions) for _ in range(runs)])
     if config.teacher.source == PLANNER:
         return ProposalNetwork(values, None, config.teacher.margin)
     if not config.teacher.filters:
         return values
     behaviours = [make_behaviour(observation_size, actions) for _ in range(runs)]
-    return FilteredNetwork(values, Ensemble(behaviours) if runs > 1 else behaviours[0])
+    return FilteredNetwork(values, _of_runs(behaviours))
+
+
+def _of_runs(networks: Sequence[QNetwork]) -> Values:
+    return networks[0] if len(networks) == 1 else Ensemble(networks)
 
 
 class Behaviour(Stateful):
@@ -182,7 +187,7 @@ class Behaviour(Stateful):
         self.optimizer = FlatAdam(self.network, _LEARNING_RATE, compiled=path == "native")
         self._slow = FlatParameters(self.average, learns=False).values
         learns = self.optimizer
-        (self._logits,) = differentiable(path, self.network, learns.values, learns.gradient)
+        self._logits = differentiable(path, self.network, learns.values, learns.gradient)
         self.updates = 0
         self.ratio = torch.tensor(config.ratio, device=device)
         self._floor = np.float32(self.ratio.log().cpu())  # of plausible logits, from the best on

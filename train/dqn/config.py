@@ -39,7 +39,6 @@ Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 class NetworkConfig(Checked, frozen=True):
     hidden: tuple[Count, ...] = (256, 256)  # widths of the layers
     layer_norm: bool = True
-    members: Count = 1  # so many learn side by side, and the mean of their values acts
 
     def check(self) -> None:
         if not self.hidden:

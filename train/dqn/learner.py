@@ -7,7 +7,7 @@ that the config, metrics and checkpoints of a run all carry.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar, cast
 
@@ -36,7 +36,6 @@ from restock.train.dqn.network import (
     averaging_rate,
     clone,
     differentiable,
-    members_of,
     update_path,
 )
 
@@ -102,8 +101,7 @@ class Learner(Stateful):
         # What the loss is computed with: the networks, or kernels that do the same.
         self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
         self._target = differentiable(self.path, self.target_network, self._slow)
-        is_dqn = type(self.algorithm) is DQN
-        self._has_kernels = is_dqn and [type(each) for each in self._online] == [Kernel]
+        self._has_kernels = type(self.algorithm) is DQN and type(self._online) is Kernel
         self.gradient_steps = 0
         self.behaviour: Behaviour | None = None
         self._preference: Callable[[Tensor], Tensor] | None = None
@@ -196,18 +194,15 @@ class Learner(Stateful):
         return [*self.optimizer.moved, self._policy, self._slow, *slow]
 
     def _fill_gradient(self, rows: Tensor, terms: Terms) -> Loss:
-        batch, losses = self._batch(rows, terms), []
-        for online, target in zip(self._online, self._target, strict=True):
-            online.zero_grad(set_to_none=False)
-            loss = self.algorithm.loss(online, target, batch)
-            descended = loss.value if loss.penalty is None else loss.value + loss.penalty
-            descended.backward()  # type: ignore[no-untyped-call]
-            losses.append(Loss(loss.value.detach(), loss.td, loss.q))
-        return mean_loss(losses)
+        self._online.zero_grad(set_to_none=False)
+        loss = self.algorithm.loss(self._online, self._target, self._batch(rows, terms))
+        descended = loss.value if loss.penalty is None else loss.value + loss.penalty
+        descended.backward()  # type: ignore[no-untyped-call]
+        return Loss(loss.value.detach(), loss.td, loss.q)
 
     def _fill_by_kernels(self, rows: Tensor, terms: Terms) -> Loss:
         """Do the same for DQN without terms on logged rows: same bits, fewer small operations."""
-        parts = self._online[0], self._target[0], self.algorithm
+        parts = self._online, self._target, self.algorithm
         online, target, algorithm = cast("tuple[Kernel, Kernel, DQN]", parts)
         packed, count, size = rows.numpy(), len(rows), self.network.observation_size
         now, after = packed[:, :size], packed[:, size : 2 * size]
@@ -257,21 +252,12 @@ class Learner(Stateful):
         """
         batch = self._batch(rows, Terms(None, 0, 0.0, None))
         slow = self.network if online else self.target_network
-        pairs = zip(members_of(self.network), members_of(slow), strict=True)
-        td = mean_loss([self.algorithm.loss(*pair, batch) for pair in pairs]).td
+        td = self.algorithm.loss(self.network, slow, batch).td
         return td, self.network(batch.observation), self.target_network(batch.observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the best action (N,) of each observation (N, D), with the teacher's preference."""
         return greedy_actions(self._acting, observation)
-
-
-def mean_loss(losses: Sequence[Loss]) -> Loss:
-    """Return the mean over the members of an ensemble, part by part, without the penalty."""
-    if len(losses) == 1:
-        return losses[0]
-    parts = zip(*((loss.value, loss.td, loss.q) for loss in losses), strict=True)
-    return Loss(*(torch.stack(part).mean(dim=0) for part in parts))
 
 
 class TargetUpdate(Stateful):

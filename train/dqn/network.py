@@ -71,10 +71,10 @@ class QNetwork(nn.Module):
 
 
 class Ensemble(nn.Module):
-    """Networks that learn side by side from the same batches; the mean of their values acts.
+    """The networks of several runs; the mean of their values acts.
 
-    Their errors differ, as they began differently, and an action that one of them overestimates is
-    rarely overestimated by all (arXiv:1611.01929).
+    Their errors differ, as the runs explored by themselves, and an action that one of them
+    overestimates is rarely overestimated by all (arXiv:1611.01929).
     """
 
     def __init__(self, members: Sequence[nn.Module]) -> None:
@@ -145,22 +145,18 @@ def update_path(device: str, threads: int = 1) -> UpdatePath:
 
 def differentiable(
     path: UpdatePath, network: nn.Module, values: Tensor, gradient: Tensor | None = None
-) -> list[Differentiable]:
-    """Return what the loss of each member is computed with: a kernel, or the network itself.
+) -> Differentiable:
+    """Return what the loss is computed with: a kernel, or the network itself.
 
     Args:
         path: which of both is wanted; only a plain `QNetwork` has a kernel.
-        network: one, or an ensemble; its parameters are in `values`, by `FlatParameters`.
+        network: its parameters are in `values`, by `FlatParameters`.
         values: all parameters.
         gradient: their gradients; None if the network does not learn.
     """
-    members = members_of(network)
-    parts = values.chunk(len(members))  # members are alike, so their parameters are equally many
-    gradients = [None] * len(members) if gradient is None else gradient.chunk(len(members))
-    return [
-        Kernel(member, part, of_part) if path == "native" and type(member) is QNetwork else member
-        for member, part, of_part in zip(members, parts, gradients, strict=True)
-    ]
+    if path == "native" and type(network) is QNetwork:
+        return Kernel(network, values, gradient)
+    return network
 
 
 class Kernel:

@@ -239,7 +239,6 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
         mean.lead = mean.lead / root
     document = {key: value for key, value in runs[0].document.items() if key != "format"}
     whole = msgspec.to_builtins(configs[0])
-    whole["network"]["members"] = sum(config.network.members for config in configs)
     whole["teacher"]["margin"] /= root
     of = [run.document.get(MEAN_OF, [made.version]) for run, made in zip(runs, agents, strict=True)]
     document |= {"created_ns": now_ns(), "config": whole, MEAN_OF: [*chain.from_iterable(of)]}
