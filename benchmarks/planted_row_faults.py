@@ -33,8 +33,8 @@ from restock.ingest.steps import episodes as steps_module
 from restock.ingest.steps.filling import Filling
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Signals
-from restock.train.judge.before_training import RowDiagnosis, diagnose_rows, drive_twin, open_rows
-from restock.train.judge.fed_rows import FedRows
+from restock.train.judge.before_training import RowDiagnosis, diagnose_rows, open_rows
+from restock.train.judge.fed_rows import FedRows, drive_twin
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT
 

@@ -24,19 +24,18 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.panel.panel import HEADER, META, FileRecord, Panel, seal
 from restock.stats import ConfidenceInterval
-from restock.train.judge import before_training
+from restock.train.judge import before_training, fed_rows
 from restock.train.judge.answers import ACTION_TURN, GAIN, RELATIONS, Answer
 from restock.train.judge.before_training import (
     OpenedRows,
     RowDiagnosis,
     diagnose_rows,
-    drive_twin,
     gap_evidence,
     open_rows,
 )
 from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
-from restock.train.judge.fed_rows import FedRows, judged, over_parts
+from restock.train.judge.fed_rows import FedRows, drive_twin, judged, over_parts
 from restock.train.judge.row_checks import values
 from restock.train.twin.calibration.twin_gap import (
     TrustLimits,
@@ -440,9 +439,9 @@ def test_conditions_from_failures_alone_are_named(logs, failed):
 def test_ice_and_aimless_driving_are_no_faults(twin, logged, monkeypatch):
     """Check that ice and aimless driving are not named as faults of a sensor."""
     if logged == "ice":
-        monkeypatch.setattr(before_training, "KINDS", ("nominal", "wheel_slip"))
+        monkeypatch.setattr(fed_rows, "KINDS", ("nominal", "wheel_slip"))
     else:
-        monkeypatch.setattr(before_training, "Handover", lambda *_: RandomPolicy(seed=9))
+        monkeypatch.setattr(fed_rows, "Handover", lambda *_: RandomPolicy(seed=9))
     found = diagnose_rows(_drive(seed=9), twin)
     assert found.findings == []
     assert not any(row.off for row in found.comparisons)

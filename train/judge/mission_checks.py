@@ -22,6 +22,7 @@ from restock.replay.store.store import Store
 from restock.stats import clustered_quantiles
 from restock.train.judge.answers import RESAMPLES
 from restock.train.judge.fed_rows import (
+    POSE,
     TAIL,
     Comparison,
     FedRows,
@@ -69,7 +70,6 @@ GAP = 0.3  # of the share that succeeds
 _MIN_MISSIONS = 5  # with and without
 _MET = 0.2  # of a condition's episodes, for an exposure to be their situation
 
-POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
 _SIGNALS = (
     f"SELECT t.transition_id, {', '.join(POSE)}, CAST(e.success AS DOUBLE) AS success,"
     " t.conditions, t.exposures, t.behaviour_policy, h.held, r.ticks - r.episode_ends"
