@@ -217,7 +217,6 @@ class Run:
             (self.path, "*.parquet"),
             (self.path, "*.json"),
             (self.latest.parent, "*.safetensors"),
-            (self.path / "fresh", "*.safetensors"),
         ):
             remove_leftovers(folder, pattern)
 

@@ -272,10 +272,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
 
     # -- episodes -------------------------------------------------------------------------------
 
-    def set_conditions(self, conditions: Mapping[str, float]) -> None:
-        """Set the shares per kind of episode, for episodes that begin from now on."""
-        self.queue.set_conditions(conditions)
-
     def mission_arms(self) -> list[MissionArm]:
         """Return the arms that drawn episodes can be chosen by, each with its natural share."""
         return self.queue.arms(self.navigation.planners)
