@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import duckdb
-import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError, expect
 from restock.files import first_line
@@ -314,7 +313,6 @@ def _parse(name: str, text: str, where: str) -> Audit:
 
 CELLS_SHARE = 0.95
 EFFECTIVE_EPISODES = 50.0
-_COLUMNS = ("transition_id", "episode_id", "logged_ns", "condition", "zone", "action")
 
 
 @dataclass(frozen=True)
@@ -399,13 +397,3 @@ def recommend_capacity(
         half_share=curve[-2]["cells_share"] if len(curve) > 1 else 1.0,
         curve=curve,
     )
-
-
-def capacity_of_rows(transitions: pa.Table) -> Capacity:
-    """Return the same of rows in memory: of a panel (`panel.meta`), which is what a run is fed."""
-    macros = files("restock.replay.store").joinpath("capacity.sql").read_text(encoding="utf-8")
-    with duckdb.connect() as connection:
-        rows = transitions.select(list(_COLUMNS)).rename_columns({"condition": "primary_condition"})
-        connection.register("transitions", rows)
-        connection.execute(macros)
-        return recommend_capacity(connection)

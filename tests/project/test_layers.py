@@ -108,15 +108,15 @@ MAY_IMPORT = {
         " replay/review replay/mixture replay/panel replay/store train/judge train/twin/missions"
     ),
     "cli/learning": (
-        "cli report ingest/profile ingest/store replay replay/fleet replay/mixture replay/trace"
+        "cli report ingest/profile replay replay/fleet replay/mixture replay/trace"
         " train train/judge train/dqn train/evaluation train/run"
         " train/study train/twin/floors train/twin/physics ingest/task"
-        " replay/panel train/feed replay/store train/twin/calibration"
+        " replay/panel train/feed"
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose ingest/task"
-        " replay/mixture replay/panel replay/trace train/dqn train/evaluation train/run"
-        " train/twin/floors train/twin/missions"
+        " replay/mixture replay/panel replay/trace train/dqn"
+        " train/evaluation train/run train/twin/floors train/twin/missions"
     ),
     "cli/twin": (
         "cli report ingest/profile ingest/propose"
