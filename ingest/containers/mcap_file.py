@@ -266,9 +266,12 @@ class McapFile(Storage):
         needed = {channel for channel, count in self.counts.items() if count}
         proven = copies if contents.summary_proven else Definitions()
         known = contents.definitions.beneath(proven)
-        for chunk in contents.chunks:
-            if not known.lacking(needed):
+        for at, chunk in enumerate(contents.chunks):
+            if not (lacking := known.lacking(needed)):
                 break
+            without_them = at and chunk.index and not lacking & chunk.index.keys()
+            if without_them and not copies.lacking(lacking):
+                continue  # not read for what begins in a later chunk
             records = self._chunks.inflate(chunk)
             known = mcap_records.definitions_in(records).beneath(known)
         if not contents.summary_proven:
