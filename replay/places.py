@@ -290,7 +290,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
         panel = Panel.open(path)
         for view, name in (("rows", META), ("evaluation_split", EVALUATION_SPLIT)):
             panel.header.files[name].check(path / name, verify=True)
-            _add_table(connection, schema, view, path / name)
+            read_parquet(connection, view, [path / name], schema=schema)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
         _keep(connection, schema, "strata", strata)
         return "panel"
@@ -312,13 +312,6 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
     if "eval_episodes" in files:
         _add_returns(connection, files["eval_episodes"], schema)
     return "run"
-
-
-def _add_table(connection: duckdb.DuckDBPyConnection, schema: str, view: str, file: Path) -> None:
-    """Create a view of a panel's table; robot and site are null in panels older than tags."""
-    has = pq.read_schema(file).names
-    absent = [name for name in ("robot", "site") if name not in has]
-    read_parquet(connection, view, [file], schema=schema, absent=absent)
 
 
 def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: str) -> None:

@@ -67,20 +67,19 @@ def read_parquet(
     files: Sequence[str | os.PathLike[str]],
     *,
     schema: str = "main",
-    absent: Sequence[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> None:
     """Create a view over Parquet files.
 
-    A column that a file lacks is null in its rows; text columns that are `absent` from all files
-    are null everywhere. If `kinds` gives the types of the columns, no file is opened.
+    A column that a file lacks is null in its rows. If `kinds` gives the types of the columns, no
+    file is opened.
 
     Raises:
         StoreError: one of them is missing or damaged.
     """
     try:
         if kinds is None:
-            connection.execute(parquet_view(view, files, schema=schema, absent=absent))
+            connection.execute(parquet_view(view, files, schema=schema))
         else:
             _view_of_known(connection, view, files, kinds, schema=schema)
     except duckdb.Error as error:
@@ -97,7 +96,6 @@ def parquet_view(
     files: Sequence[str | os.PathLike[str]],
     *,
     schema: str | None = None,
-    absent: Sequence[str] = (),
 ) -> str:
     """Return the statement that creates such a view.
 
@@ -105,11 +103,7 @@ def parquet_view(
     """
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
     listed = ", ".join(map(literal, files))
-    nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
-    return (
-        f"CREATE OR REPLACE VIEW {name} AS SELECT *{nulls}"
-        f" FROM read_parquet([{listed}], union_by_name = true)"
-    )
+    return f"CREATE OR REPLACE VIEW {name} AS FROM read_parquet([{listed}], union_by_name = true)"
 
 
 def _view_of_known(

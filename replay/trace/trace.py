@@ -113,11 +113,7 @@ def _of_run(trace: Trace, run: Path, row: str, recording: Path | str | None) -> 
             where=str(panel_path),
             remedy="trace the row of that panel: `restock trace PANEL ROW`",
         )
-    number = audit.get("panel_row")
-    if number is None:  # a run from before audit rows had it
-        ids = panel.meta_column("transition_id")
-        number = int(np.flatnonzero(ids == audit["transition_id"])[0])
-    _of_panel(trace, panel, int(number), recording)
+    _of_panel(trace, panel, int(audit["panel_row"]), recording)
 
 
 def _of_panel(trace: Trace, panel: Panel, number: int, recording: Path | str | None) -> None:
