@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -91,10 +91,9 @@ class TagRules(Checked, frozen=True):
     """The `[tags]` of a profile: what of a path, and of a recording's metadata, is a tag.
 
     `from_path` is a pattern of the path's last parts, or several, of which the first that matches
-    counts: `{robot}` is a tag, `{robot:[0-9]+}` one of the form of a regular expression, `*`
-    anything within a part, `**` any number of parts. `from_metadata` says which entry of the
-    recording's metadata is a tag of another name: `robot = "vehicle_id"`, or
-    `"record.vehicle_id"` where several records have one.
+    counts: `{robot}` is a tag, `*` anything within a part, `?` one character, `**` any number of
+    parts. `from_metadata` says which entry of the recording's metadata is a tag of another name:
+    `robot = "vehicle_id"`, or `"record.vehicle_id"` if several records have one.
     """
 
     from_path: str | list[str] = msgspec.field(default_factory=list)
@@ -235,6 +234,9 @@ def _contradiction(
     )
 
 
+_TAG = r"\{[A-Za-z_]\w*\}"
+
+
 @cache
 def path_pattern(pattern: str) -> re.Pattern[str]:
     """Compile a `from_path` into a regular expression of absolute paths.
@@ -242,69 +244,29 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
     Raises:
         ValueError: the pattern cannot be read; says why.
     """
-    parts = list(_parts(pattern.removeprefix("/")))
+    parts = pattern.removeprefix("/").split("/")
     if not pattern.startswith("/") and "**" in parts and not re.match(r"[^{*?]", pattern):
         raise ValueError(
             f"from_path {pattern!r}: a pattern with ** must begin with a folder's name, or with /"
         )
-    if "**" in parts[-1:] or not all(parts):
+    if parts[-1] == "**" or "" in parts:
         raise ValueError(f"from_path {pattern!r}: its last part is the recording's name, such as *")
+    tags = re.findall(_TAG, pattern)
+    if not tags or len(set(tags)) < len(tags) or re.search("[{}]", re.sub(_TAG, "", pattern)):
+        raise ValueError(
+            f"from_path {pattern!r} must hold the names of tags in braces, each once, such as"
+            " {robot}/*"
+        )
     begin = "/" if pattern.startswith("/") else "/(?:.*/)?"
-    *folders, last = parts
-    text = "".join("(?:[^/]+/)*" if p == "**" else _of_part(p, pattern) + "/" for p in folders)
-    text += _of_part(last, pattern)
-    names = re.findall(r"\(\?P<(\w+)>", text)
-    if not names:
-        raise ValueError(f"from_path {pattern!r} contains no tag, such as {{robot}}/*")
-    if doubled := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"from_path {pattern!r}: {{{doubled[0]}}} is in it twice")
-    try:
-        return re.compile(begin + text)
-    except re.error as error:
-        raise ValueError(f"from_path {pattern!r}: {error}") from None
+    folders = ("(?:[^/]+/)*" if part == "**" else _of_part(part) + "/" for part in parts[:-1])
+    return re.compile(begin + "".join(folders) + _of_part(parts[-1]))
 
 
-def _parts(pattern: str) -> Iterator[str]:
-    """Split a pattern at its slashes, except those of regular expressions in braces."""
-    depth, part = 0, ""
-    for letter in pattern:
-        depth += (letter == "{") - (letter == "}")
-        if letter == "/" and depth == 0:
-            yield part
-            part = ""
-        else:
-            part += letter
-    if depth:
-        raise ValueError(f"from_path {pattern!r}: its braces do not match")
-    yield part
-
-
-def _of_part(part: str, pattern: str) -> str:
-    """Return the regular expression of one part of a path."""
-    text, rest = "", part
-    while rest:
-        if rest.startswith("{"):
-            end = _closing(rest)
-            name, colon, fits = rest[1:end].partition(":")
-            if not re.fullmatch(r"[A-Za-z_]\w*", name):
-                raise ValueError(f"from_path {pattern!r}: {{{name}}} is not a name of a tag")
-            try:
-                re.compile(fits)
-            except re.error as error:
-                raise ValueError(f"from_path {pattern!r}: {fits!r}: {error}") from None
-            text += f"(?P<{name}>{fits if colon else '[^/]+?'})"
-            rest = rest[end + 1 :]
-        else:
-            text += {"*": "[^/]*", "?": "[^/]"}.get(rest[0], re.escape(rest[0]))
-            rest = rest[1:]
-    return "(?=[^/])" + text
-
-
-def _closing(text: str) -> int:
-    """Return the index of the brace that closes the one a text begins with."""
-    depth = 0
-    for place, letter in enumerate(text):
-        depth += (letter == "{") - (letter == "}")
-        if not depth:
-            return place
-    raise AssertionError(text)  # `_parts` has counted them
+def _of_part(part: str) -> str:
+    """Return the regular expression of one part of a path, which is not empty."""
+    wild = {"*": "[^/]*", "?": "[^/]"}
+    pieces = (
+        f"(?P<{piece[1:-1]}>[^/]+?)" if piece[:1] == "{" else wild.get(piece, re.escape(piece))
+        for piece in re.split(f"({_TAG}|[*?])", part)
+    )
+    return "(?=[^/])" + "".join(pieces)
