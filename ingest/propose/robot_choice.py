@@ -2,8 +2,8 @@
 
 A robot with two driven sides turns on the spot; one that steers never does, whatever its commands.
 If nothing describes the robot, its drive shows in turns on the spot, or in commands for such turns
-that it did not follow, though it drove otherwise. Without such commands its logs do not show it: a
-robot that only ever drove in wide circles may have two driven sides.
+that it did not follow, though it moved. Without such commands its logs do not show it: a robot that
+only ever drove in wide circles may have two driven sides.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.description import Description, read_description
@@ -31,34 +31,31 @@ from restock.ingest.propose.footprint import (
     outline,
 )
 from restock.ingest.propose.roles import shared
-from restock.ingest.steps.frames import PoseSeries, motion_at
+from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.task import wrap_angle
 from restock.toml import toml_value
 
-TICK_NS = 100_000_000  # between two looks at the motion
-KNOWN_S, UNKNOWN_NS = 1.0, 2_000_000_000  # after a pose: its motion is; it is surely not any more
 SETTLED_S = 1.0  # a command is no older
 ANSWERED_S = 0.5  # after its end in which a turn still answers it
 SPOT_M = 0.1  # the circle of a turn on the spot, at most: no car is so small
 TURNS_RADPS = 0.15  # less is a slope of noise
-MIN_PIVOT_S, MIN_PIVOT_RAD = 0.5, 0.5  # of one turn on the spot, and of all
+MIN_PIVOT_RAD = 0.5
 STANDS_MPS, MUCH = 0.02, 0.3  # of a command to turn on the spot; of the sharpest turn that is told
 MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
 MIN_HALF_RAD = 1.0  # … of which following half is turning on the spot
-MIN_DRIVEN_M = 0.05  # else it may not have been able to move
+MIN_MOVED_M = 0.05  # else it may not have been able to move
 
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """Evidence in a drive that its robot steers as a car."""
+    """Evidence in a drive that its robot steers as a car, or turns on the spot."""
 
-    driven_m: float = 0.0
+    moved_m: float = 0.0  # the size of the place it drove in
     pivoted_rad: float = 0.0  # in turns on the spot
     requested_rad: float = 0.0  # by commands to turn on the spot
     spells: int = 0  # of such commands
     followed_rad: float = 0.0  # of what they asked for
-    curved_rad: float = 0.0  # turned while it drove
 
     @property
     def pivots(self) -> bool:
@@ -71,9 +68,8 @@ class DriveEvidence:
     def steers(self) -> bool:
         """Return whether it did not turn on the spot when told to, though it can move."""
         reported = self.requested_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
-        drove = self.driven_m >= MIN_DRIVEN_M
         followed = self.followed_rad >= FOLLOWS * self.requested_rad
-        return reported and drove and not followed and not self.pivots
+        return reported and self.moved_m >= MIN_MOVED_M and not followed and not self.pivots
 
     @property
     def why(self) -> str:
@@ -81,16 +77,13 @@ class DriveEvidence:
         if self.pivots:
             turned = max(self.pivoted_rad, self.followed_rad)
             return f"it turned on the spot, by {turned:.1f} rad in all"
-        requested = (
+        if not self.requested_rad:
+            return "it never turned on the spot, and was never commanded to"
+        rest = f"though it moved by {self.moved_m:.1f} m" if self.steers else "too little to tell"
+        return (
             f"commanded to turn on the spot, by {self.requested_rad:.1f} rad in all, it turned by"
+            f" {max(self.followed_rad, 0.0):.1f}, {rest}"
         )
-        requested += f" {max(self.followed_rad, 0.0):.1f}"
-        if self.steers:
-            return f"{requested}, though it drove {self.driven_m:.1f} m"
-        if self.requested_rad:
-            return f"{requested}: too little to tell"
-        turns = f"{self.curved_rad:.1f} rad of turns in {self.driven_m:.1f} m"
-        return f"in {turns} it never turned on the spot, and was never commanded to"
 
 
 def drive_evidence(
@@ -104,63 +97,30 @@ def drive_evidence(
     """
     if len(command_s) < 2 or len(poses) < 3:
         return DriveEvidence()
-    changes = np.flatnonzero((np.diff(poses.x_m) != 0) | (np.diff(poses.yaw_rad) != 0))
-    pace_s = float(np.median(np.diff(poses.stamp_ns[changes]))) * 1e-9 if len(changes) > 2 else 0.1
-    window_s = float(np.clip(3 * pace_s, 0.3, 2.0))  # a pose that is held is no standing still
-    ticks = _looks(poses.stamp_ns)
-    motion = motion_at(poses, ticks, window_s, KNOWN_S)
-    known = motion.problem == ""
-    speed, turn = (np.where(known, c, 0.0) for c in (motion.forward_mps, motion.yaw_rate_radps))
-    sideways = np.where(known, motion.lateral_mps, 0.0)
-    tick_s = TICK_NS * 1e-9
-    way = np.hypot(speed, sideways)
-    spot = (np.abs(turn) >= TURNS_RADPS) & (way <= SPOT_M * np.abs(turn))
-    spot = _spells_of(spot, round(max(MIN_PIVOT_S, window_s) / tick_s))
-    sharp = float(np.percentile(np.abs(command_radps), 98))
-    fast = float(np.percentile(np.abs(command_mps), 98))
-    requested, spells, followed = _on_the_spot(command_s, command_mps, command_radps, poses, sharp)
-    drives = (way >= max(0.05, 0.2 * fast)) & (np.abs(speed) >= 0.9 * way)
-    moves = (way >= STANDS_MPS) & ~spot
-    curves = drives & (np.abs(turn) >= TURNS_RADPS)
+    at_s, heading = np.asarray(poses.stamp_ns * 1e-9, np.float64), _heading(poses)
+    turned, ahead, aside = (
+        np.interp(at_s + 0.5, at_s, column) - np.interp(at_s - 0.5, at_s, column)
+        for column in (heading, poses.x_m, poses.y_m)
+    )
+    spot = np.abs(turned) >= TURNS_RADPS
+    spot &= np.hypot(ahead, aside) <= SPOT_M * np.abs(turned)
     return DriveEvidence(
-        driven_m=float(way[moves].sum() * tick_s),
-        pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
-        requested_rad=requested,
-        spells=spells,
-        followed_rad=followed,
-        curved_rad=float(np.abs(turn[curves]).sum() * tick_s),
+        float(np.hypot(np.ptp(poses.x_m), np.ptp(poses.y_m))),
+        float(np.abs(np.diff(heading))[spot[1:]].sum()),
+        *_on_the_spot(command_s, command_mps, command_radps, at_s, heading),
     )
 
 
-def _looks(stamp_ns: Ints) -> Ints:
-    """Return moments TICK_NS apart from the first pose to the last, near poses only.
-
-    One message that is logged at the wrong time may lie years before the others.
-    """
-    gaps = np.flatnonzero(np.diff(stamp_ns) > UNKNOWN_NS)
-    begins = np.concatenate([stamp_ns[:1], stamp_ns[gaps + 1]]) - stamp_ns[0]
-    ends = np.concatenate([stamp_ns[gaps] + UNKNOWN_NS, stamp_ns[-1:]]) - stamp_ns[0]
-    spans = zip(-(-begins // TICK_NS), -(-ends // TICK_NS), strict=True)
-    numbers = np.concatenate([np.arange(*span) for span in spans])
-    looks: Ints = stamp_ns[0] + numbers * TICK_NS
-    return looks
-
-
-def _spells_of(flags: Bools, least: int) -> Bools:
-    """Keep the flags (T,) in runs of at least this length."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    kept = np.zeros_like(flags)
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        kept[begin:end] = end - begin >= least
-    return kept
+def _heading(poses: PoseSeries) -> F64:
+    """Return how far each pose is turned from the first, whole turns included (N,)."""
+    return np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
 
 
 def _on_the_spot(
-    command_s: F64, command_mps: F64, command_radps: F64, poses: PoseSeries, sharp: float
+    command_s: F64, command_mps: F64, command_radps: F64, at_s: F64, heading: F64
 ) -> tuple[float, int, float]:
     """Return how far (rad) and how often it was told to turn on the spot, and how far it did."""
-    at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
-    heading = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
+    sharp = float(np.percentile(np.abs(command_radps), 98))
     side = np.sign(command_radps) * (
         (np.abs(command_mps) <= STANDS_MPS)
         & (np.abs(command_radps) >= max(MUCH * sharp, TURNS_RADPS))
@@ -170,9 +130,9 @@ def _on_the_spot(
     requested, spells, followed = 0.0, 0, 0.0
     for first, behind in zip(begins, np.append(begins[1:], len(side)), strict=True):
         begin, end = command_s[first], command_s[behind - 1] + hold[behind - 1]
-        if not side[first] or begin < at[0] or end > at[-1]:
+        if not side[first] or begin < at_s[0] or end > at_s[-1]:
             continue
-        turned = np.diff(np.interp([begin, end + ANSWERED_S], at, heading))[0] * side[first]
+        turned = np.diff(np.interp([begin, end + ANSWERED_S], at_s, heading))[0] * side[first]
         requested += float((np.abs(command_radps) * hold)[first:behind].sum())
         followed += float(turned)
         spells += 1
