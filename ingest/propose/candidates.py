@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -19,7 +19,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.tables import CustomSignal, name_problem
-from restock.ingest.steps.cameras import TYPES, ImageProblem, image_bytes, image_fields, layouts
+from restock.ingest.steps.cameras import TYPES
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
 MAX_A_TOPIC = 8
@@ -220,52 +220,11 @@ def _number(text: str) -> bool:
 
 ENOUGH_HZ = 5.0  # a control period has no more; a faster camera is thinned
 _MAX_AGE_S = 0.5  # the profile's default
-_SAYS_NOTHING = re.compile(r"image(_(raw|rect|color|mono))*|compressed(depth)?|color|rgb|raw")
 
 
-@dataclass(frozen=True)
-class CameraTopic:
-    """A topic of images, and what its first whole frame is."""
-
-    name: str  # of its table
-    topic: TopicInfo
-    rate_hz: float | None
-    frame: str  # "jpeg, 640 x 480", or why none of its first messages is a frame
-    size_bytes: int  # of that frame; 0 if there is none
-    usable: bool
-
-    def lines(self) -> list[str]:
-        """Write its table in comments, or say why there is none."""
-        if not self.usable:
-            return [f"# {self.topic.name}: no frame that can be kept: {self.frame}"]
-        rate = "" if self.rate_hz is None else f"{self.rate_hz:.1f} Hz, "
-        lines = [f"[cameras.{self.name}]  # {rate}{self.frame}"]
-        if self.rate_hz is not None:
-            hourly = self.size_bytes * min(self.rate_hz, ENOUGH_HZ) * 3600 / 1e9
-            lines[0] += f", {self.size_bytes / 1000:,.0f} kB: {hourly:.2g} GB an hour as below"
-        lines.append(f"topic = {json.dumps(self.topic.name)}")
-        if self.rate_hz is not None and self.rate_hz > ENOUGH_HZ:
-            lines.append(f"max_hz = {ENOUGH_HZ:g}  # frames kept per second")
-        elif self.rate_hz and 2 / self.rate_hz > _MAX_AGE_S:
-            lines.append(f"max_age_s = {2 / self.rate_hz:.2g}  # two of its periods")
-        return ["# " + line for line in lines]
-
-
-def camera_topics(recording: Recording, seconds: float) -> list[CameraTopic]:
-    """List the topics of images that ingest can keep, by name; only first frames are read."""
-    found: list[CameraTopic] = []
-    for topic in sorted(recording.topics.values(), key=lambda topic: topic.name):
-        if topic.type not in TYPES or topic.skipped or not topic.expected:
-            continue
-        rate = topic.expected / seconds if seconds > 0 and topic.expected > 1 else None
-        what, size, usable = _first_frame(recording, topic)
-        name = _name(topic.name, {one.name for one in found})
-        found.append(CameraTopic(name, topic, rate, what, size, usable))
-    return found
-
-
-def camera_lines(cameras: list[CameraTopic]) -> list[str]:
-    """Write the tables of the cameras in comments, and say what to do with them."""
+def camera_lines(topics: Iterable[TopicInfo], recorded_s: float) -> list[str]:
+    """Write a table in comments for each topic of images, and say what to do with them."""
+    cameras = sorted((one for one in topics if one.type in TYPES), key=lambda one: one.name)
     if not cameras:
         return []
     lines = [
@@ -274,41 +233,17 @@ def camera_lines(cameras: list[CameraTopic]) -> list[str]:
         "# of its lines; docs/profile.md describes what is kept.",
         "",
     ]
-    for camera in cameras:
-        lines += [*camera.lines(), ""]
+    for topic in cameras:
+        name = re.sub(r"[^a-z0-9]+", "_", topic.name.lower()).strip("_")[:56]
+        name = name if name[:1].isalpha() else f"camera_{name}"
+        rate_hz = topic.expected / recorded_s if recorded_s > 0 else 0.0
+        lines += [
+            f"# [cameras.{name}]  # {rate_hz:.1f} Hz",
+            f"# topic = {json.dumps(topic.name)}",
+        ]
+        if rate_hz > ENOUGH_HZ:
+            lines.append(f"# max_hz = {ENOUGH_HZ:g}  # frames kept per second")
+        elif rate_hz and 2 / rate_hz > _MAX_AGE_S:
+            lines.append(f"# max_age_s = {2 / rate_hz:.2g}  # two of its periods")
+        lines.append("")
     return lines
-
-
-def _first_frame(recording: Recording, topic: TopicInfo) -> tuple[str, int, bool]:
-    """Describe the first whole frame among the first messages.
-
-    Format, bytes, whether there is one.
-    """
-    problem = "none of its messages could be read"
-    for _, fields in recording.batches(topic.name, image_fields(topic.type)):
-        payloads = image_bytes(fields)
-        layout = layouts(topic.type, fields)
-        for row, data in enumerate(payloads):
-            try:
-                one = layout(row, data)
-            except ImageProblem as reason:
-                problem = str(reason)
-                continue
-            return f"{one.encoding}, {one.width} x {one.height}", len(data), True
-        if payloads:
-            break
-    return problem, 0, False
-
-
-def _name(topic: str, taken: set[str]) -> str:
-    """Make a camera's name, as a profile may have it, of its topic's name."""
-    parts = [re.sub(r"[^a-z0-9_]+", "_", part.lower()).strip("_") for part in topic.split("/")]
-    said = [part for part in parts if part and not _SAYS_NOTHING.fullmatch(part)]
-    name = "_".join(said)[:56] or "camera"
-    name = name if name[0].isalpha() else f"camera_{name}"
-    number = next(n for n in range(1, len(taken) + 2) if _numbered(name, n) not in taken)
-    return _numbered(name, number)
-
-
-def _numbered(name: str, number: int) -> str:
-    return name if number == 1 else f"{name}_{number}"

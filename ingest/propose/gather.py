@@ -13,7 +13,7 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.signal_paths import conventions_of, plain
 from restock.ingest.profile.tables import HINDSIGHT, Input, is_motion
-from restock.ingest.propose.candidates import CameraTopic, Candidate, camera_topics, candidates
+from restock.ingest.propose.candidates import Candidate, candidates
 from restock.ingest.propose.clock_choice import PAUSE, ClockChoice, Gaps, choose_clock
 from restock.ingest.propose.commands import (
     CommandChoice,
@@ -155,7 +155,6 @@ class Evidence:
     outline: ScannedOutline | None  # if it has enough scans
     goal: GoalChoice
     signals: list[Candidate]
-    cameras: list[CameraTopic]
     robot: RobotProposal
     unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
     origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
@@ -275,7 +274,6 @@ def gather(
             without={topic.name for role, topic, _ in best if role in SPENT} | NODE_TOPICS | others,
             used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
         ),
-        [one for one in camera_topics(recording, recorded_s) if one.topic.name not in others],
         robot,
         unmeasured,
         None if poses is None else _origin_m(poses),

@@ -124,7 +124,7 @@ def profile_lines(
         ]
     for signal in seen.signals:
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
-    lines += camera_lines(seen.cameras)
+    lines += camera_lines(usable_topics(recording).values(), seconds)
     # Names are of a stranger: a line break in one starts no key.
     return [visible(line) for line in [*lines, *_ENDING]]
 
