@@ -10,17 +10,15 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from restock.errors import ConfigError, counted
+from restock.errors import counted
 from restock.ingest.profile.description import (
     BASE_FRAMES,
     F64,
     HEAVIEST_KG,
-    MAX_LETTERS,
     Description,
     Joint,
     Place,
@@ -64,28 +62,6 @@ class _Wheel:
     @property
     def y_m(self) -> float:
         return float(self.place.at_m[1])
-
-
-def read_urdf(path: Path) -> str:
-    """Read the text of a URDF file.
-
-    Raises:
-        ConfigError: it cannot be read, is too long, or is no text.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(4 * MAX_LETTERS + 1)
-        return content.decode("utf-8")
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be read: {error.strerror}", where=str(path), remedy="check the path of --urdf"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(
-            f"is not a URDF: {error}",
-            where=str(path),
-            remedy="give the robot's URDF, as XML in UTF-8",
-        ) from error
 
 
 def described_robot(

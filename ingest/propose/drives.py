@@ -22,11 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from restock.errors import RecordingError
+from restock.errors import counted
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.profile.description import read_description
 from restock.ingest.profile.signal_paths import FRAME_IDS, frame_id_path, plain
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import drivable
@@ -37,8 +36,8 @@ from restock.ingest.propose.commands import (
     limit_of,
     settled_at_most,
 )
-from restock.ingest.propose.footprint import Footprint, descriptions
-from restock.ingest.propose.gather import Evidence, GoalChoice, gather
+from restock.ingest.propose.footprint import RobotText, descriptions
+from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather
 from restock.ingest.propose.proposal_lines import profile_lines
 from restock.ingest.propose.propose import Proposal, RobotKind, propose_from, propose_profile, tried
 from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
@@ -91,12 +90,7 @@ def drives_by_kind(
     """Sort recordings into kinds, and choose what to read of the kind with most drives.
 
     It reads at most `most` drives, those with a command and the largest first.
-
-    Raises:
-        RecordingError: there is no recording.
     """
-    if not paths:
-        raise RecordingError("no recording given", remedy="give at least one")
     kinds = robot_kinds(traits)
     own = max(kinds, key=lambda members: sum(bool(traits[one].command) for one in members))
     fullest = sorted(own, key=lambda one: (not traits[one].command, -_bytes(paths[one])))
@@ -105,51 +99,23 @@ def drives_by_kind(
 
 
 def propose_for_drives(
-    recordings: Sequence[Recording],
-    name: str,
-    *,
-    drives: Drives | None = None,
-    footprint: Footprint | None = None,
-    urdf: Path | None = None,
-    odometry_as_command: bool = False,
-    hindsight_goals: bool = False,
+    recordings: Sequence[Recording], drives: Drives, name: str, given: Given | None = None
 ) -> Proposal:
-    """Propose one profile for all of these recordings, as `propose_profile` does for one.
+    """Propose one profile for all drives of a kind, as `propose_profile` does for one.
 
     Args:
-        recordings: drives of one kind of robot; of several kinds those of the first are taken that
-            has most drives with a command.
+        recordings: those that `drives` says to read, in that order.
+        drives: what is known of these and more recordings.
         name: of the profile.
-        drives: what is known of these and more recordings; `recordings` are then those that it
-            says to read, in that order. None: these are all there are.
-        footprint, urdf, odometry_as_command, hindsight_goals: as of `propose_profile`.
+        given: what a person says of the robot.
 
     Raises:
         ConfigError: the URDF cannot be used; says why.
-        RecordingError: there is no recording.
     """
-    if not recordings:
-        raise RecordingError("no recording given", remedy="give at least one")
-    if len(recordings) == 1 and (drives is None or len(drives.paths) == 1):
-        return propose_profile(
-            *(recordings[0], name),
-            footprint=footprint,
-            urdf=urdf,
-            odometry_as_command=odometry_as_command,
-            hindsight_goals=hindsight_goals,
-        )
-    if drives is None:
-        traits = [robot_traits(recording) for recording in recordings]
-        drives = drives_by_kind([r.path for r in recordings], traits, most=len(recordings))
-        recordings = [recordings[one] for one in drives.read]
-    evidence = [
-        gather(
-            *(recording, footprint, urdf),
-            odometry_as_command=odometry_as_command,
-            hindsight_goals=hindsight_goals,
-        )
-        for recording in recordings
-    ]
+    given = given or Given()
+    if len(drives.paths) == 1:
+        return propose_profile(recordings[0], name, given)
+    evidence = [gather(recording, given) for recording in recordings]
     seen = _best(evidence, evidence)
     usual = _trials(seen, evidence)
     giving = [one for one, trial in zip(evidence, usual, strict=True) if trial.transitions]
@@ -162,7 +128,6 @@ def propose_for_drives(
     trials = [tried(one.recording, proposal.toml) for one in evidence]
     return replace(
         proposal,
-        problems=[*proposal.problems, *_in_another(proposal.missing, evidence)],
         toml="\n".join([*_lines(evidence, trials, drives), proposal.toml]),
         advice=[*proposal.advice, *_without_rows(evidence, trials), *_left_out(drives.others)],
         kinds=drives.robots,
@@ -303,9 +268,7 @@ def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives
     """Say as comments what comes of each drive, and which were not read."""
     rows = f"by what they say: {sum(trial.transitions for trial in trials):,} transitions."
     of, unread = len(drives.kinds[0]), drives.unread
-    number = f"the {len(evidence)} largest of {of:,} drives" if unread else f"{of:,} drives"
-    if of == 1:
-        number = "the one drive"
+    number = f"the {len(evidence)} largest of {of:,} drives" if unread else counted(of, "drive")
     lines = [f"# For {number} of one kind of robot, {rows}"]
     for drive, trial in zip(evidence, trials, strict=True):
         why = f"  ({trial.problem})" if trial.problem else ""
@@ -326,17 +289,6 @@ def names_of(paths: Sequence[Path]) -> str:
 def _name(path: Path) -> str:
     """Return two parts of a path, as bags of several robots often have the same names."""
     return "/".join(path.parts[-2:])
-
-
-def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
-    """Say which other drive has what the profile's own drive lacks."""
-    found = []
-    for role, lacks in (("pose", "command"), ("command", "pose")):
-        for one in drives if role in missing else ():
-            if (topics := one.roles[role]) and not one.roles[lacks]:
-                said = f"{_name(one.recording.path)} has a {role} ({topics[0][0].name})"
-                found.append(f"{said} and no {lacks}: one recording must hold both")
-    return found
 
 
 def _without_rows(drives: Sequence[Evidence], trials: Sequence[Trial]) -> list[Advice]:
@@ -452,13 +404,13 @@ def robot_traits(recording: Recording) -> RobotTraits:
         paths = [path for path in (*FRAME_IDS, "child_frame_id") if path in leaves]
         ends = recording.read({odometry.name: paths})[odometry.name].fields
         frames = " -> ".join(plain(str(np.asarray(ends[path], object)[0])) for path in paths)
-    texts = [text for _, text in descriptions(recording)]
-    described = read_description(texts[0]) if texts else ""
+    text = next(descriptions(recording), RobotText("", ""))
+    described = text.description
     return RobotTraits(
         command,
         frames,
         _lidar(recording, topics_for(recording, topics, KINDS["scan"])[:1]),
-        hashlib.blake2b(texts[0].encode(), digest_size=8).hexdigest() if texts else "",
+        hashlib.blake2b(text.text.encode(), digest_size=8).hexdigest() if text.text else "",
         "" if isinstance(described, str) else described.name,
         frozenset((t.name, t.type) for fits in roles.values() for t, _ in fits),
         frozenset((name, topic.type) for name, topic in recording.topics.items() if topic.expected),

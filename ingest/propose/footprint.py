@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,28 +105,23 @@ def parse_footprint(text: str) -> Footprint:
     return footprint
 
 
-def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint | None, list[str]]:
-    """Return the footprint that the recording holds of its robot, or None.
+@dataclass(frozen=True)
+class RobotText:
+    """A description of the robot, and where it is from."""
 
-    Also return notes on descriptions of no use.
+    source: str  # a topic, or a file's name
+    text: str
+    kind: str = "robot_description"  # or "urdf"
+    check: str = ""  # why it may be of another robot
 
-    Of several robots in the recording, the one to propose for.
-    """
-    notes: list[str] = []
-    for name, text in descriptions(recording):
-        found = of_urdf(text, scan_frame, source=name)
-        if isinstance(found, str):
-            notes.append(f"{name}: {found}")
-        elif found.sane:
-            why = shared(recording, name)
-            return replace(found, source=f"{found.source}; {why}") if why else found, notes
-        else:
-            notes.append(f"{found.source}: {found.length_m:.3g} x {found.width_m:.3g} m, no robot")
-    return None, notes
+    @cached_property
+    def description(self) -> Description | str:
+        """Return what the text describes, or why it cannot be used."""
+        return read_description(self.text)
 
 
-def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
-    """Yield the topics of the robot's descriptions, and the last text of each.
+def descriptions(recording: Recording) -> Iterator[RobotText]:
+    """Yield the last description of the robot of each topic that has any.
 
     Of several robots in the recording, those of the one to propose for, then those of none in
     particular.
@@ -137,12 +132,30 @@ def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
         if name.split("/")[-1] != "robot_description":
             continue
         texts = np.asarray(recording.read({name: ["data"]})[name].fields["data"], object)
-        yield from ((name, str(text)) for text in texts[-1:])
+        for text in texts[-1:]:
+            yield RobotText(name, str(text), check=shared(recording, name))
 
 
-def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
+def footprint_of(
+    texts: Iterable[RobotText], scan_frame: str = ""
+) -> tuple[Footprint | None, list[str]]:
+    """Return the footprint in the first description that has one, and notes on those before."""
+    notes: list[str] = []
+    for one in texts:
+        found = of_urdf(one, scan_frame)
+        if isinstance(found, str):
+            notes.append(f"{one.source}: {found}")
+        elif found.sane:
+            source = "; ".join(filter(None, (found.source, one.check)))
+            return replace(found, source=source), notes
+        else:
+            notes.append(f"{found.source}: {found.length_m:.3g} x {found.width_m:.3g} m, no robot")
+    return None, notes
+
+
+def of_urdf(text: RobotText, scan_frame: str = "") -> Footprint | str:
     """Return the outline that a robot's description has, or why there is none."""
-    description = read_description(text)
+    description = text.description
     if isinstance(description, str):
         return description
     shapes = outline(description)
@@ -152,7 +165,7 @@ def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
     places = description.places(OUTLINE)
     length, width = (float(side) for side in (high - low)[:2])
     middle_x, middle_y = (float(low[axis] + high[axis]) / 2 for axis in (0, 1))
-    found = Footprint(length, width, f"shapes of {count} links in {source}")
+    found = Footprint(length, width, f"shapes of {count} links in {text.source}")
     if (lidar := _lidar(places, scan_frame)) is None:
         return found
     at_m, yaw, upside_down = lidar

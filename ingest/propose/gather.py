@@ -28,6 +28,7 @@ from restock.ingest.propose.footprint import (
     GUESS,
     Footprint,
     ScannedOutline,
+    descriptions,
     footprint_of,
     lidar_place,
     moved_in_frame,
@@ -47,7 +48,7 @@ from restock.ingest.propose.robot_choice import (
     DriveEvidence,
     RobotProposal,
     propose_robot,
-    urdf_footprint,
+    read_urdf,
 )
 from restock.ingest.propose.roles import (
     KINDS,
@@ -160,15 +161,23 @@ class Evidence:
     origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
 
 
-def gather(
-    recording: Recording,
-    footprint: Footprint | None,
-    urdf: Path | None = None,
-    *,
-    odometry_as_command: bool,
-    hindsight_goals: bool = False,
-) -> Evidence:
-    """Gather what a recording says of its robot."""
+@dataclass(frozen=True)
+class Given:
+    """What a person says of a robot beside its recordings."""
+
+    footprint: Footprint | None = None  # its outline; None: what the recording says of it
+    urdf: Path | None = None  # a file that describes it, in place of the recording's description
+    odometry_as_command: bool = False  # the measured motion stands for commands that are missing
+    # Goals in hindsight even if most of the drive has none: its rows are then left out.
+    hindsight_goals: bool = False
+
+
+def gather(recording: Recording, given: Given) -> Evidence:
+    """Gather what a recording says of its robot.
+
+    Raises:
+        ConfigError: the URDF cannot be used; says why.
+    """
     topics, others = usable_topics(recording), other_robots_topics(recording)
 
     def fitting(kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
@@ -185,7 +194,7 @@ def gather(
     for role, key in MEASURED.items():
         roles[role], unmeasured[role] = _measured(recording, roles[role], key)
     chosen = CommandChoice()
-    if not roles["command"] and odometry_as_command:
+    if not roles["command"] and given.odometry_as_command:
         roles["command"] = fitting(ODOMETRY_AS_COMMAND)
     else:
         if len(roles["command"]) > 1:  # an arm on the robot may have its own
@@ -210,11 +219,12 @@ def gather(
     roles["scan"].sort(key=lambda fit: plain(scanned[fit[0].name].frame) not in BASE_FRAMES)
     scan = roles["scan"][0][0].name if roles["scan"] else None
     frame = scanned[scan].frame if scan is not None else ""
-    notes: list[str] = []
-    if footprint is None and urdf is not None:
-        footprint = urdf_footprint(urdf, frame)
+    texts = list(descriptions(recording))
+    if given.urdf is not None:
+        texts.insert(0, read_urdf(given.urdf))
+    footprint, notes = given.footprint, list[str]()
     if footprint is None:
-        footprint, notes = footprint_of(recording, frame)
+        footprint, notes = footprint_of(texts, frame)
     outline = scanned_outline(recording, roles["scan"][0], poses) if roles["scan"] else None
     if footprint is None:
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
@@ -225,8 +235,7 @@ def gather(
     if scan is not None:
         footprint = moved_in_frame(footprint, scanned[scan])
     robot = propose_robot(
-        recording,
-        urdf,
+        texts,
         scanned[scan] if scan is not None else None,
         upside_down=footprint.upside_down,
         lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
@@ -268,7 +277,7 @@ def gather(
         footprint,
         notes,
         outline,
-        GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=hindsight_goals),
+        GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=given.hindsight_goals),
         candidates(
             recording,
             without={topic.name for role, topic, _ in best if role in SPENT} | NODE_TOPICS | others,

@@ -20,8 +20,8 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Input
 from restock.ingest.propose.clock_choice import by_log_time
 from restock.ingest.propose.commands import off_the_floor
-from restock.ingest.propose.footprint import UPSIDE_DOWN, Footprint
-from restock.ingest.propose.gather import Evidence, GoalChoice, gather, without_first
+from restock.ingest.propose.footprint import UPSIDE_DOWN
+from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather, without_first
 from restock.ingest.propose.proposal_lines import (
     in_one_recording,
     lidar_guess,
@@ -80,35 +80,13 @@ class Proposal:
     wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 
-def propose_profile(
-    recording: Recording,
-    name: str,
-    *,
-    footprint: Footprint | None = None,
-    urdf: Path | str | None = None,
-    odometry_as_command: bool = False,
-    hindsight_goals: bool = False,
-) -> Proposal:
-    """Propose a profile for recordings like this one.
-
-    Args:
-        recording: what it is proposed from, and tried on.
-        name: of the profile.
-        footprint: the robot's outline, where it is known; else what the recording says of it.
-        urdf: a file that describes the robot, in place of the recording's own description.
-        odometry_as_command: take the measured motion for commands where none was recorded.
-        hindsight_goals: take goals in hindsight even where most of the drive has none: its rows
-            are then left out.
+def propose_profile(recording: Recording, name: str, given: Given | None = None) -> Proposal:
+    """Propose a profile of this name for recordings like this one, tried on it.
 
     Raises:
         ConfigError: the URDF cannot be used; says why.
     """
-    seen = gather(
-        *(recording, footprint, None if urdf is None else Path(urdf)),
-        odometry_as_command=odometry_as_command,
-        hindsight_goals=hindsight_goals,
-    )
-    return propose_from(seen, name)
+    return propose_from(gather(recording, given or Given()), name)
 
 
 def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:

@@ -19,18 +19,9 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.ingest.containers.recording import Recording
-from restock.ingest.profile.description import Description, read_description
-from restock.ingest.propose.described_robot import described_robot, read_urdf
-from restock.ingest.propose.footprint import (
-    Footprint,
-    SeenScans,
-    View,
-    descriptions,
-    of_urdf,
-    outline,
-)
-from restock.ingest.propose.roles import shared
+from restock.ingest.profile.description import MAX_LETTERS
+from restock.ingest.propose.described_robot import described_robot
+from restock.ingest.propose.footprint import RobotText, SeenScans, View, outline
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.task import wrap_angle
@@ -238,81 +229,69 @@ class RobotProposal:
         return [*lines, ""]
 
 
-def check_urdf(path: Path) -> Description:
+def read_urdf(path: Path) -> RobotText:
     """Read the description of a robot on wheels from a URDF file.
 
     Raises:
         ConfigError: it cannot be read, is no URDF, or has no wheels.
     """
-    description = read_description(read_urdf(path))
+    remedy = "give the URDF of a wheeled robot, as XML in UTF-8"
+    try:
+        with path.open("rb") as file:
+            text = file.read(4 * MAX_LETTERS + 1).decode("utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read: {error.strerror}", where=str(path), remedy="check the path of --urdf"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"is not a URDF: {error}", where=str(path), remedy=remedy) from error
+    found = RobotText(path.name, text, "urdf")
+    description = found.description
     problem: str | None
     if isinstance(description, str):
         problem = description
-    elif (problem := described_robot(description, 0.0).problem) is None:
-        return description
-    raise ConfigError(problem, where=str(path), remedy="give the URDF of a wheeled robot")
-
-
-def urdf_footprint(path: Path, scan_frame: str) -> Footprint | None:
-    """Return the outline in a URDF file; None if its shapes are meshes.
-
-    Raises:
-        ConfigError: it cannot be read, is no URDF, or has no wheels.
-    """
-    check_urdf(path)
-    text = read_urdf(path)
-    found = of_urdf(text, scan_frame, source=path.name)
-    return found if isinstance(found, Footprint) and found.sane else None
+    else:
+        problem = described_robot(description, 0.0).problem
+    if problem is not None:
+        raise ConfigError(problem, where=str(path), remedy=remedy)
+    return found
 
 
 def propose_robot(
-    recording: Recording,
-    urdf: Path | None,
+    texts: Iterable[RobotText],
     scan: SeenScans | None,
     *,
     upside_down: bool = False,
     lidar_yaw_rad: float = 0.0,
 ) -> RobotProposal:
-    """Return the robot that a URDF file, else the recording's description, and its scans describe.
+    """Return the robot that the first description of one on wheels, and its scans, describe.
 
     Args:
-        recording: what is read.
-        urdf: the file, if there is one.
+        texts: the descriptions.
         scan: what the scans say of the lidar.
         upside_down: the lidar hangs so.
         lidar_yaw_rad: by which the twin's lidar, which is in the middle, covers what this one does.
-
-    Raises:
-        ConfigError: the file cannot be used: it has no wheels, say.
     """
-    texts: Iterable[tuple[str, str]] = descriptions(recording)
-    if urdf is not None:
-        texts = [(urdf.name, read_urdf(urdf))]
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}
     notes: list[str] = []
     unfit: list[str] = []
-    for source, text in texts:
-        description = read_description(text)
+    for one in texts:
+        description = one.description
         if isinstance(description, str):
-            notes.append(f"{source}: {description}")
+            notes.append(f"{one.source}: {description}")
             continue
         shapes = outline(description)
         middle = 0.0 if shapes is None else float(shapes[0][0] + shapes[1][0]) / 2
         found = described_robot(description, middle, scan.frame if scan is not None else "")
         if found.problem is not None:
-            if urdf is not None:
-                raise ConfigError(
-                    found.problem, where=str(urdf), remedy="give the URDF of a wheeled robot"
-                )
-            unfit.append(f"{source}: {found.problem}")  # an arm's, say, beside that of its base
+            unfit.append(f"{one.source}: {found.problem}")  # an arm's, say, beside that of its base
             continue
-        kind = "robot_description" if urdf is None else "urdf"
-        if urdf is None and (why := shared(recording, source)):
-            notes.append(f"{source}: {why}")
+        if one.check:
+            notes.append(f"{one.source}: {one.check}")
         values = _sound(found.values, notes)
-        origin = dict.fromkeys(values, kind)
-        notes += [f"{source}: {note}" for note in found.notes]
+        origin = dict.fromkeys(values, one.kind)
+        notes += [f"{one.source}: {note}" for note in found.notes]
         break
     if unfit and not values:
         return RobotProposal(notes=unfit, rolls=False)

@@ -13,6 +13,7 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.propose.gather import Given
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.episodes import steps_of
@@ -125,7 +126,9 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
     """Return the profile of the clean drive."""
     bag = written(winding(), tmp_path_factory.mktemp("clean") / "bag")
     with open_recording(bag) as recording:
-        return parse_profile(propose_profile(recording, "r", hindsight_goals=True).toml, where="t")
+        return parse_profile(
+            propose_profile(recording, "r", Given(hindsight_goals=True)).toml, where="t"
+        )
 
 
 def found_in(topics: Topics, profile: Profile, folder: Path) -> tuple[list[Finding], Any]:
@@ -192,7 +195,7 @@ def test_a_recorders_clock_that_is_set_back_begins_a_segment(profile, tmp_path, 
         storage=storage,
     )
     with open_recording(bag) as recording:
-        proposed = propose_profile(recording, "r", hindsight_goals=True)
+        proposed = propose_profile(recording, "r", Given(hindsight_goals=True))
         steps = steps_of(profile, read_topics(recording, profile))
     assert parse_profile(proposed.toml, where="t").task.control_period_s == 0.1
     (found,) = steps.findings

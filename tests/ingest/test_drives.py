@@ -12,6 +12,7 @@ from support.paths import ROOT
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose import drives as drives_module
 from restock.ingest.propose.drives import (
@@ -20,8 +21,9 @@ from restock.ingest.propose.drives import (
     drives_by_kind,
     propose_for_drives,
     robot_kinds,
+    robot_traits,
 )
-from restock.ingest.propose.propose import tried
+from restock.ingest.propose.propose import Proposal, tried
 
 TWIST = "geometry_msgs/msg/Twist"
 WHEELS = "".join(
@@ -196,6 +198,12 @@ def test_a_drive_that_gives_no_rows_is_no_base(tmp_path, capsys):
     assert any(reported in each["text"] for each in said["advice"])
 
 
+def proposed(*recordings: Recording) -> Proposal:
+    paths = [recording.path for recording in recordings]
+    drives = drives_by_kind(paths, [robot_traits(recording) for recording in recordings])
+    return propose_for_drives(recordings, drives, "amr")
+
+
 @pytest.mark.long
 def test_where_one_drive_has_no_map_odometry_serves_all():
     """Of two bags of a TurtleBot 4, one had rows; `restock start` stopped at the other."""
@@ -203,11 +211,11 @@ def test_where_one_drive_has_no_map_odometry_serves_all():
     with open_recording(sample) as mapped, open_recording(sample) as without:
         for recording in (mapped, without):
             del recording.topics["/amcl_pose"]
-        of_maps = parse_profile(propose_for_drives([mapped, mapped], "amr").toml, where="p")
+        of_maps = parse_profile(proposed(mapped, mapped).toml, where="p")
         assert of_maps.frames is not None
         assert of_maps.frames.fixed == "map"
         del without.topics["/tf"]
-        proposal = propose_for_drives([mapped, without], "amr")
+        proposal = proposed(mapped, without)
         profile = parse_profile(proposal.toml, where="p")
         assert profile.frames is None
         assert profile.inputs.pose is not None

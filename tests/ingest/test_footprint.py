@@ -6,7 +6,13 @@ from support.paths import SHARED
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.propose.footprint import footprint_of, of_urdf, parse_footprint
+from restock.ingest.propose.footprint import (
+    RobotText,
+    descriptions,
+    footprint_of,
+    of_urdf,
+    parse_footprint,
+)
 
 URDF = """<robot name="cart">
   <link name="base_footprint"/>
@@ -29,7 +35,7 @@ URDF = """<robot name="cart">
 
 
 def test_shapes_of_the_base_and_its_wheels_make_the_outline():
-    found = of_urdf(URDF, "lidar", source="/robot_description")
+    found = of_urdf(RobotText("/robot_description", URDF), "lidar")
     assert not isinstance(found, str)
     # The box from -.2 to .4 ahead; .2 m to the right of the middle, the wheel to .28 m on the left.
     assert (found.length_m, found.width_m) == pytest.approx((0.6, 0.48))
@@ -48,7 +54,7 @@ def test_shapes_of_the_base_and_its_wheels_make_the_outline():
     ],
 )
 def test_a_description_of_no_use_is_said_to_be_one(text, why):
-    found = of_urdf(text, source="/robot_description")
+    found = of_urdf(RobotText("/robot_description", text))
     assert isinstance(found, str)
     assert why in found
 
@@ -72,7 +78,7 @@ def test_a_footprint_on_the_command_line():
 )
 def test_outlines_are_those_of_the_makers(bag, length_m, width_m):
     with open_recording(SHARED / bag) as recording:
-        found, notes = footprint_of(recording, "base_scan")
+        found, notes = footprint_of(descriptions(recording), "base_scan")
     assert found is not None
     assert notes == []
     assert found.length_m == pytest.approx(length_m, abs=0.02)

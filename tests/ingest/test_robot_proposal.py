@@ -13,7 +13,8 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.description import Description, read_description
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.described_robot import DescribedRobot, described_robot
-from restock.ingest.propose.footprint import footprint_of
+from restock.ingest.propose.footprint import descriptions, footprint_of
+from restock.ingest.propose.gather import Given
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import propose_robot
 from restock.ingest.propose.roles import robots_in
@@ -183,7 +184,7 @@ def test_a_proposed_profile_has_the_robot_of_the_file(bag, tmp_path):
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(robot(wheels((0.2, 0.22), (0.2, -0.22))))
     with open_recording(bag) as recording:
-        proposed = propose_profile(recording, "mine", urdf=urdf)
+        proposed = propose_profile(recording, "mine", Given(urdf=urdf))
         plain = propose_profile(recording, "mine")
     own = parse_profile(proposed.toml, where="proposed")
     assert own.robot is not None
@@ -241,8 +242,8 @@ def test_robots_in_a_recording_have_their_own_outlines(said_of, outline, source,
     topics |= {f"{name}/robot_description": said(text) for name, text in said_of.items()}
     with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
         assert robots_in(recording) == ["/robot2", "/robot1"]
-        found, notes = footprint_of(recording)
-        track_m = propose_robot(recording, None, None).values.get("track_m")
+        found, notes = footprint_of(descriptions(recording))
+        track_m = propose_robot(descriptions(recording), None).values.get("track_m")
     assert notes == []
     assert (found is None, track_m) == ((True, None) if outline is None else (False, 0.44))
     if found is not None:

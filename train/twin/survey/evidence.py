@@ -25,7 +25,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import Profile, parse_profile
-from restock.ingest.propose.footprint import Footprint, footprint_of
+from restock.ingest.propose.footprint import Footprint, descriptions, footprint_of
 from restock.ingest.task.task import yaw_of
 from restock.replay.store.store import Store, is_store
 from restock.train.twin.floors.floor_files import FURTHEST_M, read_grid
@@ -260,7 +260,7 @@ def gather(
         poses = own = choose_poses(candidate_poses(recording, profile), free_on)
         if with_map and known and stored is not None and _lies_on(stored.everywhere, free_on):
             poses = stored.everywhere  # drives on one map are in one frame
-        size = _of_profile(profile) or footprint_of(recording)[0]
+        size = _of_profile(profile) or footprint_of(descriptions(recording))[0]
         scans: list[PlacedScans] = []
         if with_scans and own is not None:
             scans = placed_scans(recording, own, profile, size)

@@ -97,32 +97,30 @@ class ProfileCommand:
         from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.propose.drives import names_of, propose_for_drives
         from restock.ingest.propose.footprint import parse_footprint
+        from restock.ingest.propose.gather import Given
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         expect_file_place(self.out, "--out")
-        footprint = None if self.footprint is None else parse_footprint(self.footprint)
+        given = Given(
+            None if self.footprint is None else parse_footprint(self.footprint),
+            self.urdf,
+            self.odometry_as_command,
+            self.hindsight_goals,
+        )
         stem = (self.out or Path(self.paths[0])).stem
         if self.out is None and self.robot is not None:  # of one name, they would be two versions
             stem += f"_{self.robot.strip('/')}"
         paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
         drives, unreadable = self._drives(paths)
-        chosen = paths if drives is None else [drives.paths[one] for one in drives.read]
-        unread = [] if drives is None else drives.unread
+        chosen, unread = [drives.paths[one] for one in drives.read], drives.unread
         with ExitStack() as opened:
             recordings = [opened.enter_context(self._open(path)) for path in chosen]
             with output.progress("proposing", None) as advance:
                 for recording in recordings:
                     recording.watch = advance.part
-                proposal = propose_for_drives(
-                    recordings,
-                    re.sub(r"\W+", "_", stem).strip("_") or "robot",
-                    drives=drives,
-                    footprint=footprint,
-                    urdf=self.urdf,
-                    odometry_as_command=self.odometry_as_command,
-                    hindsight_goals=self.hindsight_goals,
-                )
+                name = re.sub(r"\W+", "_", stem).strip("_") or "robot"
+                proposal = propose_for_drives(recordings, drives, name, given)
             losses = _losses(recordings, proposal.toml)
         chosen.sort(key=lambda path: path != proposal.base)  # that one first
         toml = "".join(f"# LOST: {loss}\n" for loss in losses) + proposal.toml
@@ -168,18 +166,16 @@ class ProfileCommand:
         lossy = proposal.problems or losses or unreadable or kept
         return ExitCode.LOSSY if lossy else ExitCode.OK
 
-    def _drives(self, paths: Sequence[Path]) -> tuple[Drives | None, list[Path]]:
-        """Group several recordings by kind of robot, and name those that cannot be read.
-
-        The groups are None for a single recording.
+    def _drives(self, paths: Sequence[Path]) -> tuple[Drives, list[Path]]:
+        """Group recordings by kind of robot, and name those that cannot be read.
 
         Raises:
             RecordingError: none can be read.
         """
-        from restock.ingest.propose.drives import drives_by_kind, robot_traits
+        from restock.ingest.propose.drives import Drives, drives_by_kind, robot_traits
 
         if len(paths) == 1:
-            return None, []
+            return Drives(paths, [], [[0]], [0]), []
         traits: dict[Path, RobotTraits] = {}
         unreadable: dict[Path, RecordingError] = {}
         for path in paths:

@@ -391,9 +391,9 @@ class StartCommand:
 
             open_device(self.device)
         if self.urdf is not None:
-            from restock.ingest.propose.robot_choice import check_urdf
+            from restock.ingest.propose.robot_choice import read_urdf
 
-            check_urdf(self.urdf)
+            read_urdf(self.urdf)
         if self.map is not None:
             from restock.train.twin.floors.floor_files import read_grid
 
