@@ -30,7 +30,6 @@ MIN_M = 0.005  # of a wheel's radius
 MAX_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
 ENDLESS_RAD = 6 * np.pi  # a joint that may turn so far is a wheel's
 AT_FLOOR_M = 0.012  # what is no higher above the floor stands on it
-USUAL_RADPS = (0.5, 60.0)  # a wheel's limit beyond this is a placeholder
 DRIVES = {  # words in the names of links and of simulators' plugins
     "omnidirectional": ("mecanum", "omni_wheel", "omniwheel", "planar_move", "holonomic"),
     "ackermann": ("ackermann",),
@@ -106,8 +105,6 @@ def described_robot(
         casters = _casters(boxes, rolling, floor, middle)
         if _stands(casters, values["axle_x_m"], values.get("height_m", radius * 4)):
             values["casters_m"] = casters
-    if speed := _fastest(driven, radius):
-        values["max_speed_mps"] = speed
     if lidar := _lidar_z(places, scan_frame, floor, notes):
         values["lidar.z_m"] = lidar
     meshes = _meshes(description, boxes)
@@ -268,14 +265,6 @@ def _stands(casters: list[list[float]], axle_x_m: float, height_m: float) -> boo
     room = 0.02 + 0.1 * height_m
     ahead = [0.0, *(x for x, _ in casters)]
     return min(ahead) + room < -axle_x_m < max(ahead) - room
-
-
-def _fastest(driven: list[_Wheel], radius: float) -> float | None:
-    limits = [wheel.joint.element.find("limit") for wheel in driven]
-    speeds = [number(limit.get("velocity")) for limit in limits if limit is not None]
-    low, high = USUAL_RADPS
-    usual = [speed for speed in speeds if low <= speed <= high]
-    return min(usual) * radius if len(usual) == len(driven) else None
 
 
 def _lidar_z(places: dict[str, Place], frame: str, floor: float, notes: list[str]) -> float | None:

@@ -240,8 +240,7 @@ def steered_by(seen: Evidence) -> str:
 def _robot_lines(seen: Evidence) -> list[str]:
     """Write what the twin builds; the actions are within its limits."""
     robot = seen.robot.limited(*seen.commands.reached)
-    fastest = np.abs(actions_of(seen.commands, robot)).max(axis=0).tolist()
-    return robot.lines(*fastest, outline_guessed=not seen.footprint.measured)
+    return robot.lines(outline_guessed=not seen.footprint.measured)
 
 
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:

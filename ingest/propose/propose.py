@@ -8,7 +8,6 @@ each guess. Possible custom signals are commented out.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -239,43 +238,28 @@ def tried(recording: Recording, toml: str) -> Trial:
 
 DRONES = ("mavros_msgs/", "px4_msgs/", "mav_msgs/", "ardupilot_msgs/", "crazyflie_interfaces/")
 MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
-ARMS = ("trajectory_msgs/msg/JointTrajectory", "control_msgs/", "moveit_msgs/")
-CAMERAS = re.compile(r"sensor_msgs/msg/(Image|CompressedImage|CameraInfo|PointCloud2?)$")
-ALONGSIDE = re.compile(r"tf2_msgs/|rcl_interfaces/|rosgraph_msgs/|std_msgs/|diagnostic_msgs/")
 ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its velocity commands"
 
 
 def no_wheeled_robot(
     recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
 ) -> str | None:
-    """Say what a recording seems to be if it is not of a wheeled robot, and what to do.
-
-    Else None.
+    """Say what a recording seems to be if it is not of a wheeled robot; else None.
 
     `command` are the topics that may drive it, `located` whether anything says where it is.
     """
-    types = {topic.type for topic in recording.topics.values() if topic.expected}
-    flying = sorted({t.split("/")[0] for t in types if t.startswith(DRONES) or t == MULTI_DOF})
-    if not (command and located) and flying:
-        reported = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
-        return f"this looks like a drone's recording (it has {reported}): {ON_WHEELS}"
     if command:
         off, requested = off_the_floor(recording, command[0])
-        if 2 * off <= requested:
+        if 2 * off > requested:
+            return (
+                f"this looks like a robot arm's or a drone's recording ({off:,} of the"
+                f" {requested:,} commands to move of {command[0][0].name} have linear.z, angular.x"
+                f" or angular.y): {ON_WHEELS}"
+            )
+        if located:
             return None
-        return (
-            f"this looks like a robot arm's or a drone's recording ({off:,} of the {requested:,} "
-            f"commands to move of {command[0][0].name} have linear.z, angular.x or angular.y): "
-            f"{ON_WHEELS}"
-        )
-    arm = sorted(t for t in types if t.startswith(ARMS))
-    if arm and not located:
-        reported = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
-        return f"this looks like a robot arm's recording ({reported}): {ON_WHEELS}"
-    rest = [t for t in types if not CAMERAS.search(t) and not ALONGSIDE.match(t)]
-    if types and not rest and any(CAMERAS.search(t) for t in types):
-        return (
-            "this looks like a recording of sensors alone (it has images or point clouds, but no "
-            "velocity command and no odometry): also record the command and a pose"
-        )
-    return None
+    types = {topic.type for topic in recording.topics.values() if topic.expected}
+    flying = sorted(kind for kind in types if kind.startswith(DRONES) or kind == MULTI_DOF)
+    if not flying:
+        return None
+    return f"this looks like a drone's recording (it has {', '.join(flying[:3])}): {ON_WHEELS}"

@@ -8,7 +8,6 @@ only ever drove in wide circles may have two driven sides.
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -189,38 +188,30 @@ class RobotProposal:
         return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
-        """Replace the limits of a description by those that its logs show."""
+        """Add the limits that its logs show."""
         logged = {"max_speed_mps": speed_mps, "max_yaw_rate_radps": yaw_rate_radps}
         found = {key: value for key, value in logged.items() if value is not None}
         origin = self.origin | dict.fromkeys(found, "logs")
         return replace(self, values=self.values | found, origin=origin)
 
-    def lines(self, speed_mps: float, yaw_rate_radps: float, *, outline_guessed: bool) -> list[str]:
-        """Write the TOML, without limits below what was commanded (m/s, rad/s), which are noted."""
+    def lines(self, *, outline_guessed: bool) -> list[str]:
+        """Write the TOML."""
         if not self.rolls:
             return [*(f"# [robot]  # {note}" for note in self.notes), ""]
-        values, notes = dict(self.values), list(self.notes)
-        for key, commanded in (
-            ("max_speed_mps", speed_mps),
-            ("max_yaw_rate_radps", yaw_rate_radps),
-        ):
-            if values.get(key, math.inf) < commanded * 0.999:
-                limit = values.pop(key)
-                notes.append(f"{key} = {limit:g} is not its limit: {commanded:g} was commanded")
-        own = {key: value for key, value in values.items() if "." not in key}
-        lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
+        own = {key: value for key, value in self.values.items() if "." not in key}
+        lidar = {key[6:]: value for key, value in self.values.items() if key.startswith("lidar.")}
         drive, reported = own.pop("drive", None), self.described
         guesses = {} if reported else {"wheelbase_m": "  # A GUESS from the outline: MEASURE IT"}
         lines = [
             "[robot]  # what the twin builds; missing values follow from the size of the outline",
-            *(f"# {note}" for note in notes),
+            *(f"# {note}" for note in self.notes),
             *([] if reported else [f"# {line}" for line in textwrap.wrap(self.drive_why, 98)]),
             f'drive = "{drive or "differential"}"',
             *(f"{key} = {toml_value(value)}{guesses.get(key, '')}" for key, value in own.items()),
         ]
         if lidar:
             lines += ["", "[robot.lidar]", *(f"{k} = {toml_value(v)}" for k, v in lidar.items())]
-        origin = {key: self.origin[key] for key in values if key in self.origin}
+        origin = {key: self.origin[key] for key in self.values if key in self.origin}
         if origin or outline_guessed:
             lines += ["", "[robot.origin]"]
             lines += [f'{_key(key)} = "{value}"' for key, value in origin.items()]

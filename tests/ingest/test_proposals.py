@@ -433,10 +433,6 @@ def test_a_proposal_is_of_its_robot(name, tmp_path):
             "a drone's recording (it has trajectory_msgs/msg/MultiDOF",
         ),
         (
-            {"/arm_controller/joint": ("trajectory_msgs/msg/JointTrajectory", EMPTY)},
-            "a robot arm's recording (it has trajectory_msgs/msg/JointTrajectory",
-        ),
-        (
             servoed(**{"linear.y": 0.1, "linear.z": 0.05, "angular.y": 0.1}),
             "a robot arm's or a drone's recording (80 of the 80 commands to move of /servo/twists"
             " have linear.z, angular.x or angular.y)",
@@ -445,7 +441,6 @@ def test_a_proposal_is_of_its_robot(name, tmp_path):
             servoed(**{"linear.z": np.where(SECONDS < 4.2, 0.1, 0.0)}),
             "a robot arm's or a drone's recording (42 of",
         ),
-        ({"/camera/color": ("sensor_msgs/msg/Image", EMPTY)}, "a recording of sensors alone"),
     ],
 )
 def test_a_recording_of_no_wheels_is_named_once(topics, said, tmp_path, capsys):
