@@ -113,9 +113,9 @@ class LiveObserver:
     def __init__(self, profile: Profile, max_ahead_s: float | None = None) -> None:
         if lacking := not_live(profile):
             raise ConfigError(
-                "takes " + " and ".join(f"{one.takes}, {one.why}" for one in lacking),
+                f"takes {' and '.join(lacking)}",
                 where=f"profile {profile.name!r}",
-                remedy="; ".join(one.remedy for one in lacking),
+                remedy="; ".join(lacking.values()),
             )
         self.profile, self.task = profile, profile.task
         self._inputs: dict[str, list[Input]] = {}

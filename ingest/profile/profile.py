@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
 from importlib.resources import files
@@ -361,54 +360,28 @@ def _lines(table: dict[str, Any]) -> list[str]:
     return [f"{name} = {toml_value(value)}" for name, value in table.items()]
 
 
-_POSE = "name a topic with the pose in the map frame under [inputs.pose]"
+def not_live(profile: Profile) -> dict[str, str]:
+    """Say what a profile takes that a running robot lacks, each with what to give instead.
 
-
-@dataclass(frozen=True)
-class NotLive:
-    """One thing that a profile takes and a running robot does not give."""
-
-    takes: str  # "its pose from transforms"
-    why: str  # why it is not there
-    remedy: str
-
-
-def not_live(profile: Profile) -> list[NotLive]:
-    """List what a profile takes that a running robot lacks; empty if it can be followed live."""
-    found = []
+    Empty if the profile can be followed live.
+    """
+    found: dict[str, str] = {}
     pose = profile.inputs.pose
+    named = "name a topic with the pose in the map frame under [inputs.pose]"
     if profile.frames is not None:
-        found.append(
-            NotLive(
-                "its pose from transforms ([frames])",
-                "which are not held live",
-                _POSE,
-            )
-        )
+        found["its pose from transforms ([frames]), which are not held live"] = named
     elif pose is not None and pose.by_fix:
-        found.append(
-            NotLive(
-                "its pose from satellite fixes",
-                "whose frame and heading are not computed live",
-                f"{_POSE}, such as that of robot_localization's navsat_transform_node",
-            )
+        found["its pose from satellite fixes, whose frame and heading are not computed live"] = (
+            f"{named}, such as that of robot_localization's navsat_transform_node"
         )
     elif pose is not None and pose.by_rates:
-        found.append(
-            NotLive(
-                "its pose by dead reckoning",
-                "which is not computed live",
-                f"{_POSE}, such as that of its odometry",
-            )
+        found["its pose by dead reckoning, which is not computed live"] = (
+            f"{named}, such as that of its odometry"
         )
     if profile.goal_source == "hindsight":
-        found.append(
-            NotLive(
-                "its goals in hindsight",
-                "which is not possible live",
-                "name the topics of goal and plan under [inputs.goal] and [inputs.plan], with"
-                ' goal.source = "logged"',
-            )
+        found["its goals in hindsight, which is not possible live"] = (
+            "name the topics of goal and plan under [inputs.goal] and [inputs.plan], with"
+            ' goal.source = "logged"'
         )
     return found
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -262,7 +262,6 @@ def _reserved() -> set[str]:
 
 COMMAND_SOURCES = "command_sources"
 COMMAND_THROUGH = "command_through"
-MAX_NAME = 64  # characters of a behaviour policy
 CLOUD = "sensor_msgs/msg/PointCloud2"
 SCAN_OF_CLOUD = {
     "ranges_m": "ranges",
@@ -272,40 +271,45 @@ SCAN_OF_CLOUD = {
 _Bearing = Annotated[float, Meta(ge=-3.1416, le=3.1416)]
 _OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of its outline
 SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # of a robot's lidars
-_SCAN_FIELDS = {
-    "ranges_m": True,
-    "angle_min_rad": True,
-    "angle_increment_rad": False,  # either this one
-    "angle_max_rad": False,  # or this one
-}
 
 
-# What each input must and may say of a message: signal-side name -> whether it is required.
-# `orientation` is a quaternion's path and becomes a yaw.
-RATES = {"speed_mps": False, "sideways_mps": False, "yaw_rate_radps": False}
-INPUT_FIELDS: dict[str, dict[str, bool]] = {
-    "command": {**RATES, "speed_mps": True, "steering_rad": False},
-    "pose": {
-        **{"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
-        **{"latitude_deg": False, "longitude_deg": False, "status": False},
-        **{"covariance_m2": False, "covariance_type": False},
-        **RATES,
-    },
-    "heading": {"orientation": False, "yaw_rad": False},  # of a pose by fix
-    "wheels": {"speed_mps": True, "yaw_rate_radps": True},
-    "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
-    **dict.fromkeys(SCANS, _SCAN_FIELDS),
-    "goal": {"x_m": True, "y_m": True},
-    "plan": {"x_m": True, "y_m": True},
-    "bumper": {"pressed": True},
-    "nav_command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
-    "behaviour_policy": {"text": True},
-    "true_condition": {"text": True},
-    "true_exposure": {"text": True},
-    "perturbation": {"text": True},
+class Form(NamedTuple):
+    """The fields by which messages may fill an input."""
+
+    needs: tuple[str, ...] = ()
+    either: tuple[str, ...] = ()  # and one of these two
+    may: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        return (*self.needs, *self.either, *self.may)
+
+
+_TURNS = ("yaw_rate_radps", "steering_rad")
+_HEADING = ("orientation", "yaw_rad")  # the path of a quaternion, which becomes a yaw, or a yaw
+_TEXT = Form(("text",))
+BY_FIX = Form(("latitude_deg", "longitude_deg"), may=("status", "covariance_m2", "covariance_type"))
+BY_RATES = Form(("speed_mps", "yaw_rate_radps"), may=("sideways_mps",))
+INPUT_FIELDS: dict[str, Form] = {
+    "command": Form(("speed_mps",), _TURNS, ("sideways_mps",)),
+    "pose": Form(("x_m", "y_m"), _HEADING),  # or BY_FIX, or BY_RATES
+    "heading": Form(either=_HEADING),  # of a pose by fix
+    "wheels": Form(("speed_mps", "yaw_rate_radps")),
+    "imu": Form(("yaw_rate_radps", "accel_x_mps2")),
+    **dict.fromkeys(
+        SCANS, Form(("ranges_m", "angle_min_rad"), ("angle_increment_rad", "angle_max_rad"))
+    ),
+    "goal": Form(("x_m", "y_m")),
+    "plan": Form(("x_m", "y_m")),
+    "bumper": Form(("pressed",)),
+    "nav_command": Form(("speed_mps",), _TURNS),
+    "behaviour_policy": _TEXT,
+    "true_condition": _TEXT,
+    "true_exposure": _TEXT,
+    "perturbation": _TEXT,
 }
 # Of a source of commands: the commands that it gives, or what is pressed while it drives.
-COMMAND_SOURCE_FIELDS = {**INPUT_FIELDS["nav_command"], "speed_mps": False, "pressed": False}
+COMMAND_SOURCE_FIELDS = ("speed_mps", *_TURNS, "pressed")
 
 # What is used instead of an input that is left out, or is optional and the recording lacks.
 FALLBACKS: dict[str, str] = {
@@ -380,7 +384,7 @@ class Input(Checked, frozen=True):
     @property
     def by_rates(self) -> bool:
         """Return whether it has speeds; a pose that has is by dead reckoning."""
-        return not RATES.keys().isdisjoint(self.fields)
+        return not {*BY_RATES.needs, *BY_RATES.may}.isdisjoint(self.fields)
 
 
 class Inputs(Checked, frozen=True):
@@ -422,31 +426,17 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
     Raises:
         ConfigError: it does not; names the key.
     """
-    known = INPUT_FIELDS[name]
-    unknown = sorted(source.fields.keys() - known.keys())
-    missing = sorted(
-        key for key, required in known.items() if required and key not in source.fields
-    )
-    if source.by_fix:
-        missing = sorted({"latitude_deg", "longitude_deg"} - source.fields.keys())
-        unknown += sorted(source.fields.keys() & {"x_m", "y_m", "orientation", "yaw_rad"})
-    elif name == "pose" and source.by_rates:
-        missing = sorted({"speed_mps", "yaw_rate_radps"} - source.fields.keys())
-        unknown += sorted(source.fields.keys() & {"x_m", "y_m", "orientation", "yaw_rad"})
-    elif name in ("pose", "heading") and not source.fields.keys() & {"orientation", "yaw_rad"}:
-        missing.append("orientation")
+    form = INPUT_FIELDS[name]
+    if name == "pose" and (source.by_fix or source.by_rates):
+        form = BY_FIX if source.by_fix else BY_RATES
+    unknown = sorted(source.fields.keys() - form.known)
+    missing = sorted(form.needs - source.fields.keys())
+    given = [key for key in form.either if key in source.fields]
+    if form.either and not given:
+        missing.append(form.either[0])
+    if len(given) > 1:
+        unknown.append(f"{given[1]} beside {given[0]}")
     _check_settings(f"inputs.{name}", name, source, where)
-    steered = "steering_rad" in source.fields
-    if name in ("command", "nav_command"):
-        if steered and "yaw_rate_radps" in source.fields:
-            unknown.append("steering_rad beside yaw_rate_radps")
-        elif not steered and "yaw_rate_radps" not in source.fields:
-            missing.append("yaw_rate_radps")
-    if name in SCANS:
-        if {"angle_increment_rad", "angle_max_rad"} <= source.fields.keys():
-            unknown.append("angle_max_rad beside angle_increment_rad")
-        elif not {"angle_increment_rad", "angle_max_rad"} & source.fields.keys():
-            missing.append("angle_increment_rad")
     _check_units(f"inputs.{name}", source, where)
     _check_wheelbase(f"inputs.{name}", source, where)
     _check_pressed(f"inputs.{name}", source, where)
@@ -455,7 +445,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         raise ConfigError(
             f"`inputs.{name}.fields`: {', '.join(problems)}",
             where=where,
-            remedy=f"{name} has the fields {', '.join(known)}",
+            remedy=f"{name} has the fields {', '.join(form.known)}",
         )
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
@@ -582,14 +572,7 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
         ConfigError: it does not; names the key.
     """
     commanding = source.fields.keys() - {"pressed"}
-    name = key.removeprefix(f"{COMMAND_SOURCES}.")
-    if not name or len(name) > MAX_NAME or not name.isprintable():
-        raise ConfigError(
-            f"`{key}`: the name of a behaviour policy has 1 to {MAX_NAME} printable characters",
-            where=where,
-            remedy='name the driver: "teleop", "navigation"',
-        )
-    if unknown := sorted(source.fields.keys() - COMMAND_SOURCE_FIELDS.keys()):
+    if unknown := sorted(source.fields.keys() - {*COMMAND_SOURCE_FIELDS}):
         raise ConfigError(
             f"`{key}.fields`: unknown {', '.join(map(repr, unknown))}",
             where=where,
@@ -612,12 +595,6 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
             where=where,
             remedy="give the topic of this source's commands, before one of several sources is "
             "chosen",
-        )
-    if source.optional:
-        raise ConfigError(
-            f"`{key}.optional`: a recording may always lack a source of commands",
-            where=where,
-            remedy="leave it out",
         )
     _check_wheelbase(key, source, where)
     _check_pressed(key, source, where)
