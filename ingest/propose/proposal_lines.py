@@ -126,7 +126,7 @@ def profile_lines(
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
     lines += camera_lines(usable_topics(recording).values(), seconds)
     # Names are of a stranger: a line break in one starts no key.
-    return [visible(line) for line in [*lines, *_ENDING]]
+    return [visible(line) for line in lines]
 
 
 def _origin_lines(seen: Evidence) -> list[str]:
@@ -177,21 +177,6 @@ def _exposures(seen: Evidence) -> list[str]:
     """Return the shipped exposures that this robot's signals can show."""
     slip = ["slippery_floor"] if _shows_slip(seen) else []
     return slip + (["closing_traffic", "plan_blocked"] if seen.roles["scan"] else [])
-
-
-_ENDING = [
-    "# A condition of your own: one SQL expression over the steps of an episode:",
-    "# [[condition]]",
-    '# name = "tight"',
-    '# timing = "pre"  # "post" may look ahead',
-    '# sql = "clearance_m < 0.3 AND command_speed_mps > 0"',
-    "",
-    "# Named rectangles of the map, for coverage by place:",
-    "# [[zone]]",
-    '# name = "aisle_1"',
-    "# box_m = [0.0, 0.0, 10.0, 1.8]  # x0, y0, x1, y1",
-    "",
-]
 
 
 def _trial_lines(trial: Trial) -> list[str]:

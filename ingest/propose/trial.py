@@ -59,6 +59,7 @@ class Trial:
     problem: str = ""  # why there is nothing
     findings: list[Finding] = field(default_factory=list)  # what contradicts itself
     pose_noise_m: float | None = None  # by how much poses differ from wheels in a control period
+    inside_outline: float | None = None  # share of usable ticks with a return inside the robot
 
     def comments(self, *keys: str) -> list[str]:
         """Write what it says of these keys of the profile, as comments of its TOML."""
@@ -76,7 +77,8 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     why = f"{why}; {remedy}" if remedy else why
     if not len(steps):
         return Trial(problem=why)
-    advice = [*_ages(profile, topics, steps, episodes), *_outline(profile, topics, steps)]
+    inside, advice = _outline(profile, topics, steps)
+    advice = [*_ages(profile, topics, steps, episodes), *advice]
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     problem = "" if episodes.transitions else f"no transition: {why}"
     stamps = steps.signals["stamp_ns"]
@@ -93,6 +95,7 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         problem,
         steps.findings,
         _pose_noise_m(steps, profile.task) if all(f.repaired for f in steps.findings) else None,
+        None if problem else inside,
     )
 
 
@@ -176,18 +179,24 @@ def _with_age(
         return 0
 
 
-def _outline(profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps) -> list[Advice]:
-    """Say whether the lidar sees things inside the robot's outline, or almost touching it."""
+def _outline(
+    profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps
+) -> tuple[float | None, list[Advice]]:
+    """Return at which share of usable ticks the lidar sees something inside the robot's outline.
+
+    Also advise on that, and on things that almost touch it.
+    """
     scan = profile.inputs.scan
     if scan is None or scan.topic not in topics:
-        return []
+        return None, []
     usable = np.array([problem == "" for problem in steps.problem], np.bool_)
     clearance = steps.signals["clearance_m"][usable]
     near_m = profile.task.rewards.tight_clearance_m  # as of near_collision and recovery
     inside, near = int((clearance <= 0).sum()), int((clearance < near_m).sum())
     often = inside > OFTEN_INSIDE * len(clearance) or near > OFTEN_NEAR * len(clearance)
-    if not len(clearance) or not often:
-        return []
+    share = inside / len(clearance) if len(clearance) else None
+    if not often:
+        return share, []
     body = profile.task.body
     text = (
         f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something "
@@ -195,4 +204,4 @@ def _outline(profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps)
         f"robot at {inside:,}: these are labelled near_collision and recovery. Measure the "
         "robot"
     )
-    return [Advice("task.body", text)]
+    return share, [Advice("task.body", text)]

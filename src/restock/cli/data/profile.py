@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -276,9 +276,7 @@ class ProfileCommand:
         ):
             recording.watch = advance.part
             as_read = as_recorded(profile, recording.topics)
-            topics = read_topics(recording, as_read)
-            trial = try_profile(as_read, topics)
-            inside = None if trial.problem else _inside_outline(as_read, topics)
+            trial = try_profile(as_read, read_topics(recording, as_read))
         lines = [str(each) for each in trial.advice]
         rows = outcome.manifest["transitions"] if outcome else 0
         lines += [
@@ -287,7 +285,7 @@ class ProfileCommand:
             for name, count in (outcome.conditions if outcome else {}).items()
             if name != NOMINAL and count > OFTEN * rows
         ]
-        return lines, inside
+        return lines, trial.inside_outline
 
 
 def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
@@ -307,25 +305,6 @@ def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
         for loss in recording.lost_messages
         if loss.topic is None or topics is None or loss.topic in topics
     ]
-
-
-def _inside_outline(profile: Profile, topics: Mapping[str, Any]) -> float | None:
-    """Return the share of usable ticks with a lidar return inside the robot's outline.
-
-    None if there is no lidar.
-    """
-    from restock.ingest.steps.episodes import steps_of
-
-    scan = profile.inputs.scan
-    if scan is None or scan.topic not in topics:
-        return None
-    steps = steps_of(profile, topics)
-    inside = [
-        clearance <= 0
-        for clearance, problem in zip(steps.signals["clearance_m"], steps.problem, strict=True)
-        if problem == ""
-    ]
-    return float(sum(inside) / len(inside)) if inside else None
 
 
 def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
