@@ -459,7 +459,6 @@ def check_profile(profile: Profile, where: str) -> None:
             remedy="leave out wheel_slip, or give the odometry under [inputs.wheels]",
         )
     _check_goal(profile, where)
-    _check_goal_rules(profile, where)
     proposed = profile.inputs.nav_command
     if proposed is not None and proposed.topic == profile.inputs.command.topic:
         raise ConfigError(
@@ -487,6 +486,13 @@ def check_profile(profile: Profile, where: str) -> None:
 
 def _check_goal(profile: Profile, where: str) -> None:
     """Check that goals and plans come from somewhere, and from one place alone."""
+    rules = changed(profile.goal)
+    if profile.goal.source == "logged" and rules:
+        raise ConfigError(
+            f"`goal.{rules[0]}` is given, and `goal.source` is 'logged': it would not be used",
+            where=where,
+            remedy='leave it out, or set goal.source = "hindsight"',
+        )
     if profile.task.goal == "none":
         if profile.goal.source == "hindsight":
             raise ConfigError(
@@ -511,17 +517,6 @@ def _check_goal(profile: Profile, where: str) -> None:
                 remedy=f"give the topic of the {name}; or take goals in hindsight, [goal] source ="
                 ' "hindsight"; or set task.goal = "none"',
             )
-
-
-def _check_goal_rules(profile: Profile, where: str) -> None:
-    """Raise ConfigError if a profile says how goals are found, and they are not found so."""
-    rules = [f"goal.{key}" for key in changed(profile.goal)]
-    if profile.goal.source == "logged" and rules:
-        raise ConfigError(
-            f"`{rules[0]}` is given, and `goal.source` is 'logged': it would not be used",
-            where=where,
-            remedy=f'leave {rules[0]} out, or set goal.source = "hindsight"',
-        )
 
 
 def _check_conditions(profile: Profile, where: str) -> None:

@@ -27,12 +27,11 @@ MAX_TAGS = 64  # of a recording
 MAX_NAME, MAX_VALUE = 64, 256  # characters
 
 
-def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False) -> dict[str, str]:
+def parse_tags(texts: Iterable[str], *, empty: bool = False) -> dict[str, str]:
     """Parse tags from `KEY=VALUE` texts of the command line.
 
     Args:
         texts: such as `robot=amr-07`.
-        flag: the option, for errors.
         empty: whether a value may be empty (`KEY=`): it then takes the tag off.
 
     Raises:
@@ -45,20 +44,20 @@ def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False
         name, value = name.strip(), value.strip()
         if not equals or not (value or empty):
             raise ConfigError(
-                f"{text!r} is not KEY=VALUE", where=flag, remedy=f"such as {flag} robot=amr-07"
+                f"{text!r} is not KEY=VALUE", where="--tag", remedy="such as --tag robot=amr-07"
             )
         if problem := tag_problem(name, value):
-            raise ConfigError(problem, where=flag)
+            raise ConfigError(problem, where="--tag")
         if tags.setdefault(name, value) != value:
             raise ConfigError(
                 f"{name} is given twice, as {tags[name]!r} and as {value!r}",
-                where=flag,
+                where="--tag",
                 remedy="a recording has one value of a tag: ingest the recordings of each value "
                 "separately",
             )
     if len(tags) > MAX_TAGS:
         raise ConfigError(
-            f"{len(tags)} tags are too many: at most {MAX_TAGS} are allowed", where=flag
+            f"{len(tags)} tags are too many: at most {MAX_TAGS} are allowed", where="--tag"
         )
     return tags
 

@@ -105,7 +105,7 @@ def described_robot(
         casters = _casters(boxes, rolling, floor, middle)
         if _stands(casters, values["axle_x_m"], values.get("height_m", radius * 4)):
             values["casters_m"] = casters
-    if lidar := _lidar_z(places, scan_frame, floor, notes):
+    if lidar := _lidar_z(places, scan_frame, floor):
         values["lidar.z_m"] = lidar
     meshes = _meshes(description, boxes)
     if meshes:
@@ -267,15 +267,11 @@ def _stands(casters: list[list[float]], axle_x_m: float, height_m: float) -> boo
     return min(ahead) + room < -axle_x_m < max(ahead) - room
 
 
-def _lidar_z(places: dict[str, Place], frame: str, floor: float, notes: list[str]) -> float | None:
+def _lidar_z(places: dict[str, Place], frame: str, floor: float) -> float | None:
     wanted = frame.strip("/").split("/")[-1]
     place = next((p for n, p in places.items() if n.split("/")[-1] == wanted), None)
     if not wanted or place is None or not np.isfinite(place.at_m).all():
         return None
-    if place.rotation[2, 2] < 0.9:
-        notes.append(f"the lidar ({frame}) is not level, unlike the twin's")
-    if abs(place.at_m[1]) > 0.02:
-        notes.append(f"the lidar ({frame}) is {place.at_m[1]:.2f} m to the left of the middle")
     return float(place.at_m[2]) - floor
 
 

@@ -306,12 +306,11 @@ def _without_rows(drives: Sequence[Evidence], trials: Sequence[Trial]) -> list[A
 def _left_out(others: Sequence[tuple[Path, RobotTraits]]) -> list[Advice]:
     if not others:
         return []
-    one = len(others) == 1
-    number = "1 recording is" if one else f"{len(others):,} recordings are"
-    text = f"{number} of another kind of robot, by what {'it says' if one else 'they say'}"
     names = names_of([path for path, _ in others])
-    propose = f"propose another profile for {'it' if one else 'them'}"
-    return [Advice("name", f"{text}: {names}; {propose}")]
+    text = (
+        f"another kind of robot, by its contents, in {counted(len(others), 'recording')}: {names}"
+    )
+    return [Advice("name", f"{text}; propose another profile for that")]
 
 
 SCANS = 40  # of a recording that are looked at

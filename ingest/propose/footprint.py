@@ -90,11 +90,8 @@ def parse_footprint(text: str) -> Footprint:
     Raises:
         ConfigError: it is not that.
     """
-    match = re.fullmatch(r"\s*([\d.]+)\s*[x,]\s*([\d.]+)\s*", text)
-    try:
-        length, width = (float(part) for part in match.groups()) if match else (0.0, 0.0)
-    except ValueError:
-        length = width = 0.0
+    match = re.fullmatch(r"\s*(\d*\.?\d+)\s*[x,]\s*(\d*\.?\d+)\s*", text)
+    length, width = (float(part) for part in match.groups()) if match else (0.0, 0.0)
     footprint = Footprint(length, width, "as given by --footprint")
     if not footprint.sane:
         raise ConfigError(
@@ -461,61 +458,54 @@ def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
     return SeenScans(said, (first, last, step[0]), origin)
 
 
-@dataclass(frozen=True)
-class LidarPlace:
-    """The place of a lidar in a robot's base frame, by transforms."""
+def with_lidar(
+    footprint: Footprint, recording: Recording, edges: Edges, scan_frame: str
+) -> Footprint:
+    """Add the lidar's place by the last of the recording's transforms, if they say it sanely.
 
-    base: str
-    x_m: float  # ahead
-    y_m: float  # to the left
-    yaw_rad: float
-    upside_down: bool
-
-
-def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPlace | None:
-    """Place the lidar by the last of the recording's transforms.
-
-    None if they do not, or not sanely.
+    The base frame is taken for the middle of the outline. A guessed outline is enlarged to contain
+    the lidar. If the lidar is outside a measured one, the base frame is not its middle: then only
+    the lidar's yaw is known.
     """
-    if not scan_frame:
-        return None
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
-    topic, static_topic = transform_topics(recording)
-    for base in named_frames(BASE_FRAMES, frames):
-        if plain(scan_frame) == base:
-            return LidarPlace(base, 0.0, 0.0, 0.0, False)
-        if base not in upward(plain(scan_frame), edges.parents):
-            continue
-        usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
-        kept = edges.only({base, scan_frame})
-        segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)
-        last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
-        times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
-        at = Tree(usual, kept, segments).place(scan_frame, times)
-        x, y = (float(way) for way in at.translation_m[0, :2])
-        yaw = float(at.yaw_rad[0])
-        if at.problem[0] == "" and max(abs(x), abs(y)) < MAX_ASIDE_M and np.isfinite(yaw):
-            return LidarPlace(base, x, y, yaw, bool(at.rotation[0, 2, 2] < 0))
-    return None
-
-
-def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
-    """Add the lidar's place by transforms to the footprint, with the base frame as its middle.
-
-    A guessed outline is enlarged to contain the lidar. If the lidar is outside a measured outline,
-    the base frame is not its middle: then only the lidar's yaw is known.
-    """
+    bases = [
+        base
+        for base in named_frames(BASE_FRAMES, frames)
+        if base in (plain(scan_frame), *upward(plain(scan_frame), edges.parents))
+    ]
+    place = _place(recording, edges, scan_frame, bases[0]) if scan_frame and bases else None
     if place is None:
         return footprint
-    turned = replace(footprint, lidar_yaw_rad=place.yaw_rad, upside_down=place.upside_down)
-    source = f"of {place.base}, by transforms; that this is the middle is a guess"
+    (x_m, y_m), yaw_rad, upside_down = place
+    turned = replace(footprint, lidar_yaw_rad=yaw_rad, upside_down=upside_down)
+    source = f"of {bases[0]}, by transforms; that this is the middle is a guess"
     if not footprint.measured:
-        sizes = (footprint.length_m, place.x_m), (footprint.width_m, place.y_m)
+        sizes = (footprint.length_m, x_m), (footprint.width_m, y_m)
         length, width = (max(usual, 2 * abs(at)) for usual, at in sizes)
         turned = replace(turned, length_m=length, width_m=width)
-    elif abs(place.x_m) > footprint.length_m / 2:
-        return replace(turned, lidar_source=f"{place.base} has it {place.x_m:.2f} m ahead, outside")
-    return replace(turned, lidar_x_m=place.x_m, lidar_y_m=place.y_m, lidar_source=source)
+    elif abs(x_m) > footprint.length_m / 2:
+        return replace(turned, lidar_source=f"{bases[0]} has it {x_m:.2f} m ahead, outside")
+    return replace(turned, lidar_x_m=x_m, lidar_y_m=y_m, lidar_source=source)
+
+
+def _place(
+    recording: Recording, edges: Edges, scan_frame: str, base: str
+) -> tuple[tuple[float, float], float, bool] | None:
+    """Return the lidar's place, yaw and whether it is upside down, in the base's frame."""
+    if plain(scan_frame) == base:
+        return (0.0, 0.0), 0.0, False
+    topic, static_topic = transform_topics(recording)
+    usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
+    kept = edges.only({base, scan_frame})
+    segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)
+    last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
+    times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
+    at = Tree(usual, kept, segments).place(scan_frame, times)
+    x, y = (float(way) for way in at.translation_m[0, :2])
+    yaw = float(at.yaw_rad[0])
+    if at.problem[0] != "" or max(abs(x), abs(y)) >= MAX_ASIDE_M or not np.isfinite(yaw):
+        return None
+    return (x, y), yaw, bool(at.rotation[0, 2, 2] < 0)
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:

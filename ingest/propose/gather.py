@@ -30,7 +30,6 @@ from restock.ingest.propose.footprint import (
     ScannedOutline,
     descriptions,
     footprint_of,
-    lidar_place,
     moved_in_frame,
     scanned_outline,
     scans_of,
@@ -228,7 +227,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
     if footprint is None:
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
-        footprint = with_lidar(footprint, lidar_place(recording, edges, frame))
+        footprint = with_lidar(footprint, recording, edges, frame)
     if footprint.lidar_yaw_rad is None and plain(frame).split("/")[-1] not in BASE_FRAMES:
         footprint = replace(footprint, lidar_unplaced=plain(frame))
     if scan is not None:

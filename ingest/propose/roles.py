@@ -310,14 +310,10 @@ def choose_robot(recording: Recording, name: str) -> None:
     found, chosen = _namespaces(recording), f"/{name.strip('/')}"
     if chosen not in found or len(found[chosen].kinds) < 2:
         robots = ", ".join(sorted(robots_in(recording)))
-        held = [n for n, one in found.items() if "command" in one.kinds and len(one.kinds) > 1]
         raise ConfigError(
             f"there is no robot {chosen} in the recording",
             where=str(recording.path),
-            remedy=f"its robots are {robots}"
-            if robots
-            else "it seems to be of one robot: name none"
-            + (f", or a namespace with a command: {', '.join(sorted(held))}" if held else ""),
+            remedy=f"its robots are {robots}" if robots else "it seems to be of one: name none",
         )
     recording.robot = chosen
 
