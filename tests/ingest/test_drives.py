@@ -98,15 +98,6 @@ def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
     assert sum(rows) == said["transitions"]
 
 
-def test_one_recording_is_proposed_as_before(tmp_path, capsys):
-    bag = write_bag(Told(), tmp_path / "bags" / "one")
-    texts = []
-    for path in (bag, tmp_path / "bags"):
-        assert main(["profile", "new", str(path), "--json"]) == 0
-        texts.append(json.loads(capsys.readouterr().out)["toml"].split("\n\n", 1)[1])
-    assert texts[0].replace('name = "one"', 'name = "bags"') == texts[1]
-
-
 def traits(**reported) -> RobotTraits:
     empty = RobotTraits("", "", None, "", "", frozenset(), frozenset())
     return replace(empty, **reported)

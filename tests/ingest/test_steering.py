@@ -1,6 +1,5 @@
 """Robots that nothing describes: whether they steer as a car, by how they turned."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -67,34 +66,9 @@ def test_drives_of_the_twin_tell_a_robot_that_steers(name: str, seed: int) -> No
     assert (found.steers, found.pivots) == (name == "ackermann", name != "ackermann")
     if found.steers:
         assert "commanded to turn on the spot, by" in found.why
-
-
-@pytest.mark.parametrize("seed", one_in(2, range(2)))
-@pytest.mark.parametrize("name", ROBOTS)
-def test_never_told_to_turn_on_the_spot_is_no_car(name: str, seed: int) -> None:
-    found = shown(name, seed, spot=False)
-    assert not found.pivots
-    assert not found.steers or name == "ackermann"
-    if not found.steers:
-        assert "never turned on the spot, and was never commanded to" in found.why
-
-
-def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
-    """One message that was logged before the clock was set; 0.1 s at a time it is a long way."""
-    at_s, years_s = np.arange(0, 60, PERIOD_S), 50 * 365 * 86_400.0
-    reported, turn_radps = at_s[:-1], np.where(at_s[:-1] % 20 < 10, 0.5, 0.0)
-    yaw = np.concatenate([[0.0], np.cumsum(turn_radps * PERIOD_S)])
-
-    def evidence(stray: bool) -> DriveEvidence:
-        shift_s = years_s if stray else 0.0
-        stamps = np.concatenate([[0] * stray, ((at_s + shift_s) * 1e9)]).astype(np.int64)
-        still = np.zeros(len(stamps))
-        poses = PoseSeries(stamps, still, still, np.concatenate([[0.0] * stray, yaw]))
-        return drive_evidence(reported + shift_s, np.zeros(len(reported)), turn_radps, poses)
-
-    assert evidence(stray=False).pivots
-    for field, value in dataclasses.asdict(evidence(stray=True)).items():
-        assert value == pytest.approx(getattr(evidence(stray=False), field), abs=0.01), field
+    gentle = shown(name, seed, spot=False)  # it was never commanded to
+    assert not gentle.pivots
+    assert not gentle.steers or name == "ackermann"
 
 
 def bag(folder: Path, *, pivots: bool) -> Path:
