@@ -258,10 +258,10 @@ def _on_map(one: Evidence) -> bool:
 
 
 def _fullness(one: Evidence) -> tuple[int, int, float]:
-    """Count the deciding inputs that it has and all its inputs, with how long it recorded."""
+    """Count the deciding inputs that it has and all its inputs, with how long it drove."""
     located = bool(one.roles["pose"]) or one.poses_from_frames
     deciding = sum((bool(one.roles["command"]), located, bool(one.roles["wheels"])))
-    return deciding, sum(map(bool, one.roles.values())), one.recorded_s
+    return deciding, sum(map(bool, one.roles.values())), one.driven_s
 
 
 def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives) -> list[str]:

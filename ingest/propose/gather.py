@@ -148,6 +148,7 @@ class Evidence:
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
+    driven_s: float
     recorded_s: float  # that its sensors were recorded: rates are of it
     footprint: Footprint
     footprint_notes: list[str]
@@ -270,6 +271,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
             stamped=_stamped(recording, roles, commands),
         ),
         gaps,
+        _driven_s(recording, gaps),
         recorded_s,
         footprint,
         notes,
@@ -384,3 +386,13 @@ def _recorded_s(recording: Recording, roles: Roles) -> float:
         return whole
     recorded = float(gaps[gaps <= PAUSE * max(float(np.median(gaps)), 0.02)].sum())
     return recorded if recorded > whole / 10 else whole
+
+
+def _driven_s(recording: Recording, gaps: Gaps) -> float:
+    """Return how long the robot drove, as recordings may pause between drives."""
+    span = recording.span_ns
+    whole = (span[1] - span[0]) * 1e-9 if span else 0.0
+    if gaps.period_s is None:
+        return whole
+    driven = gaps.period_s * gaps.count
+    return min(driven, whole) if driven > whole / 10 else whole
