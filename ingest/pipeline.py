@@ -37,7 +37,7 @@ from restock.ingest.containers.mcap_file import metadata_of
 from restock.ingest.containers.open_recording import identify, open_recording, state_of
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
-from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
+from restock.ingest.profile.profile import Profile, parse_profile, profile_toml
 from restock.ingest.profile.tag_rules import RecordingTags, in_words, resolve_tags
 from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
 from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
@@ -219,7 +219,7 @@ def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
 @lru_cache(maxsize=64)  # which many recordings share
 def _stored_profile(text: str) -> Profile | None:
     with suppress(ConfigError):  # as another version wrote it
-        return read_profile_toml(text, where="profile_toml")
+        return parse_profile(text, where="profile_toml")
     return None
 
 

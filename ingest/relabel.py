@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError
-from restock.ingest.profile.profile import profile_toml, read_profile_toml, with_conditions
+from restock.ingest.profile.profile import parse_profile, profile_toml, with_conditions
 from restock.ingest.store.manifest import (
     COLUMN,
     Correction,
@@ -161,7 +161,7 @@ def relabel_rows(
     rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
     named = rows["condition"].to_pylist()
     scores = label_scores(rows, labels, task.control_period_s)
-    profile = read_profile_toml(row["profile_toml"], where="the manifest's profile")
+    profile = parse_profile(row["profile_toml"], where="the manifest's profile")
     profile = with_conditions(profile, definitions)
     manifest = row | {
         "ingest_id": ingest_id,

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32
 from restock.errors import ConfigError
 from restock.files import first_line
-from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
+from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.task.task import Task
 from restock.process import import_extra
 
@@ -62,7 +62,7 @@ class PolicyFile:
             raise _refusal(path, "is an ONNX model without a task: it was not exported by Restock")
         self.version = f"{metadata.get('run', '')} {metadata.get('version', '')}".strip()
         self.profile: Profile = (
-            read_profile_toml(metadata.get("profile_toml", ""), where=f"{path}: profile_toml")
+            parse_profile(metadata.get("profile_toml", ""), where=f"{path}: profile_toml")
             if profile is None
             else load_profile(profile)
         )

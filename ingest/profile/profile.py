@@ -264,12 +264,13 @@ def load_profile(name_or_path: str | Path) -> Profile:
     return profile
 
 
-def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profile:
-    """Parse a profile from its TOML text.
+def parse_profile(text: str, *, where: str) -> Profile:
+    """Parse a profile from its TOML text, which names no file; `where` names it in errors.
 
-    `where` names it in errors, `.sql` files lie in `folder`.
+    Raises:
+        ConfigError: its TOML says something Restock cannot use.
     """
-    return _typed(parse_toml(text, where=where), where=where, folder=folder)
+    return _typed(parse_toml(text, where=where), where=where, folder=None)
 
 
 def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
@@ -314,7 +315,7 @@ def without_lidar(profile: Profile) -> Profile:
 
 
 def profile_toml(profile: Profile) -> str:
-    """Write the profile as TOML with every default; `read_profile_toml` gives an equal one."""
+    """Write the profile as TOML with every default; `parse_profile` gives an equal one."""
     values = _given(msgspec.to_builtins(profile))
     plain, tables = [], []
     for name, value in values.items():
@@ -326,15 +327,6 @@ def profile_toml(profile: Profile) -> str:
         else:
             plain += _lines({name: value})
     return "\n".join([*plain, *tables]) + "\n"
-
-
-def read_profile_toml(text: str, *, where: str) -> Profile:
-    """Read a profile from such a text; `where` names it in errors.
-
-    Raises:
-        ConfigError: as `parse_profile`, also where the text names a file.
-    """
-    return parse_profile(text, where=where, folder=None)
 
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:

@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 from restock.arrays import F32, F64
 from restock.errors import ConfigError, RestockError, StoreError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.profile.profile import read_profile_toml
+from restock.ingest.profile.profile import parse_profile
 from restock.ingest.relabel import stored_conditions
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.needs import read_topics
@@ -260,7 +260,7 @@ class Moments:
         found = {one.name: one for one in stored_conditions(manifest)}[name]
         doc = ""
         with suppress(RestockError):
-            own = read_profile_toml(manifest["profile_toml"], where="").definitions
+            own = parse_profile(manifest["profile_toml"], where="").definitions
             doc = {one.name: one.doc for one in own}.get(name, "")
         doc = doc or (shipped()[name].doc if name in shipped() else "")
         return msgspec.structs.replace(found, doc=doc)
@@ -314,7 +314,7 @@ def _read_inputs(manifest: Mapping[str, Any]) -> AlignedInputs | str:
     if sum(file.stat().st_size for file in files) > MAX_RECORDING_BYTES:
         return f"{path.name} is larger than {MAX_RECORDING_BYTES >> 20} MB"
     try:
-        profile = read_profile_toml(manifest["profile_toml"], where=manifest["profile"])
+        profile = parse_profile(manifest["profile_toml"], where=manifest["profile"])
         with open_recording(path, salvage=True) as opened:
             if opened.recording_id != manifest["recording_id"]:
                 return f"{path.name} is now another recording"

@@ -18,7 +18,7 @@ from restock.errors import ConfigError, RecordingError, StoreError
 from restock.files import first_line
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.profile import Profile, read_profile_toml
+from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.profile.signal_paths import AXES, TURN
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
@@ -430,7 +430,7 @@ def profile_of(origin: Origin, manifest: Mapping[str, Any]) -> Profile | None:
     """Return the profile that read the recording, as its manifest has it; None if it is damaged."""
     name = manifest["profile"]
     try:
-        profile = read_profile_toml(manifest["profile_toml"], where=f"profile {name!r}")
+        profile = parse_profile(manifest["profile_toml"], where=f"profile {name!r}")
     except ConfigError as error:
         origin.notes.append(f"profile {name!r} cannot be read from the store ({error.what})")
         return None

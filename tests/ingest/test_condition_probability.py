@@ -7,7 +7,7 @@ from support.profile_texts import WAREHOUSE
 from support.stores import recording_transitions, write_store
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import parse_profile, profile_toml, read_profile_toml
+from restock.ingest.profile.profile import parse_profile, profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.task.conditions import (
     Condition,
@@ -110,7 +110,7 @@ def test_noise_of_a_profile_does_not_change_rows():
     assert usual.labels_version != noisy.labels_version
     near = next(one for one in noisy.conditions if one.name == "near_collision")
     assert near.constants == {"lidar_noise_m": 0.05, "tight_clearance_m": 0.15}
-    carried = read_profile_toml(profile_toml(noisy), where="its text")
+    carried = parse_profile(profile_toml(noisy), where="its text")
     assert carried.labels_version == noisy.labels_version
     assert shipped(noisy.constants)["near_collision"] == near
     with pytest.raises(ConfigError, match="lidar_m"):
@@ -132,7 +132,7 @@ def test_a_condition_of_ones_own_may_name_limits_and_write_times() -> None:
     tight = profile.conditions[-1]
     assert "ROWS BETWEEN 5 PRECEDING" in tight.sql
     assert tight.constants == {"tight_clearance_m": 0.15}
-    carried = read_profile_toml(profile_toml(profile), where="its text")
+    carried = parse_profile(profile_toml(profile), where="its text")
     assert carried.labels_version == profile.labels_version
     with pytest.raises(ConfigError, match=r"(?s)tight.*\{1\.6 s\}"):
         parse_profile(WAREHOUSE + OWN.format("1 min"), where="here")

@@ -10,7 +10,7 @@ from support.driven_robot import Drive, write_bag
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
-from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
+from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
 from restock.ingest.store.manifest import label_scores
 from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
 from restock.ingest.task.schema import SIGNAL_COLUMNS
@@ -112,8 +112,8 @@ def test_a_store_lists_exposures_beside_its_conditions(store, profile):
         shelves = opened.sql("SELECT condition FROM coverage_by_condition").fetchall()
         assert not {"far_out", "closing_traffic"} & {name for (name,) in shelves}
         carried = opened.sql("SELECT profile_toml FROM recordings").fetchall()[0][0]
-    assert read_profile_toml(carried, where="").exposures == load_profile(profile).exposures
-    again = read_profile_toml(profile_toml(load_profile(profile)), where="")
+    assert parse_profile(carried, where="").exposures == load_profile(profile).exposures
+    again = parse_profile(profile_toml(load_profile(profile)), where="")
     assert again.labels_version == load_profile(profile).labels_version
 
 

@@ -12,7 +12,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError, PanelError
-from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
+from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
 from restock.ingest.profile.tables import CustomSignal
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
@@ -77,7 +77,7 @@ def carrying(folder: Path, text: str) -> Panel:
 def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
     with Store(folder / "store") as store:
         rows = store.sql("SELECT profile_toml, profile_hash FROM recordings").fetchall()
-    carried = read_profile_toml(rows[0][0], where="test")
+    carried = parse_profile(rows[0][0], where="test")
     assert (carried.name, carried.hash) == ("mine", rows[0][1])
     assert [c.sql for c in carried.own_conditions] == ["abs(wheel_speed_mps) < 0.3"]
     assert profile_of_panel(Panel.open(folder / "panel")) == carried
@@ -114,7 +114,7 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(folder, text, problem
     whole = profile_toml(load_profile("warehouse_amr")).replace("condition = []\n", "")
     text = whole + text if "[[" in text else text + whole
     with pytest.raises(ConfigError, match=problem):
-        read_profile_toml(text, where="a panel")
+        parse_profile(text, where="a panel")
     with pytest.raises(PanelError, match=r"that it contains cannot be read") as error:
         profile_of_panel(carrying(folder, text))
     assert error.value.remedy is not None
@@ -132,4 +132,4 @@ def test_a_profile_comes_back_from_its_text_as_it_was(doc, age_s, values):
     profile = msgspec.structs.replace(
         load_profile("warehouse_amr"), signals={"voltage_v": signal}, doc=doc
     )
-    assert read_profile_toml(profile_toml(profile), where="test") == profile
+    assert parse_profile(profile_toml(profile), where="test") == profile

@@ -17,7 +17,6 @@ from restock.ingest.profile.profile import (
     load_profile,
     parse_profile,
     profile_toml,
-    read_profile_toml,
 )
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.robot import Lidar, Robot
@@ -214,7 +213,7 @@ def test_a_profile_carries_its_robot() -> None:
         for name in ("wheel_radius_m", "mass_kg", "track_m", "lidar.beams", "lidar.z_m")
     ]
     assert origins == ["profile", "urdf", "default", "logs", "default"]
-    assert read_profile_toml(profile_toml(profile), where="here") == profile
+    assert parse_profile(profile_toml(profile), where="here") == profile
     assert profile.hash == AMR.hash  # rows do not depend on it
     assert "robot" not in profile_toml(AMR)
 

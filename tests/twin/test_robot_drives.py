@@ -9,7 +9,7 @@ import pytest
 from twin.test_robot import AMR, amr_with, driven
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
+from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Body, Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
@@ -88,7 +88,7 @@ def test_a_profile_file_is_refused_and_one_in_a_store_is_read(tmp_path: Path) ->
     (tmp_path / "car.toml").write_text(text)
     with pytest.raises(ConfigError, match="turns on the spot"):
         load_profile(tmp_path / "car.toml")
-    assert read_profile_toml(text, where="a store").robot is not None
+    assert parse_profile(text, where="a store").robot is not None
 
 
 def test_the_planner_drives_it_to_its_goals() -> None:

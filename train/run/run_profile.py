@@ -14,8 +14,8 @@ from restock.errors import ConfigError, PanelError, RestockError, RunError
 from restock.ingest.profile.profile import (
     Profile,
     load_profile,
+    parse_profile,
     profile_toml,
-    read_profile_toml,
     shipped_profiles,
 )
 from restock.replay.panel.panel import Panel
@@ -46,7 +46,7 @@ def profile_of_run(run: Run) -> Profile:
     if not text:
         return load_profile(config["profile"])
     try:
-        return read_profile_toml(text, where="profile_toml")
+        return parse_profile(text, where="profile_toml")
     except ConfigError as error:
         raise RunError(
             f"the profile in it cannot be read: {error.what}",
@@ -91,7 +91,7 @@ def carried_profile(
     )
     if text:
         try:
-            own = read_profile_toml(text, where=where)
+            own = parse_profile(text, where=where)
             if own.task.hash == task_hash:
                 return own
             problem = f"; with this Restock, the profile that it contains defines {own.task.hash}"

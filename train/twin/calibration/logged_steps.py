@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, StoreError
-from restock.ingest.profile.profile import read_profile_toml
+from restock.ingest.profile.profile import parse_profile
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.task import Signals, Task
@@ -261,7 +261,7 @@ def robot_of_store(store: Store, task_hash: str) -> Robot | None:
         if not stored.toml:
             continue
         try:
-            profile = read_profile_toml(stored.toml, where=str(store.path))
+            profile = parse_profile(stored.toml, where=str(store.path))
         except ConfigError:  # of another version: as if it were not there
             continue
         return profile.robot

@@ -86,7 +86,7 @@ class LabelCommand:
         return ExitCode.OK
 
     def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
-        from restock.ingest.profile.profile import load_profile, read_profile_toml
+        from restock.ingest.profile.profile import load_profile, parse_profile
 
         live = store.live()
         carried = {row["profile"]: row["profile_toml"] for row in live.to_pylist()}
@@ -110,7 +110,7 @@ class LabelCommand:
                 return load_profile(name).definitions
             except ConfigError as error:
                 if text := carried[name]:
-                    return read_profile_toml(text, where=f"profile {name!r}").definitions
+                    return parse_profile(text, where=f"profile {name!r}").definitions
                 raise ConfigError(
                     f"the store holds recordings of profile {name!r}, which cannot be found",
                     where=str(self.store),
