@@ -13,7 +13,7 @@ from support.pages import PAGES, RUN, Block, blocks, indented
 from support.paths import ROOT
 from support.reader import Reader, reader
 
-from restock.ingest.profile.profile import parse_profile
+from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.train.study.study import load_study
 from restock.train.twin.floors.floor_files import read_floor
@@ -171,7 +171,8 @@ def check_profile(block: Block, folder: Path) -> None:
     own = [rf"\[inputs\.{name}[].]" for name in tomllib.loads(block.text).get("inputs", {})]
     kept = [table for table in tables if not any(re.match(one, table) for one in own)]
     whole = "\n".join(["".join(kept), WHEELS, block.text])
-    parse_profile(whole, where=block.place, folder=folder)
+    (folder / "profile.toml").write_text(whole, encoding="utf-8")
+    load_profile(folder / "profile.toml")
 
 
 # Blocks of TOML that are no file of a page's commands: how a page's are checked.
