@@ -47,14 +47,11 @@ from restock.ingest.task.conditions import (
     labels_version,
     of_kind,
     reported,
-    runnable,
     stored,
     unknown_rows,
 )
 from restock.ingest.task.schema import recording_schema
 from restock.ingest.task.task import Task
-
-TWIN = "twin"  # format of the recordings that training makes of its episodes
 
 
 @dataclass(frozen=True)
@@ -133,8 +130,6 @@ def relabel_rows(
         reported(several, lidar=task.lidar, driven_plan=driven_plan(rows))
         for several in (every_condition, every_exposure)
     )
-    if row["format"] == TWIN:  # which fills none of the profile's own signals
-        conditions, exposures = (runnable(stored, one) for one in (conditions, exposures))
     steps = pa.concat_tables([stored, ends.cast(stored.schema)])
     try:
         every, probable = label_with_probabilities(steps, [*conditions, *exposures])

@@ -128,6 +128,7 @@ def propose_for_drives(
     trials = [tried(one.recording, proposal.toml) for one in evidence]
     return replace(
         proposal,
+        problems=[*proposal.problems, *_in_another(proposal.missing, evidence)],
         toml="\n".join([*_lines(evidence, trials, drives), proposal.toml]),
         advice=[*proposal.advice, *_without_rows(evidence, trials), *_left_out(drives.others)],
         kinds=drives.robots,
@@ -289,6 +290,17 @@ def names_of(paths: Sequence[Path]) -> str:
 def _name(path: Path) -> str:
     """Return two parts of a path, as bags of several robots often have the same names."""
     return "/".join(path.parts[-2:])
+
+
+def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
+    """Say which other drive has what the profile's own drive lacks."""
+    found = []
+    for role, lacks in (("pose", "command"), ("command", "pose")):
+        for one in drives if role in missing else ():
+            if (topics := one.roles[role]) and not one.roles[lacks]:
+                said = f"{_name(one.recording.path)} has a {role} ({topics[0][0].name})"
+                found.append(f"{said} and no {lacks}: one recording must hold both")
+    return found
 
 
 def _without_rows(drives: Sequence[Evidence], trials: Sequence[Trial]) -> list[Advice]:

@@ -9,7 +9,6 @@ WITH rules AS (
         logged_start_time,
         unnest(from_json(conditions_json, '[{"name": "VARCHAR"}]')).name AS condition
     FROM recordings
-    WHERE format <> 'twin' -- whose truth is known
 ), judged AS (
     SELECT
         t.transition_id,

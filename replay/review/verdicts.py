@@ -31,10 +31,10 @@ _MOVED_S = 0.1  # by which a step's time may differ from the file's
 _MAX_SAID = 10  # problems of a file that are named
 _ROWS = """
 SELECT
-    recording_id, ingest_id, source_file, format, episode_id, episode_index, step_index, logged_ns,
+    recording_id, ingest_id, source_file, episode_id, episode_index, step_index, logged_ns,
     epoch_ns(logged_start_time) AS recording_start_ns
 FROM transitions
-JOIN (SELECT ingest_id, format, logged_start_time FROM recordings) USING (ingest_id)
+JOIN (SELECT ingest_id, logged_start_time FROM recordings) USING (ingest_id)
 WHERE {wanted}
 ORDER BY episode_id, step_index
 """
@@ -84,7 +84,6 @@ class _Episode:
     ingest_id: str
     episode_id: str
     episode_index: int
-    format: str
     step: Ints  # (N,)
     logged_ns: Ints  # (N,)
     recording_start_ns: int
@@ -253,7 +252,6 @@ class Reading:
                 first["ingest_id"],
                 first["episode_id"],
                 first["episode_index"],
-                first["format"],
                 part["step_index"].to_numpy(),
                 part["logged_ns"].to_numpy(),
                 first["recording_start_ns"],
@@ -276,11 +274,6 @@ class Reading:
             )
             return None
         episode = found[0]
-        if episode.format == "twin":
-            self._problem(
-                verdict.line, "is an episode of the twin, whose true conditions are known"
-            )
-            return None
         first, last = verdict.extent or (verdict.first_step, verdict.last_step)
         first, last = min(first, verdict.first_step), max(last, verdict.last_step)
         if len(_between(episode.step, first, last)) != last - first + 1:

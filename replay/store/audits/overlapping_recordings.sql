@@ -12,7 +12,7 @@ WITH beside AS (
         arg_max(recording_id, logged_end_time) OVER earlier AS same_time_as,
         arg_max(source_file, logged_end_time) OVER earlier AS same_time_as_file
     FROM recordings
-    WHERE format <> 'twin' AND transitions > 0
+    WHERE transitions > 0
     WINDOW earlier AS (
         PARTITION BY robot, CASE WHEN robot IS NULL THEN profile END
         ORDER BY logged_start_time, recording_id

@@ -23,5 +23,5 @@ SELECT
     ) AS untold
 FROM recordings
 CROSS JOIN told
-WHERE untold <> '' AND format <> 'twin'
+WHERE untold <> ''
 ORDER BY source_file, recording_id

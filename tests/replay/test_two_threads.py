@@ -1,4 +1,4 @@
-"""Arguments of another kind than a function takes: refused by name, before anything is written."""
+"""Two threads that read from one opened store: the second is told so."""
 
 import threading
 from pathlib import Path
