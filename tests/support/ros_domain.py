@@ -15,7 +15,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from restock.ingest.live.node import load_ros
+from restock.ingest.live.node import load_ros, quality
 from restock.train.twin.recording.bag_writer import build, serialise, stamp, typestore
 from support.ros_graph import VOLATILE, Graph, QoS
 
@@ -50,7 +50,7 @@ class RosGraph(Graph):
         self._executor.add_node(self.node)
         self.publishers = {
             topic: self.node.create_publisher(
-                ros.get_message(kind), topic, ros.latched_qos() if topic == keep else 10
+                ros.get_message(kind), topic, quality(ros, 1, latched=True) if topic == keep else 10
             )
             for topic, kind in {**outputs, CLOCK: "rosgraph_msgs/msg/Clock"}.items()
         }
@@ -65,7 +65,7 @@ class RosGraph(Graph):
             message = typestore().deserialize_cdr(raw, kind)
             super(RosGraph, self).send(topic, message)
 
-        qos = ros.latched_qos() if topic == "/behaviour_policy" else 100
+        qos = quality(ros, 1, latched=True) if topic == "/behaviour_policy" else 100
         self.node.create_subscription(ros.get_message(kind), topic, take, qos, raw=True)
 
     def send(self, topic: str, message: Any, offered: QoS = VOLATILE) -> None:
