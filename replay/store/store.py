@@ -140,6 +140,9 @@ class Store:
             self.changed_by_others = self._count_changed(held)
             self._present_manifests(self.bare, "main")
             self._frames().present(self.bare)
+            if version is not None:  # its files may be gone
+                self._present_rows(self.bare, "main")
+                query(self.bare, "FROM stored_transitions LIMIT 0", where=str(self.path))
         except StoreError as error:
             if version is None:
                 raise

@@ -175,6 +175,8 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
         why = f"cannot be made: {parent} is a file"
     elif not os.access(parent, os.W_OK | os.X_OK):
         why = f"cannot be made: {parent} may not be written"
+    elif any(map(is_undecoded, str(absolute))):
+        why = "cannot be made: its path is not UTF-8, and other libraries cannot write there"
     if why := _within(path) or why:
         raise error(why, where=str(path), remedy="choose another --out")
 
@@ -187,6 +189,11 @@ def _within(path: Path, run: Path | None = None) -> str | None:
             if (folder / mark).exists() and not own:
                 return f"is within {kind} {folder}: what replaces or removes that removes this, too"
     return None
+
+
+def is_undecoded(letter: str) -> bool:
+    """Return whether a character stands for a byte of a path that Python could not decode."""
+    return "\udc80" <= letter <= "\udcff"
 
 
 def _temporary(path: Path, *, replaces: bool = True) -> Path:

@@ -1,6 +1,7 @@
 """Missing, cut or changed files: every verb names the path, a remedy, and exits 2, never 1."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -247,6 +248,14 @@ def test_a_memory_limit_that_is_too_small_is_said(
         assert "memory limit" in said, argv
         assert remedy in said.splitlines()[-1], argv
         assert "damaged" not in said, argv
+
+
+def test_a_path_that_is_not_utf_8_is_no_bug(tmp_path, capsys):
+    place = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")
+    assert cli.main(["audit", place]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "a path is not UTF-8, as it must be for a store, a panel or a run" in said
+    assert r"/caf\xe9/transitions rename the folder" in said
 
 
 def test_what_nobody_foresaw_exits_2_and_developers_see_where(monkeypatch, capsys):

@@ -7,12 +7,13 @@ This module turns errors of libraries into messages that say what, where and wha
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Sequence
 
 from restock.cli import FOLDER_OF
 from restock.errors import TRACEBACK, RestockError, StoreError, print_traceback
-from restock.files import first_line
+from restock.files import first_line, is_undecoded
 from restock.process import EXTRAS, not_installed
 
 _CHECK = "a file is damaged, or is of another kind than the command expects"
@@ -20,6 +21,8 @@ _OF_A_STORE = (
     f"{_CHECK}; `restock store compact STORE --drop-damaged --dry-run` looks for one in a store"
 )
 NEEDS_TRAIN = ("learning", "twin", "start")  # folders of verbs; `train` brings `pages`, too
+_GL = "MUJOCO_GL"
+_NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
 # package of an exception -> what to do
 _REMEDIES = {
     "duckdb": _OF_A_STORE,
@@ -57,12 +60,21 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
         files = [str(name) for name in (error.filename, error.filename2) if name is not None]
         what, remedy = error.strerror, "check the path, the permissions and the free space"
         return known(f"cannot be read or written: {what}", remedy, " -> ".join(files) or where)
+    if isinstance(error, UnicodeEncodeError) and _undecoded(error):
+        return known(
+            "a path is not UTF-8, as it must be for a store, a panel or a run: "
+            + repr(os.fsencode(error.object))[2:-1],
+            "rename the folder; or set a locale of UTF-8, if the shell has none: LC_ALL=C.UTF-8",
+        )
     if isinstance(error, ModuleNotFoundError):
         missing = str(error.name).partition(".")[0]
         if missing in EXTRAS:
             names = (" ".join(args[:2]), *args[:1])
             learns = any(FOLDER_OF.get(name) in NEEDS_TRAIN for name in names)
             return not_installed(missing, where, "train" if learns else EXTRAS[missing])
+    if _in_gl(error):  # raised while MuJoCo is imported, by any verb that needs the twin
+        what = f"MuJoCo cannot use {os.environ[_GL]!r}: {first_line(error)}"
+        return known(what, _NO_GL, f"{_GL} in the environment")
     kind = type(error)
     package = kind.__module__.split(".")[0]
     if package == "torch" and kind.__name__ == "OutOfMemoryError":
@@ -86,6 +98,19 @@ def _out_of_memory(error: BaseException | None) -> str:
             return first_line(error)
         error = error.__cause__
     return ""
+
+
+def _undecoded(error: UnicodeEncodeError) -> bool:
+    """Return whether the error is about bytes of a path that Python could not decode."""
+    return all(map(is_undecoded, error.object[error.start : error.end]))
+
+
+def _in_gl(error: Exception) -> bool:
+    """Return whether the error comes from the library that MUJOCO_GL names."""
+    names = (frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return _GL in os.environ and any(
+        str(name).startswith("mujoco.") and str(name).endswith("gl_context") for name in names
+    )
 
 
 def _at(error: Exception) -> str:
