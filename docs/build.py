@@ -39,9 +39,10 @@ def list_verbs() -> Iterator[str]:
 def _help(*words: str) -> str:
     from restock.cli import main
 
-    with contextlib.redirect_stdout(io.StringIO()) as text:
+    with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), "utf-8")) as text:
         main([*words, "--help"])
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+    text.seek(0)
+    return "\n".join(line.rstrip() for line in text.read().splitlines()) + "\n"
 
 
 def list_names() -> Iterator[str]:

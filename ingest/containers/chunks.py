@@ -203,9 +203,9 @@ def _check(chunk: StoredChunk, data: bytes | memoryview) -> None:
         raise BadChunk("its CRC does not match")
 
 
-def inflate_partly(chunk: StoredChunk, file: Buffer, limit: int = MAX_CHUNK) -> bytes:
-    """Return a chunk's first records, unchecked, up to `limit` bytes or the damage."""
-    limit = min(limit, chunk.size, most_bytes(chunk.stop - chunk.start))
+def inflate_partly(chunk: StoredChunk, file: Buffer) -> bytes:
+    """Return a chunk's first records, unchecked, up to the damage."""
+    limit = min(MAX_CHUNK, chunk.size, most_bytes(chunk.stop - chunk.start))
     if chunk.compression == "":
         return file[chunk.start : min(chunk.start + limit, chunk.stop)]
     if chunk.compression not in _DECODERS:

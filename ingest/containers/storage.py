@@ -13,7 +13,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -180,11 +179,10 @@ class Storage(ABC):
         """Return whether checksums confirm what was read so far; most formats have none."""
         return "damaged" if self.damage else "unverified"
 
-    def damaged(self, what: str, messages: Mapping[int, int] = MappingProxyType({})) -> None:
+    def damaged(self, what: str, messages: Mapping[int, int] | None = None) -> None:
         """Note damage, once, and how many messages it costs, by channel id."""
-        found = Damage(what, dict(messages))
-        if all(item.what != found.what for item in self.damage):
-            self.damage.append(found)
+        if all(item.what != what for item in self.damage):
+            self.damage.append(Damage(what, dict(messages or {})))
 
     @abstractmethod
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:

@@ -21,6 +21,7 @@ from restock.ingest.task.task import OPTIONAL_SIGNALS, STORED_SIGNALS, Signals
 
 # transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
 STEP_BITS = 25
+GOLDEN = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: the step between splitmix64's states
 
 
 def transition_ids(recording_id: str, tick: Ints) -> Ints:

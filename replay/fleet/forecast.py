@@ -104,19 +104,18 @@ def probability_to_close(
     missing: float,
     *,
     rng: np.random.Generator,
-    replicates: int = REPLICATES,
 ) -> float:
     """Return the probability that planned missions yield what is missing.
 
     `parts` are pairs of yields (E,) and a number of missions.
     """
-    total = np.zeros(replicates)
+    total = np.zeros(REPLICATES)
     for sample, missions in parts:
         found = sample[~np.isnan(sample)]
         if not len(found) or not missions or not found.any():
             continue
         found = np.append(found, 0.0)
-        for index, weights in enumerate(_replicates(len(found) - 1, rng, replicates)):
+        for index, weights in enumerate(_replicates(len(found) - 1, rng, REPLICATES)):
             if missions > _SIMULATED:
                 mean = float(weights @ found)
                 spread = math.sqrt(max(float(weights @ found**2) - mean**2, 0.0))

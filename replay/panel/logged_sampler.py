@@ -29,7 +29,6 @@ from restock.replay.mixture.shares import stands_for_others
 from restock.replay.plan.plan import outcome_column
 from restock.replay.plan.strata import rules_of
 from restock.replay.plan.weights import WeightsInForce
-from restock.replay.sampling.rules import follow_td
 from restock.replay.sampling.sampler import QuotaSampler
 from restock.state import Stateful
 
@@ -133,7 +132,7 @@ class LoggedSampler(Stateful):
     @property
     def needs_td(self) -> bool:
         """Return whether draws follow the TD errors given to `update`."""
-        return follow_td(self.sampler.within)
+        return self.sampler.follows_td
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
         """Take |TD error| (n,) of rows (n,) that were just learnt from."""

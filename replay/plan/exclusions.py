@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 from restock.errors import MixtureError, counted
-from restock.ingest.task.schema import splitmix64
+from restock.ingest.task.schema import GOLDEN, splitmix64
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.plan.candidates import Places, bools, codes
 from restock.replay.plan.strata import NO_STRATUM
-from restock.replay.sampling.packed_rows import GOLDEN
 from restock.replay.store.definitions import install_repeated_rows
 
 DAY_NS = 86_400 * 10**9

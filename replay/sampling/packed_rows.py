@@ -31,6 +31,3 @@ def row_columns(observation_size: int) -> dict[str, slice]:
     for place, name in enumerate(SCALARS):
         columns[name] = slice(2 * size + place, 2 * size + place + 1)
     return columns
-
-
-GOLDEN = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: the step between splitmix64's states

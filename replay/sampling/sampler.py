@@ -205,10 +205,10 @@ class QuotaSampler(Stateful):
         self.sizes: Ints = np.array([len(rows) for rows in self._rows], np.int64)
         self.within = [within] * len(self.sizes) if isinstance(within, str) else list(within)
         self.quotas, self.rng = Quotas(shares, batch_size, self.sizes), rng
-        self._follows_td = follow_td(self.within)
+        self.follows_td = follow_td(self.within)
         if block is None:
             block = BLOCK
-            if self._follows_td:
+            if self.follows_td:
                 block = min(max(int(self.sizes.sum()) // (16 * batch_size), MIN_BLOCK), MAX_BLOCK)
         self.block = block
         numbers = prioritised or Prioritised()
@@ -223,7 +223,7 @@ class QuotaSampler(Stateful):
         self._ahead_places = none  # within their strata
         self._ahead_weights: F32 | None = None
         self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
-        if self._follows_td:
+        if self.follows_td:
             self._place_rows()
 
     @property
@@ -254,7 +254,7 @@ class QuotaSampler(Stateful):
             MixtureError: a rule follows them, and one is negative or not finite, or they are not
                 one a row.
         """
-        if self._follows_td:
+        if self.follows_td:
             self._learnt.append((np.array(rows), checked_errors(td_abs, rows).copy()))
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:

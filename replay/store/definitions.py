@@ -369,8 +369,10 @@ def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
 def is_own(connection: duckdb.DuckDBPyConnection, view: str) -> bool:
     """Return whether a name means a store's view, and none that a query made in its place."""
     made = _of(connection)
-    if made is None or view not in made.made:
-        return made is not None
+    if made is None:
+        return False
+    if view not in made.made:  # it is made when a query names it
+        return True
     views = "SELECT 1 FROM duckdb_views() WHERE view_name = $1"
     return bool(connection.execute(views, [view]).fetchall())
 

@@ -34,7 +34,7 @@ MAY_IMPORT = {
     "replay/store": "ingest/steps ingest/store ingest/task",
     "replay/sampling": "",
     "replay/mixture": "sampling",
-    "replay/plan": "mixture store ingest/task sampling",
+    "replay/plan": "mixture store ingest/task",
     "replay/panel": "mixture plan sampling store ingest/store ingest/task",
     "replay/fleet": "mixture panel plan store ingest/task",
     "replay/trace": (

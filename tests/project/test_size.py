@@ -36,9 +36,10 @@ def count_options() -> int:
 
 
 def help_of(*words: str) -> str:
-    with contextlib.redirect_stdout(io.StringIO()) as text:
+    with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), "utf-8")) as text:
         main([*words, "--help"])
-    return text.getvalue()
+    text.seek(0)
+    return text.read()
 
 
 def count_keys() -> int:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.arrays import F32, Bools, Ints
-from restock.ingest.task.schema import splitmix64
+from restock.ingest.task.schema import GOLDEN, splitmix64
 from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
 
@@ -43,7 +43,6 @@ from itertools import pairwise
 from typing import Any
 
 from restock.arrays import F64
-from restock.replay.sampling.packed_rows import GOLDEN
 from restock.replay.sampling.ring import FreshRing
 from restock.train.dqn.learner import Learner, value_lag
 

@@ -32,7 +32,7 @@ VERBS = {
     "coverage": "how much of each condition a store holds; what is missing, different or changed",
     "audit": "check that the coverage is good enough and nothing got worse: exit 1 if not",
     "mix": "a pinned replay panel with quotas per stratum",
-    "export": "write transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
+    "export": "write transitions as a data set for Minari, d3rlpy, LeRobot or Parquet",
     "train": "offline warm-up on the panel, then online in the twin; or a study of many runs",
     "eval": "success per condition, clean and perturbed",
     "gate": "is a policy shown not to be worse than what drives today? exit 1 if not",

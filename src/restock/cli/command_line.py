@@ -15,7 +15,6 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro import _fmtlib
 
 from restock.cli.words import Positional, Repeated, declared
 
@@ -95,8 +94,6 @@ def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
     help_asked = bool({"-h", "--help"} & set(words))
     if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
         tyro._experimental_options["ansi_codes"] = False
-    # tyro draws boxes in ASCII into a string, and where the name is in capitals.
-    _fmtlib._FORCE_UTF8_BOXES = (sys.stdout.encoding or "utf-8").lower() == "utf-8"
     if help_asked:  # tyro would not wrap it
         sys.stdout.write(_wrapped(command.__doc__ or "", min(columns, MAX_PROSE)) + "\n\n")
     return tyro.cli(

@@ -40,7 +40,7 @@ MAX_PROFILES = 20  # of a topic: publishers that offer others
 
 @dataclass
 class InfoCommand:
-    """Show what is in recordings: format, times, compression, topics, types, counts, rates, QoS.
+    """Show what is in recordings: format, times, topics, types, counts, rates, QoS.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
     recordings, or a quoted glob. Nothing is written, and messages are decoded only with --clocks. A

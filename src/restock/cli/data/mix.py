@@ -32,10 +32,9 @@ class MixCommand:
     Applies a mixture to a store and packs the chosen transitions into one memory-mapped file. The
     plan shows for each stratum its share of the store's rows (natural), the share of a batch that
     is wanted, its share of the logged rows drawn and of their gradient after importance weights,
-    how often each of its rows will be replayed, and how many rows and hours of driving are
-    missing. Importance weights that give a stratum a smaller
-    share than it has in the logs are refused. A panel never changes; its id is a hash of store
-    version, mixture, task and rows.
+    how often each of its rows will be replayed, and how many rows are missing. Importance weights
+    that give a stratum a smaller share than it has in the logs are refused. A panel never changes;
+    its id is a hash of store version, mixture, task and rows.
     """
 
     store: Annotated[str, Positional("STORE")]

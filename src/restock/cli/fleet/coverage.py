@@ -122,10 +122,9 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
 
 
 _MEANING = {
-    "hours": "hours: driving like that logged so far, until one gap is closed: median (95 %);"
-    " as in `restock mix`",
+    "hours": "hours: driving like that logged so far, until one gap is closed: median (95 %)",
     "missions": "missions: of the kind that is best, until one gap is closed: median (95 %)."
-    " `restock mix` counts hours of driving as logged, nothing chosen: --unit hours",
+    " --unit hours counts driving as logged, nothing chosen",
 }
 
 

@@ -177,9 +177,9 @@ def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, label
     return each.facet(column=alt.Column(f"{key}:N", sort=list(names)))
 
 
-def in_words(rows: Sequence[Row], key: str = "condition") -> list[dict[str, Any]]:
-    """Return the rows with a column's names as people read them."""
-    return [{**row, key: words(row[key])} for row in rows]
+def in_words(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the rows with the names of their conditions as people read them."""
+    return [{**row, "condition": words(row["condition"])} for row in rows]
 
 
 def estimates(
