@@ -3,10 +3,11 @@
     python benchmarks/planted_row_faults.py --out /tmp/faults --sets developed
     python benchmarks/planted_row_faults.py --out /tmp/faults            # what was left out, once
 
-It records two fleets of four robots in the twin. The types of `row_fault_types.DEVELOPED`, on
-which limits are set, are planted in the first fleet, those of `left_out_types` in the second;
-faults of all robots that leave missions out, in the sample logs, which have more. The controls
-are both fleets and recordings of other missions, drivers, loads and floors, with nothing planted.
+It records two fleets of four robots in the twin. The types on which limits are set, those of
+`row_fault_types` and `used_types`, are planted in the first fleet, those of `left_out_types` in
+the second; faults of all robots that leave missions out, in the sample logs, which have more. The
+controls are both fleets and recordings of other missions, drivers, loads and floors, with nothing
+planted.
 
 A fault is *named* if a finding says what it is of and, if one robot has it, which robot. Findings
 of another cause are a *wrong reason*; those that blame only robots without it are *opposite*.
@@ -26,6 +27,7 @@ import numpy as np
 from harness import finish, markdown, option_parser, run_restock
 from left_out_types import LEFT_OUT
 from row_fault_types import DEVELOPED, DOSES, Draws, Fault, with_columns
+from used_types import USED
 
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
@@ -40,8 +42,8 @@ from restock.train.twin.floors.layout import DEFAULT
 
 PROFILE = load_profile("warehouse_amr")
 ROBOTS, FAULTY = ("amr-1", "amr-2", "amr-3", "amr-4"), "amr-2"
-FLEETS = {"developed": 801, "left out": 841}  # the seed of the first robot
-SETS = {"developed": DEVELOPED, "left out": LEFT_OUT}
+FLEETS = {"developed": 801, "left out": 861}  # the seed of the first robot
+SETS = {"developed": (*DEVELOPED, *USED), "left out": LEFT_OUT}
 OUTCOMES = ("named", "wrong reason", "missed", "opposite")
 MOSTLY = {"slippery": "wheel_slip", "blocked": "blocked_aisle", "crowded": "near_collision"}
 CONTROLS = {  # name: arguments of `restock twin record`

@@ -5,7 +5,7 @@ observation, so that observations, actions, rewards and labels all agree with it
 profile or a wrong clock; or in the rows of a store, as by software that rewrites them. One robot
 of the fleet has it, unless it is of all. `right` is a pattern of what a right finding says.
 
-`left_out_types.py` has those that no check was made for.
+`used_types.py` has those that were left out once, `left_out_types.py` those that still are.
 """
 
 from __future__ import annotations
