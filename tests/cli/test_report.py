@@ -25,7 +25,7 @@ from restock.report import build_report
 from restock.report.look.blocks import ask, statements
 from restock.report.run.facts import Facts, evaluation_bias, gather
 from restock.report.run.headline import headline
-from restock.report.run.page import floor_section, ways_section
+from restock.report.run.page import floor_section, success
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -263,8 +263,9 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
     for ended_on, failed in (("hall.toml", 18), ("default", 0)):
         section = floor_section(_on_floors(run, tmp_path / f"on {ended_on}", str(hall), ended_on))
         assert section is not None
-        assert 'rect width="800" height="200"' in section.figures[0].drawing.svg[470]
-        assert f"{failed} failed clean episodes there" in str(section.figures[1].caption)
+        (figure,) = section.figures
+        assert 'rect width="800" height="200"' in figure.drawing.svg[470]
+        assert figure.drawing.svg[470].count('stroke-width="3.4"') == failed
 
 
 def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
@@ -326,7 +327,8 @@ def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
 
 
 def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_path: Path) -> None:
-    assert ways_section(gather(run)) is None
+    own = success(gather(run))
+    assert own is not None
     copy = shutil.copytree(run, tmp_path / "run")
     file = copy / "eval" / "episodes.parquet"
     drawn = pq.read_table(file).to_pylist()
@@ -338,10 +340,12 @@ def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_pa
     named = [{**row, "layouts": "hall.toml"} for row in drawn]
     pq.write_table(pa.Table.from_pylist([*driven, *named], schema=EVAL_EPISODES), file)
     facts = gather(copy)
-    section = ways_section(facts)
+    section = success(facts)
     assert section is not None
-    assert "4 of 84 episodes" in section.intro
-    shown = {row["policy"]: row["success"] for row in section.tables[0].rows}
+    *before, table = section.tables
+    assert [one.rows for one in before] == [one.rows for one in own.tables]
+    assert "4 of 84 episodes" in table.caption
+    shown = {row["policy"]: row["success"] for row in table.rows}
     assert shown == {"agent": "1.00 [0.34, 1.00]", "planner": "0.00 [0.00, 0.66]"}
     assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
 

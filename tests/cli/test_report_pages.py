@@ -77,7 +77,7 @@ def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, capsys):
 
 def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> None:
     with Store(store_path) as store:
-        _, sections = coverage_of(store, missing())
+        sections = coverage_of(store, missing())
         slips = "SELECT count(*) FROM transitions WHERE"
         ((held,),) = store.sql(f"{slips} list_contains(conditions, 'wheel_slip')").fetchall()
         ((named,),) = store.sql(f"{slips} primary_condition = 'wheel_slip'").fetchall()
@@ -100,11 +100,10 @@ def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[
     return {**place, "unit": unit, "closed": not gaps, "gaps": list(gaps), "plan": whole}
 
 
-def coverage_of(store: Store, gaps: dict[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
-    """Return the cards by label, and the sections by id."""
+def coverage_of(store: Store, gaps: dict[str, Any]) -> dict[str, Any]:
+    """Return the sections of a store's page by id."""
     page = coverage_page(store, gaps, "nothing to compare")
-    cards = {card["label"]: card["value"] for card in page["cards"]}
-    return cards, {section.id: section for section in page["sections"]}
+    return {section.id: section for section in page["sections"] if section is not None}
 
 
 def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) -> None:
@@ -112,7 +111,7 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     tags = [{"robot": "a"}, {"robot": "a"}, {"robot": "b"}]
     with Store(write_store(tmp_path / "store", tables, tags=tags)) as store:
-        _, sections = coverage_of(store, missing())
+        sections = coverage_of(store, missing())
         (table,) = sections["robots"].tables
         weeks, _ = coverage_weeks(store)
         of_robot = (

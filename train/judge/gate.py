@@ -55,7 +55,6 @@ DOCUMENT, EPISODES = "gate.json", "episodes.parquet"
 ERROR = 0.05  # of the whole verdict
 FIRST_SEED = 1_000_000  # far from those of evaluations
 ROUND = 32  # pairs of a kind that are driven before what is decided is asked again
-MAX_POINTS = 120  # of a cell's curve in the document
 MAX_MISSIONS = 3  # a kind in two forms has two cells, and drives up to so many times the budget
 
 
@@ -176,8 +175,6 @@ class Cell:
         of, scale = self.sequence, self.scale or 1.0
         low = [value / scale for value in of.low] if of is not None else []
         high = [value / scale for value in of.high] if of is not None else []
-        every = max(len(low) // MAX_POINTS, 1)
-        shown = sorted({*range(0, len(low), every), len(low) - 1} - {-1})
         return {
             "name": self.name,
             "layouts": self.layouts,
@@ -193,7 +190,6 @@ class Cell:
             "low": low[-1] if low else None,
             "high": high[-1] if high else None,
             "verdict": self.verdict,
-            "curve": [{"pairs": n + 1, "low": low[n], "high": high[n]} for n in shown],
         }
 
 

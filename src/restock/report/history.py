@@ -19,8 +19,7 @@ from restock.replay.places import kind_beside
 from restock.replay.store.store import Store, is_store
 from restock.report.fleet.coverage import coverage_weeks
 from restock.report.look import blocks, charts
-from restock.report.look.blocks import Figure, Rows, Section, Table, count, words
-from restock.report.run.comparison import better_and_worse
+from restock.report.look.blocks import Figure, Rows, Section, Table, better_and_worse, count, words
 from restock.stats import interval_text
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.judge.compare import diff_runs, last_evaluation
@@ -71,10 +70,6 @@ def history_page(folder: Path) -> dict[str, Any]:
         "title": folder.resolve().name,
         "headline": _headline(runs, changes, len(weeks)),
         "lead": "Runs are in the order in which they began, each beside the run before it.",
-        "cards": [
-            {"value": count(len(runs)), "label": "runs"},
-            {"value": count(len(weeks)), "label": "stores"},
-        ],
         "sections": [
             _runs(runs),
             _changes(runs, changes),

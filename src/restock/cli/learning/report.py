@@ -15,7 +15,7 @@ from restock.cli.words import Positional, refuse
 class ReportCommand:
     """Write one HTML page about a run, or about a folder of runs; it opens without a network.
 
-    The page shows what the critic was fed (intended, drawn and available share per stratum, ages,
+    The page shows what the critic was fed (natural, wanted and drawn share per stratum, ages,
     behaviour policies), learning curves, TD error by condition, target lag, success per condition
     with intervals beside the planner and a random policy (run `restock eval RUN` first), a map of
     the logs' positions and the agent's failures, and the provenance of the data.

@@ -8,22 +8,22 @@ from typing import Any
 import altair as alt
 from markupsafe import Markup
 
-from restock.errors import by_priority, counted, figure, plural, quoted, uncertain_labels
+from restock.errors import by_priority, counted, figure, quoted, uncertain_labels
 from restock.replay.fleet.drift import Drift
 from restock.replay.fleet.shopping_list import readable
 from restock.replay.store.definitions import install_named
 from restock.replay.store.novelty import novel_rows, novel_rows_said, strangest
 from restock.replay.store.store import Store
-from restock.report.fleet.drift import drift_sections
+from restock.report.fleet.drift import drift_section
 from restock.report.look import blocks, charts, floor_map
 from restock.report.look.blocks import (
-    Drawing,
     Figure,
     Rows,
     Section,
     Table,
     ask,
     count,
+    listed,
     percent,
     statements,
     words,
@@ -31,34 +31,7 @@ from restock.report.look.blocks import (
 
 MAX_DOTS = 1500
 MAX_CELLS_ACROSS = 90  # cells of the map along an axis
-PALE_ROWS = 0.5  # where a bar of the logarithmic axis begins
-
-
-def coverage_facts(store: Store) -> dict[str, Rows]:
-    """Return the rows behind every figure of the page."""
-    sql = statements("restock.report.fleet", "coverage.sql")
-    names = ("shelves", "weeks", "robots", "totals", "bounds")
-    install_named(store.connection, " ".join(sql.values()))
-    found = {name: ask(store.connection, sql[name]) for name in names}
-    (bounds,) = found["bounds"]
-    across = max((bounds["x1"] or 0.0) - (bounds["x0"] or 0.0), 1.0)
-    cell_m = max(0.25, math.ceil(across / MAX_CELLS_ACROSS / 0.25) * 0.25)
-    bounds["cell_m"] = cell_m
-    found["visited"] = ask(store.connection, sql["visited"], cell_m=cell_m)
-    found["rare"] = ask(store.connection, sql["rare"], most=MAX_DOTS)
-    found["novel"], found["strangest"] = [novel_rows(store)], strangest(store)
-    found["priority"] = [{"condition": name} for name in store.priority()]
-    return found
-
-
-def coverage_weeks(store: Store) -> tuple[Rows, Section | None]:
-    """Return the rows of a store's weeks, and their section as on its page."""
-    sql = statements("restock.report.fleet", "coverage.sql")["weeks"]
-    install_named(store.connection, sql)
-    rows = ask(store.connection, sql)
-    colours = blocks.palette({row["condition"] for row in rows})
-    once = by_priority(words(name) for name in store.priority())
-    return rows, _weeks(rows, {words(name): colour for name, colour in colours.items()}, once)
+SHARE_COLOURS = {"held": "#0f766e", "by priority": "#94a3b8"}
 
 
 def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dict[str, Any]:
@@ -68,43 +41,40 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
         gaps: as `restock coverage gaps --json` prints them.
         drift: what was measured, or why nothing was.
     """
-    found = coverage_facts(store)
-    (totals,) = found["totals"]
-    named = (row["condition"] for rows in ("shelves", "weeks", "rare") for row in found[rows])
-    colours = blocks.palette(set(named))
-    in_words = {words(name): colour for name, colour in colours.items()}
-    once = by_priority(words(row["condition"]) for row in found["priority"])
-    sections = [
-        _shelves(found["shelves"], in_words, once),
-        shopping_section(gaps),
-        _strangest(found, gaps["store"]),
-        _weeks(found["weeks"], in_words, once),
-        _robots(found["robots"]),
-        _map(found, colours),
-        *(
-            [Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")]
-            if isinstance(drift, str)
-            else drift_sections(drift)
-        ),
-    ]
-    robots = {row["robot"] for row in found["robots"]}
-    numbers = {
-        "transition": totals["rows"],
-        "episode": totals["episodes"],
-        "recording": totals["recordings"],
-        "robot": len(robots),
-        "gap": len(gaps["gaps"]),
-    }
+    shelves, robots, (totals,) = (_rows(store, name) for name in ("shelves", "robots", "totals"))
+    counts = {noun: totals[f"{noun}s"] for noun in ("row", "episode", "recording")}
+    counts["robot"] = len({row["robot"] for row in robots})
     return {
         "kicker": "coverage of a store",
         "title": f"Coverage of {gaps['store']}",
-        "headline": headline(found["shelves"], gaps),
-        "lead": f"How much of each condition the logs hold, and what mixture {gaps['mixture']} "
-        "and the audits require and do not find.",
-        "cards": [{"value": count(n), "label": plural(n, noun)} for noun, n in numbers.items()],
-        "sections": sections,
+        "headline": headline(shelves, gaps),
+        "lead": f"{listed([counted(n, noun) for noun, n in counts.items()])}: how much of each "
+        f"condition they hold, and what mixture {gaps['mixture']} and the audits require and do not"
+        " find.",
+        "sections": [
+            _shelves(shelves, _once(store)),
+            shopping_section(gaps),
+            _strangest(store, gaps["store"]),
+            coverage_weeks(store)[1],
+            _robots(robots),
+            _map(store),
+            Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")
+            if isinstance(drift, str)
+            else drift_section(drift),
+        ],
         "source": f"{gaps['store']}, version {gaps['store_version']}",
     }
+
+
+def _rows(store: Store, name: str, **parameters: Any) -> Rows:
+    """Return the rows of a statement of coverage.sql."""
+    sql = statements("restock.report.fleet", "coverage.sql")[name]
+    install_named(store.connection, sql)
+    return ask(store.connection, sql, **parameters)
+
+
+def _once(store: Store) -> str:
+    return by_priority(words(name) for name in store.priority())
 
 
 def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
@@ -135,10 +105,15 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     return text.removeprefix("; ")
 
 
-def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
+def _shelves(rows: Rows, once: str) -> Section:
     unknown = [words(row["condition"]) for row in rows if row["rows_held"] is None]
     guessed = {words(r["condition"]): n for r in rows if (n := r["uncertain_recordings"])}
     rows = [row for row in rows if row["rows_held"] is not None]
+    bars = [
+        {"condition": words(row["condition"]), "kind": kind, "share": row[name]}
+        for row in rows
+        for kind, name in (("held", "held_share"), ("by priority", "primary_share"))
+    ]
     table = [
         {
             "condition": words(row["condition"]),
@@ -165,51 +140,14 @@ def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
             if unknown
             else ""
         ),
-        figures=[Figure(_bars(rows, colours), "Rows in which each condition holds (logarithmic)")]
-        if rows
-        else [],
-        two=True,
+        figures=[Figure(charts.shares(bars, "condition", SHARE_COLOURS))] if rows else [],
         tables=[Table(table)],
     )
 
 
-def _bars(rows: Rows, colours: dict[str, str]) -> Drawing:
-    shown = [
-        {
-            "condition": words(row["condition"]),
-            "rows": row["rows_held"],
-            "from": PALE_ROWS,
-            "to": max(row["rows_held"], PALE_ROWS),
-            "text": f"{row['rows_held']:,}",
-        }
-        for row in rows
-    ]
-    names = [row["condition"] for row in shown]
-
-    def chart(width: int) -> Any:
-        base = charts.plot(shown).encode(
-            y=alt.Y("condition:N", sort=names, title=None, axis=alt.Axis(grid=False, ticks=False)),
-            tooltip=["condition:N", alt.Tooltip("rows:Q", format=",")],
-        )
-        most = max(row["to"] for row in shown)
-        scale = alt.Scale(type="log", domain=[PALE_ROWS, most * 8])
-        axis = charts.x_axis(width, f"datum.value < 1 ? '' : {charts.SHORT_NUMBERS}")
-        x = alt.X("to:Q", title="rows", scale=scale, axis=axis)
-        bars = base.mark_bar(cornerRadiusEnd=2).encode(
-            x=x,
-            x2="from:Q",
-            color=alt.Color("condition:N", scale=charts.scale(names, colours), legend=None),
-        )
-        texts = base.mark_text(align="left", dx=5, fontSize=12, color="#475569").encode(
-            x=x, text="text:N"
-        )
-        return alt.layer(bars, texts).properties(height=30 * len(names))
-
-    return charts.draw(chart)
-
-
-def _strangest(found: dict[str, Rows], place: str) -> Section | None:
-    if not (rows := found["strangest"]):
+def _strangest(store: Store, place: str) -> Section | None:
+    novel = novel_rows(store)
+    if not (rows := strangest(store)):
         return None
     shown = [
         {
@@ -227,17 +165,19 @@ def _strangest(found: dict[str, Rows], place: str) -> Section | None:
     return Section(
         "strangest",
         "What does no rule name?",
-        intro=f"{novel_rows_said(found['novel'][0])} These are the strangest, one an episode, with"
+        intro=f"{novel_rows_said(novel)} These are the strangest, one an episode, with"
         " the entries of the observation that are furthest from the nearest rows (their mean)."
         f" `restock trace {quoted(place)} ROW` follows one to its recording.",
         tables=[Table(shown)],
     )
 
 
-def _weeks(rows: Rows, colours: dict[str, str], once: str) -> Section | None:
-    rows = [row for row in rows if row["primary_rows"]]
+def coverage_weeks(store: Store) -> tuple[Rows, Section | None]:
+    """Return the rows of a store's weeks, and their section."""
+    every = _rows(store, "weeks")
+    rows = [row for row in every if row["primary_rows"]]
     if not rows:
-        return None
+        return every, None
     shown = [
         {
             "week": "not known" if row["week"] is None else str(row["week"]),
@@ -255,18 +195,17 @@ def _weeks(rows: Rows, colours: dict[str, str], once: str) -> Section | None:
             .encode(
                 x=alt.X("week:O", title=None, axis=alt.Axis(labelAngle=-60, grid=False)),
                 y=alt.Y("rows:Q", title="rows", axis=alt.Axis(labelExpr=charts.SHORT_NUMBERS)),
-                color=charts.coloured("condition", names, colours, width),
+                color=charts.coloured("condition", names, blocks.WORDS_COLOURS, width),
             )
             .properties(height=200)
         )
 
     weeks = len({row["week"] for row in shown})
-    return Section(
+    return every, Section(
         "weeks",
         "When was it logged?",
-        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}. {once}",
-        figures=[Figure(charts.draw(chart), "Rows by week")],
-        two=True,
+        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}. {_once(store)}",
+        figures=[Figure(charts.draw(chart))],
     )
 
 
@@ -302,38 +241,29 @@ def _robots(rows: Rows) -> Section | None:
     )
 
 
-def _map(found: dict[str, Rows], colours: dict[str, str]) -> Section | None:
-    (bounds,) = found["bounds"]
-    if not found["visited"] or bounds["x0"] is None:
+def _map(store: Store) -> Section | None:
+    (bounds,) = _rows(store, "bounds")
+    if bounds["x0"] is None:
         return None
+    across = bounds["x1"] - bounds["x0"]
+    cell_m = max(0.25, math.ceil(across / MAX_CELLS_ACROSS / 0.25) * 0.25)
     margin = 0.5
     x0, y0 = bounds["x0"] - margin, bounds["y0"] - margin
-    plan = floor_map.FloorMap(bounds["x1"] + margin - x0, bounds["y1"] + margin - y0, [])
+    size_m = bounds["x1"] + margin - x0, bounds["y1"] + margin - y0
 
     def moved(rows: Rows) -> Rows:
         return [{**row, "x_m": row["x_m"] - x0, "y_m": row["y_m"] - y0} for row in rows]
 
-    cell_m = bounds["cell_m"]
-    conditions = charts.ordered(found["rare"], "condition", blocks.CONDITION_COLOURS)
-    return Section(
-        "map",
-        "Where was it logged?",
-        figures=[
-            Figure(
-                floor_map.visited(plan, moved(found["visited"]), cell_m),
-                "Where the robots have been",
-                f"Logged steps in cells of {cell_m:g} m, darker where there are more (logarithmic);"
-                f" the bar is {floor_map.BAR_M} m. Poses are in the map frame, from"
-                f" ({x0:.1f}, {y0:.1f}) m.",
-            ),
-            Figure(
-                floor_map.events(plan, moved(found["rare"]), [], colours),
-                "Where rare conditions were met",
-                Markup(floor_map.legend(conditions, colours)),
-            ),
-        ],
-        two=True,
+    visited = moved(_rows(store, "visited", cell_m=cell_m))
+    rare = moved(_rows(store, "rare", most=MAX_DOTS))
+    drawing, legend = floor_map.draw(size_m, [], visited, cell_m, rare)
+    caption = (
+        f"Logged steps in cells of {cell_m:g} m, darker where there are more (logarithmic); dots"
+        f" are rare conditions; the bar is {floor_map.BAR_M} m. Poses are in the map frame, from"
+        f" ({x0:.1f}, {y0:.1f}) m."
     )
+    caption = legend + Markup("<br>") + caption
+    return Section("map", "Where was it logged?", figures=[Figure(drawing, caption=caption)])
 
 
 MAX_GAPS = 20  # in the table

@@ -1,4 +1,4 @@
-"""The sections on drift: what has changed about which robot, and since when."""
+"""The section on drift: what has changed about which robot, and since when."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from restock.replay.fleet.drift import Drift
 from restock.replay.store.definitions import UNITS
 from restock.replay.store.definitions import unit as unit_of
 from restock.report.look import charts
-from restock.report.look.blocks import MAX_ROWS, Figure, Rows, Section, Table, listed, words
+from restock.report.look.blocks import Figure, Section, Table, listed, words
 
-MAX_ROBOTS = 12  # in a chart: those with findings first
+MAX_ROBOTS = 12  # in a chart
 MAX_PERIODS = 26  # the newest
 MAX_FINDINGS = 8  # findings with a chart of their own
 _BESIDE = ("driving", "conditions")  # parts about the use, not about the hardware
-_VERDICTS = ("changed", "undecided", "unchanged", "too few")
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
@@ -25,10 +24,6 @@ _SCOPE = {
     "alone": "no other robot to compare",
     "unclear": "unclear",
 }
-
-
-def drift_sections(drift: Drift) -> list[Section | None]:
-    return [_findings_section(drift), _comparisons_section(drift.own)]
 
 
 def headline(drift: Drift) -> str:
@@ -51,7 +46,8 @@ def headline(drift: Drift) -> str:
     return drift.without_findings()
 
 
-def _findings_section(drift: Drift) -> Section:
+def drift_section(drift: Drift) -> Section:
+    """Show each finding with its size and date, and the weeks behind it."""
     robots = {row["robot"] for row in drift.periods}
     periods = {row["period"] for row in drift.periods}
     rows = [
@@ -93,9 +89,12 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
         for row in drift.periods
         if row["signal"] == finding["signal"] and row["site"] == finding["site"]
     ]
-    robots = _chosen({row["robot"] for row in rows}, {finding["robot"]})
-    rows = _newest([row for row in rows if row["robot"] in robots])
-    colours = {finding["robot"]: "#b91c1c"}
+    own = finding["robot"]
+    robots = sorted({row["robot"] for row in rows}, key=lambda robot: (robot != own, robot))
+    robots = sorted(robots[:MAX_ROBOTS])
+    periods = sorted({row["period"] for row in rows if row["robot"] in robots})[-MAX_PERIODS:]
+    rows = [row for row in rows if row["robot"] in robots and row["period"] in periods]
+    colours = {own: "#b91c1c"}
 
     def chart(width: int) -> Any:
         base = charts.plot(rows).encode(
@@ -114,57 +113,6 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
         f"{finding['robot']}: {signal_name(finding)}",
         "Median and middle half of the episodes.",
     )
-
-
-def _comparisons_section(own: Rows) -> Section | None:
-    """Show the newest comparison of each hardware signal, with its sizes of effect."""
-    newest: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in own:
-        if row["part"] not in _BESIDE:
-            newest[row["robot"], row["signal"]] = row
-    if not newest:
-        return None
-    rows = [
-        {
-            "robot": row["robot"],
-            "signal": signal_name(row),
-            "reference": value_text(row["reference_value"]),
-            "now": value_text(row["value"]),
-            "change": change_text(row),
-            "verdict": row["verdict"],
-            "Cliff's delta": value_text(row["cliffs_delta"]),
-            "KS": value_text(row["ks_distance"]),
-            "corrected p": "" if row["q"] is None else f"{row['q']:.1g}",
-            "samples": f"{row['n']} / {row['n_reference']} {row['samples']}",
-        }
-        for row in sorted(newest.values(), key=lambda row: _VERDICTS.index(row["verdict"]))
-    ]
-    return Section(
-        "comparisons",
-        "The newest comparison of each signal",
-        intro="Changed signals come first. Undecided: neither a change nor its absence is shown; "
-        "more drives would decide. Samples: now / reference. Cliff's delta and the "
-        "Kolmogorov-Smirnov distance compare episodes: 0 is no difference, 1 no overlap. "
-        "docs/coverage.md says what each signal is.",
-        tables=[
-            Table(
-                rows[:120],
-                title=counted(min(len(rows), 120), "comparison"),
-                folded=len(rows) > MAX_ROWS,
-            ),
-        ],
-    )
-
-
-def _chosen(robots: set[str], first: set[str]) -> list[str]:
-    """Return at most MAX_ROBOTS robots, these first, sorted by name."""
-    return sorted((sorted(robots & first) + sorted(robots - first))[:MAX_ROBOTS])
-
-
-def _newest(rows: Rows) -> Rows:
-    """Return the rows of the newest periods."""
-    kept = sorted({row["period"] for row in rows})[-MAX_PERIODS:]
-    return [row for row in rows if row["period"] in kept]
 
 
 def signal_name(row: dict[str, Any]) -> str:
@@ -190,8 +138,3 @@ def change_text(row: dict[str, Any]) -> str:
     )
     unit = " sd" if row["compared"] == "spread" else ""
     return f"{'× ' if ratio else ''}{value}{unit} [{low}, {high}]"
-
-
-def value_text(value: float | None) -> str:
-    """Format three digits; nothing if there is no value."""
-    return "" if value is None else f"{value:.3g}"

@@ -117,10 +117,11 @@ _SHARES = ("agreement", "changed", "chosen_agreement")
 
 def shown(rows: Rows, columns: dict[str, str]) -> Rows:
     """Return rows as a page shows them: some columns under titles, values formatted by name."""
-    return [{title: _cell(name, row[name]) for name, title in columns.items()} for row in rows]
+    return [{title: cell(name, row[name]) for name, title in columns.items()} for row in rows]
 
 
-def _cell(name: str, value: Any) -> str:
+def cell(name: str, value: Any) -> str:
+    """Format a value by the name of its column: shares in percent, names with spaces."""
     if value is None or isinstance(value, str):
         return words(value or "") if name in _NAMES else value or ""
     if name.endswith("share") or name in _SHARES:
@@ -154,6 +155,15 @@ def named(rows: Rows) -> str:
     return listed(texts + [f"{len(rows) - MAX_NAMED} more"] * (len(rows) > MAX_NAMED))
 
 
+def better_and_worse(rows: Rows, than: str = "") -> tuple[list[str], int]:
+    """Name the conditions that differ by their intervals, and say how many they are."""
+    better = [row for row in rows if row["difference_low"] > 0]
+    worse = [row for row in rows if row["difference_high"] < 0]
+    both = ("better", better), ("worse", worse)
+    parts = [f"{word}{than} in {named(of)}" for word, of in both if of]
+    return parts, len(better) + len(worse)
+
+
 def estimate(row: dict[str, Any]) -> str:
     """Return a value with its interval, or why there is none."""
     if row["value"] is None:
@@ -169,10 +179,6 @@ def percent(value: float | None) -> str:
 
 def count(value: int | None) -> str:
     return "" if value is None else f"{int(value):,}"
-
-
-def number(value: float | None) -> str:
-    return "" if value is None else f"{round(value, 3) + 0.0:.3f}"  # no -0.000
 
 
 def span(seconds: float) -> str:
@@ -197,15 +203,11 @@ def statements(package: str, name: str) -> dict[str, str]:
     return {part.split("\n", 1)[0].strip(): part.split("\n", 1)[1] for part in parts}
 
 
-def rows_of(cursor: duckdb.DuckDBPyConnection) -> Rows:
-    """Return the result of a query as dicts."""
-    names = [column[0] for column in cursor.description or ()]
-    return [dict(zip(names, row, strict=True)) for row in cursor.fetchall()]
-
-
-def ask(connection: Any, sql: str, **parameters: Any) -> Rows:
-    """Run a query with its `$name` parameters."""
-    return rows_of(connection.execute(sql, parameters or None))
+def ask(connection: duckdb.DuckDBPyConnection, sql: str, **parameters: Any) -> Rows:
+    """Return the rows of a query with `$name` parameters."""
+    found = connection.execute(sql, parameters or None)
+    names = [column[0] for column in found.description or ()]
+    return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
 
 # Okabe-Ito: colour-blind readers can distinguish them too.

@@ -42,7 +42,6 @@ POLICY_COLOURS = {
 }
 # Colours of other policies, distinct from each other and from those above in both themes.
 POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d")
-SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
 FEW_POINTS = 10  # a line of at most so many points shows each of them
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
@@ -235,15 +234,15 @@ def estimates(
 
 
 def success(rows: Sequence[Row]) -> Drawing:
-    """Draw success with intervals: rows of cell, perturbation, policy, success, low, high."""
+    """Draw success by condition and policy with intervals, perturbations side by side."""
     return estimates(
         rows,
-        y="cell",
+        y="condition",
         series="policy",
         names=ordered(rows, "policy", POLICY_COLOURS),
         colours=POLICY_COLOURS,
         value="success",
-        ends=("low", "high"),
+        ends=("success_low", "success_high"),
         axis=_PERCENT,
         x_scale=_SHARE,
         beside="perturbation",
@@ -259,19 +258,17 @@ def lines(
     y_title: str,
     colours: Mapping[str, str] = WORDS_COLOURS,
     percent: bool = False,
-    domain: tuple[float, float] | None = None,
-    points: bool = False,
     marker: float | None = None,
 ) -> Drawing:
     """Draw lines over training, by `env_steps` or `gradient_steps`.
 
-    `marker` is the step of the kept checkpoint.
+    With `percent`, values are shares. `marker` is the step of the kept checkpoint.
     """
     names = ordered(rows, series, colours)
     # A line of a single point would not be seen.
-    points = points or len({row[x] for row in rows}) < FEW_POINTS
+    points = percent or len({row[x] for row in rows}) < FEW_POINTS
     axis = alt.Axis(format=".1~%") if percent else alt.Axis(format="~g")
-    y_scale = alt.Scale(domain=domain or alt.Undefined)
+    y_scale = _SHARE if percent else alt.Undefined
 
     def chart(width: int) -> Any:
         base = plot(rows).encode(
@@ -311,46 +308,32 @@ def x_axis(width: int, labels: str = SHORT_NUMBERS) -> alt.Axis:
     return alt.Axis(labelExpr=labels, grid=False, tickCount=max(3, width // 80))
 
 
-def ages(rows: Sequence[Row]) -> Drawing:
-    """Chart age histograms by source, from rows of source, bucket (text), order, share."""
-    sources = ordered(rows, "source", SOURCE_COLOURS)
-    buckets = [row["bucket"] for row in sorted(rows, key=lambda row: row["order"])]
+def shares(rows: Sequence[Row], y: str, colours: Mapping[str, str]) -> Drawing:
+    """Draw a bar for each kind of share, on a square-root axis so that rare ones can be seen.
+
+    Args:
+        rows: a name in column `y`, the kind and the share.
+        colours: the kinds, and their colours.
+    """
+    names = list(dict.fromkeys(row[y] for row in rows))
 
     def chart(width: int) -> Any:
-        axis = alt.Axis(labelAngle=-60, grid=False, labelOverlap=False)
+        marks = [0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1]
         return (
             plot(rows)
             .mark_bar(cornerRadiusEnd=2)
             .encode(
-                x=alt.X("bucket:N", sort=list(dict.fromkeys(buckets)), title=None, axis=axis),
-                y=alt.Y("share:Q", title="share of sampled rows", axis=alt.Axis(format=".1~%")),
-                color=coloured("source", sources, SOURCE_COLOURS, width),
+                y=alt.Y(f"{y}:N", sort=names, title=None, axis=_QUIET),
+                yOffset=alt.YOffset("kind:N", sort=list(colours)),
+                x=alt.X(
+                    "share:Q",
+                    title="share of rows (square-root axis)",
+                    scale=alt.Scale(type="sqrt"),
+                    axis=alt.Axis(format=".1~%", values=marks),
+                ),
+                color=coloured("kind", list(colours), colours, width, label_px(names)),
             )
-            .properties(height=200)
-        )
-
-    return draw(chart)
-
-
-def stacked(
-    rows: Sequence[Row], *, group: str, part: str, value: str, colours: Mapping[str, str]
-) -> Drawing:
-    """Draw one horizontal bar per group, split into parts that sum to one."""
-    parts = list(dict.fromkeys(row[part] for row in rows))
-    groups = list(dict.fromkeys(row[group] for row in rows))
-
-    def chart(width: int) -> Any:
-        quiet = alt.Axis(grid=False, ticks=False)
-        percent = alt.Axis(format=".1~%", values=[0, 0.25, 0.5, 0.75, 1])
-        return (
-            plot(rows)
-            .mark_bar()
-            .encode(
-                y=alt.Y(f"{group}:N", sort=groups, title=None, axis=quiet),
-                x=alt.X(f"{value}:Q", stack="normalize", title=None, axis=percent),
-                color=coloured(part, parts, colours, width),
-            )
-            .properties(height=30 * max(len(groups), 1))
+            .properties(height=(16 * len(colours) + 4) * max(len(names), 1))
         )
 
     return draw(chart)
@@ -388,24 +371,13 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
 
 
 def differences(rows: Rows) -> Drawing:
-    """Draw differences in success by condition, perturbations side by side."""
-    return _outcomes(rows, "difference", "difference in success (points)", 0.0, alt.Scale())
-
-
-def improvements(rows: Rows) -> Drawing:
-    """Draw the probability that the second arm's return is higher."""
-    return _outcomes(rows, "improvement", "P(higher return)", 0.5, _SHARE)
-
-
-def _outcomes(rows: Rows, value: str, title: str, neutral: float, x_scale: alt.Scale) -> Drawing:
-    """Draw one measure of outcomes beside the value of no difference; differences in points."""
-    factor = 100 if value == "difference" else 1
-    columns = (value, f"{value}_low", f"{value}_high")
+    """Draw differences in success by condition and perturbation, in points."""
+    ends = "difference_low", "difference_high"
     shown: Rows = [
         {
             "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
             "condition": words(row["condition"]),
-            **{name: None if row.get(name) is None else factor * row[name] for name in columns},
+            **{n: None if row[n] is None else 100 * row[n] for n in ("difference", *ends)},
         }
         for row in rows
     ]
@@ -416,11 +388,10 @@ def _outcomes(rows: Rows, value: str, title: str, neutral: float, x_scale: alt.S
         series="perturbation",
         names=names,
         colours=colours(names),
-        value=value,
-        ends=columns[1:],
-        title=title,
-        x_scale=x_scale,
-        neutral=neutral,
+        value="difference",
+        ends=ends,
+        title="difference in success (points)",
+        neutral=0.0,
     )
 
 

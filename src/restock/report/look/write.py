@@ -39,8 +39,8 @@ def write_page(content: dict[str, Any], out: Path | str, *, markdown: bool = Fal
     With `markdown` the same words and tables are written beside it, as FILE.md.
 
     Args:
-        content: what the template asks for: kicker, title, headline, lead, cards, sections,
-            a verdict if there is one, and the source that the footer names. Sections may be None.
+        content: what the template asks for: kicker, title, headline, lead, sections, a verdict
+            if there is one, and the source that the footer names. Sections may be None.
     """
     out, folder = Path(out), files("restock.report.look")
     environment = jinja2.Environment(

@@ -17,24 +17,13 @@ import msgspec
 from restock.files import write_text
 from restock.replay.sampling.rules import RULES
 from restock.report.look import write
-from restock.report.look.blocks import Rows, Section, Table, count, estimate, percent, shown
+from restock.report.look.blocks import Rows, Section, Table, cell, estimate, shown, words
 from restock.report.run.facts import Facts, evaluation_bias, gather
-from restock.report.run.fed import by_arm
+from restock.report.run.fed import AGES, FED, POLICIES, PRACTICE
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"
 
-
-_FED = {
-    "stratum": "stratum",
-    "natural_share": "natural",
-    "wanted_share": "wanted",
-    "drawn_share": "drawn",
-    "logs_share": "from logs",
-    "fresh_share": "fresh",
-    "short_share": "short",
-    "reason": "why short",
-}
 _CONDITIONS = {
     "source": "source",
     "condition": "condition",
@@ -42,16 +31,6 @@ _CONDITIONS = {
     "drawn_share": "drawn",
     "effective_share": "after weights",
     "td_abs_mean": "mean absolute TD error at the end",
-}
-_AGES = {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")}
-_POLICIES = {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"}
-_PRACTICE = {
-    "arm": "missions",
-    "natural_share": "natural",
-    "first_share": "wanted at first",
-    "last_share": "wanted at last",
-    "given_share": "given",
-    "episodes": "ended",
 }
 _TEACHER = {
     "source": "source",
@@ -104,8 +83,8 @@ def replay_card(facts: Facts) -> dict[str, Any]:
                 "fresh": settings.get("loss", {}).get("n_step"),
             },
         },
-        "fed": _columns(facts.fed, *_FED, "drawn_rows"),
-        "ages": [_ages(facts.ages, *key) for key in _keys(facts.ages, "source", "unit")],
+        "fed": _columns(facts.fed, *FED, "drawn_rows"),
+        "ages": facts.ages,
         "target": facts.config.get("target") or settings.get("target"),
         "conditions": _columns(facts.conditions, *_CONDITIONS),
         "strata": _columns(
@@ -115,7 +94,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         ),
         "practice": {
             "rule": settings.get("practice", {}).get("rule", "natural"),
-            "arms": _columns(by_arm(facts), *_PRACTICE, "success"),
+            "arms": _columns(facts.practice, *PRACTICE, "success"),
         },
         "teacher": {
             **{
@@ -126,7 +105,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         }
         if teacher.get("source", "none") != "none"
         else None,
-        "behaviour_policies": _columns(facts.policies, *_POLICIES),
+        "behaviour_policies": facts.policies,
         "corrections": {
             "rules": mixture.get("correction") if mixture is not None else None,
             "post_strata": [row["stratum"] for row in logs if row["timing"] == "post"],
@@ -149,23 +128,17 @@ def replay_card(facts: Facts) -> dict[str, Any]:
 
 def as_markdown(card: dict[str, Any]) -> str:
     """Write the card as a page of Markdown."""
-    capacity, sampling, moved = card["capacity"], card["sampling"], card["corrections"]
-    teacher = card["teacher"]
+    teacher = dict(card["teacher"] or {})
+    states = teacher.pop("states", [])
     facts = {
         "Policy": card["policy"] and card["policy"]["text"],
-        "Capacity": f"{count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
-        "Sampling rule": f"batches of {_words(sampling['batch_size'])},"
-        f" {percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
-        f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
-        "Teacher": _teacher(teacher, card["behaviour_policies"]),
-        "Practice": f"missions by the rule {card['practice']['rule']}",
-        "Returns": f"{_words(sampling['n_step']['logs'])}-step in the logs,"
-        f" {_words(sampling['n_step']['fresh'])}-step fresh",
-        "Target rule": _words(card["target"]),
-        "Corrections": f"{_words(moved['rules'])}; outcome strata:"
-        f" {', '.join(moved['post_strata']) or 'none'}; weights moved"
-        f" {percent(moved['moved_by_weights'])} of the logs' mix",
-        "Left out of the panel": _words(card["left_out"]),
+        "Capacity": card["capacity"],
+        "Sampling": card["sampling"],
+        "Teacher": teacher or None,
+        "Practice": card["practice"]["rule"],
+        "Target": card["target"],
+        "Corrections": card["corrections"],
+        "Left out of the panel": card["left_out"],
         "Evaluation shown": card["evaluation"],
     }
     off_policy = [
@@ -173,18 +146,16 @@ def as_markdown(card: dict[str, Any]) -> str:
         for row in card["off_policy"]
     ]
     tables = {
-        "What it was": [{"of the run": name, "": _words(text)} for name, text in facts.items()],
+        "What it was": [{"of the run": name, "": _words(value)} for name, value in facts.items()],
         "Quotas of the batch, and what filled them (shares of all rows fed)": shown(
-            card["fed"], _FED
+            card["fed"], FED
         ),
         "Conditions in the sampled batches": shown(card["conditions"], _CONDITIONS),
-        "Age of the sampled rows": shown(card["ages"], _AGES),
-        "Whose behaviour it was": shown(card["behaviour_policies"], _POLICIES),
+        "Age of the sampled rows": shown(card["ages"], AGES),
+        "Whose behaviour it was": shown(card["behaviour_policies"], POLICIES),
         "Off-policy evaluation on held-out logs, before it drove": off_policy,
-        "Missions that the twin gave": shown(card["practice"]["arms"], _PRACTICE),
-        "What the teacher's filter did at the end": shown(
-            teacher["states"] if teacher else [], _TEACHER
-        ),
+        "Missions that the twin gave": shown(card["practice"]["arms"], PRACTICE),
+        "What the teacher's filter did at the end": shown(states, _TEACHER),
         "Unknown": [{"why": line} for line in card["missing"]],
     }
     return write.as_markdown(
@@ -196,39 +167,6 @@ def as_markdown(card: dict[str, Any]) -> str:
                 Section("", title, tables=[Table(rows)]) for title, rows in tables.items() if rows
             ],
         }
-    )
-
-
-def _teacher(teacher: dict[str, Any] | None, sampled: list[dict[str, Any]]) -> str:
-    """Say who decides what is plausible; `sampled` are the policies of the rows drawn."""
-    if teacher is None:
-        return "none: every action may be chosen"
-    if teacher["source"] == "planner":
-        return (
-            "what navigation proposes, except where Q is more than"
-            f" {teacher['margin']:g} better for another action"
-        )
-    ratio = teacher["ratio"]
-    ratio = f"{ratio:g}" if isinstance(ratio, int | float) else f"a schedule ({_words(ratio)})"
-    drawn = {row["behaviour_policy"] for row in sampled if row["source"] == "logs"}
-    names = [name for name in teacher["policies"] if name in drawn]
-    names += ["other drivers that reached their goal"] if drawn and teacher["successes"] else []
-    cloned = f"logged rows of {', '.join(names)} cloned" if names else "no logged rows to clone"
-    mirrored = ", half of its rows mirrored" if teacher["mirror"] else ""
-    return (
-        f"{teacher['source']}; {cloned}{mirrored}; an action is plausible"
-        f" from {ratio} of the likeliest's probability on"
-    )
-
-
-def _panel(capacity: dict[str, Any]) -> str:
-    if capacity["panel"] is None:
-        return "no panel"
-    if capacity["panel_rows"] is None:
-        return f"panel {capacity['panel']}, which is not at hand"
-    return (
-        f"panel {capacity['panel']} of {count(capacity['panel_rows'])} rows"
-        f" (store version {capacity['store_version']})"
     )
 
 
@@ -258,35 +196,17 @@ def _drawn_share(facts: Facts, source: str) -> float | None:
     return of_source / rows if rows else None
 
 
-def _keys(rows: Rows, *names: str) -> list[tuple[Any, ...]]:
-    return list(dict.fromkeys(tuple(row[name] for name in names) for row in rows))
-
-
-def _ages(rows: Rows, source: str, unit: str) -> dict[str, Any]:
-    """Return quantiles of a log2 histogram: the upper ends of the buckets they fall into."""
-    buckets = sorted(
-        (row["bucket"], float(row["rows"]))
-        for row in rows
-        if (row["source"], row["unit"]) == (source, unit)
-    )
-    total = sum(rows_in_it for _, rows_in_it in buckets)
-    ages: dict[str, Any] = {"source": source, "unit": unit, "rows": int(total)}
-    for name, part in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99)):
-        below = 0.0
-        for bucket, rows_in_it in buckets:
-            below += rows_in_it
-            if below >= part * total:
-                ages[name] = f"below {2 ** (bucket + 1):,}"
-                break
-    return ages
-
-
 def _columns(rows: Rows, *names: str) -> Rows:
     return [{name: row[name] for name in names} for row in rows]
 
 
-def _words(value: Any) -> str:
+def _words(value: Any, name: str = "") -> str:
     """Write a small document for people."""
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "none"
-    return "none" if value is None else str(value)
+        parts = [f"{words(key)} {_words(item, key)}" for key, item in value.items()]
+        return ", ".join(parts) or "none"
+    if isinstance(value, list | tuple):
+        return " and ".join(map(_words, value)) or "none"
+    if value is None or isinstance(value, bool):
+        return "yes" if value else "no" if value is False else "none"
+    return cell(name, value)

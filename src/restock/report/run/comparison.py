@@ -5,24 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import altair as alt
-
-from restock.errors import counted, verdict_said
+from restock.errors import verdict_said
 from restock.report.look import charts
 from restock.report.look.blocks import (
-    Drawing,
     Figure,
     Rows,
     Section,
     Table,
+    better_and_worse,
     count,
-    named,
-    number,
     points_text,
     span,
     words,
 )
-from restock.report.look.charts import FULL, draw, label_px, plot, side_by_side
 from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
 from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 
@@ -60,14 +55,6 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
     )
 
 
-def better_and_worse(rows: Rows) -> tuple[list[str], int]:
-    """Name the conditions that differ by their intervals, and say how many they are."""
-    better = [row for row in rows if row["difference_low"] > 0]
-    worse = [row for row in rows if row["difference_high"] < 0]
-    parts = [f"{word} in {named(of)}" for word, of in (("better", better), ("worse", worse)) if of]
-    return parts, len(better) + len(worse)
-
-
 def outcome_sections(
     found: dict[str, Any], first: str, second: str, prefix: str = ""
 ) -> list[Section | None]:
@@ -100,24 +87,10 @@ def outcome_sections(
         }
         for row in rows
     ]
-    goal = any(row["difference"] is not None for row in rows)
-    figures = [
-        Figure(
-            charts.improvements(rows),
-            f"Probability that {second} is better",
-            "The probability that its return on an episode is higher, ties counting half, over "
-            "all pairs of runs; 0.5 means no difference.",
-        )
-    ]
-    if goal:
-        figures.insert(
-            0,
-            Figure(
-                charts.differences(rows),
-                "Difference in success",
-                f"Right of the line {second} is better.",
-            ),
-        )
+    figures = []
+    if any(row["difference"] is not None for row in rows):
+        caption = f"Right of the line {second} is better."
+        figures = [Figure(charts.differences(rows), "Difference in success", caption)]
     return [
         Section(
             f"{prefix}outcomes",
@@ -125,8 +98,14 @@ def outcome_sections(
             intro=f"{treatment} Both drove the same episodes, from {found['outcomes_from']}."
             f" {_INTERVALS}" + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
             figures=figures,
-            two=True,
-            tables=[Table(table)],
+            tables=[
+                Table(
+                    table,
+                    caption="P(higher return): the probability that the return of"
+                    f" {second} on an episode is higher, ties counting half, over all pairs of"
+                    " runs; 0.5 means no difference.",
+                )
+            ],
         )
     ]
 
@@ -196,7 +175,7 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
             "part": words(row["part"]),
             first: _setting(row["first"]),
             second: _setting(row["second"]),
-            "value": number(row["value"]),
+            "value": _setting(row["value"]),
             "95 %": _ends(row["low"], row["high"]),
             "limit": f"{row['limit']:g}",
             "verdict": verdict_said(row["verdict"], decides=row["decides"]),
@@ -231,28 +210,16 @@ def _ends(low: float | None, high: float | None) -> str:
     return f"{low:.3g} or more" if high is None else f"{low:.3g} to {high:.3g}"
 
 
-def cost_cards(rows: Rows) -> list[dict[str, str]]:
-    """Show what a run of each arm took."""
-    cards = []
-    for row in rows:
-        known = {
-            "time": None if row["wall_s"] is None else span(row["wall_s"]),
-            "steps": None
-            if row["env_steps"] is None
-            else f"{row['env_steps']:,.0f} environment steps",
-        }
-        reported = [text for text in known.values() if text is not None]
-        reported += [f"{row['gradient_steps']:,.0f} updates"] if row["gradient_steps"] else []
-        if reported:
-            seeds = f"{counted(row['runs'], 'seed')}"
-            cards.append(
-                {
-                    "value": reported[0],
-                    "label": f"of training, a run of {row['arm']} ({seeds})"
-                    + (f": {', '.join(reported[1:])}" if reported[1:] else ""),
-                }
-            )
-    return cards
+def _costs(rows: Rows) -> dict[str, str]:
+    """Say what training took for a run of each arm."""
+    return {
+        row["arm"]: ", ".join(
+            ([] if row["wall_s"] is None else [span(row["wall_s"])])
+            + ([f"{row['env_steps']:,.0f} steps"] if row["env_steps"] else [])
+            + ([f"{row['gradient_steps']:,.0f} updates"] if row["gradient_steps"] else [])
+        )
+        for row in rows
+    }
 
 
 SAFETY = {
@@ -271,8 +238,8 @@ def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
     sections = [
         _study_gate(comparisons),
         _contrasts(study["contrasts"], study["rare"]),
-        _arms(study["arms"], arms),
-        curves_section(study.get("curves", []), arms),
+        _arms(study["arms"], arms, _costs(study["cost"])),
+        curves_section(study["curves"], arms),
         *(
             section
             for number, one in enumerate(comparisons)
@@ -293,7 +260,6 @@ def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
         "lead": (f"{study['doc']} " if study["doc"] else "")
         + f"{len(arms)} arms, seeds {', '.join(map(str, study['seeds']))}, all evaluated on the"
         " same episodes.",
-        "cards": cost_cards(study.get("cost", [])),
         "sections": sections,
     }
 
@@ -374,12 +340,13 @@ def _p(value: float | None) -> str:
     return "" if value is None else "< .001" if value < 0.001 else f"{value:.3f}"
 
 
-def _arms(arms: Rows, order: list[str]) -> Section | None:
-    """Show success by condition of every arm and reference, and its cost in safety."""
+def _arms(arms: Rows, order: list[str], costs: dict[str, str]) -> Section | None:
+    """Show success by condition of every arm and reference, safety, and the cost of training."""
     if not arms:
         return None
     cells = [
-        {"arm": row["arm"], "condition": name.removeprefix("success "), **_value_and_ends(value)}
+        {"arm": row["arm"], "condition": name.removeprefix("success ")}
+        | dict(zip(("value", "low", "high"), value, strict=True))
         for row in arms
         for name, value in row.items()
         if name.startswith("success ")
@@ -390,9 +357,12 @@ def _arms(arms: Rows, order: list[str]) -> Section | None:
             "arm": row["arm"],
             "runs": "" if row["runs"] is None else str(row["runs"]),
             **{
-                title: "" if row.get(name) is None else _text(row[name], form)
+                title: ""
+                if (row.get(name) or [None])[0] is None
+                else interval_text(*row[name], form)
                 for name, (title, form) in SAFETY.items()
             },
+            "training of a run": costs.get(row["arm"], ""),
         }
         for row in arms
     ]
@@ -404,35 +374,18 @@ def _arms(arms: Rows, order: list[str]) -> Section | None:
         f"arrived. From fewer than {MIN_PAIRS} seeds, and where all came to the same, there are "
         "values alone.",
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
-        two=True,
         tables=[Table(rows)],
     )
 
 
-def _value_and_ends(value: list[float | None]) -> dict[str, float | None]:
-    mean, low, high = value
-    return {
-        "value": mean,
-        "low": low,
-        "high": high,
-    }
-
-
-def _text(value: list[float | None], form: str) -> str:
-    mean, low, high = value
-    return "" if mean is None else interval_text(mean, low, high, form)
-
-
 _GATE_KINDS = {NOT_WORSE: "good", NOT_SHOWN: "open", WORSE: "bad"}
 _WORDS = {NOT_WORSE: "shown not worse", NOT_SHOWN: "not shown", WORSE: "shown worse"}
-_COLOURS = {NOT_WORSE: "#0f766e", NOT_SHOWN: "#b58900", WORSE: "#be185d"}
-HEIGHT = 150
+_COLOURS = dict(zip(_WORDS.values(), ("#0f766e", "#b58900", "#be185d"), strict=True))
 
 
 def gate_page(document: dict[str, Any]) -> dict[str, Any]:
     """Return everything that the page's template needs."""
     cells, policy = document["cells"], document["policy"]
-    of = {word: sum(cell["verdict"] == word for cell in cells) for word in _WORDS}
     return {
         "kicker": "gate",
         "title": f"May {Path(document['run']).name} drive instead of {document['baseline']}?",
@@ -441,11 +394,14 @@ def gate_page(document: dict[str, Any]) -> dict[str, Any]:
         "lead": ("" if policy is None else f"{policy['text'].capitalize()}. ")
         + "Both drove the same missions in the twin, until each condition was decided or its budget"
         f" of {count(document['budget'])} pairs was spent.",
-        "cards": [
-            {"value": count(number), "label": f"of {len(cells)} tests: {_WORDS[word]}"}
-            for word, number in of.items()
+        "sections": [
+            _evidence(cells),
+            Section(
+                "limits",
+                "What this does not say",
+                tables=[Table([{"limit": line} for line in document["limits"]])],
+            ),
         ],
-        "sections": [_evidence(cells), _limits(document)],
     }
 
 
@@ -464,59 +420,30 @@ def _evidence(cells: list[dict[str, Any]]) -> Section:
         }
         for cell in cells
     ]
-    by_measure: dict[str, list[dict[str, Any]]] = {}
-    for cell in cells:
-        if cell["curve"]:
-            by_measure.setdefault(cell["measure"], []).append(cell)
+    drawn = [
+        cell
+        | {"cell": cell["name"] + (f", {cell['layouts']}" if len(floors) > 1 else "")}
+        | {"verdict": _WORDS[cell["verdict"]], "limit": -cell["margin"]}
+        for cell in cells
+        if cell["difference"] is not None
+    ]
     figures = [
         Figure(
-            _curves(of, several_floors=len(floors) > 1),
+            charts.estimates(
+                [cell for cell in drawn if cell["measure"] == measure],
+                y="cell",
+                series="verdict",
+                names=[name for name in _COLOURS if name in {cell["verdict"] for cell in drawn}],
+                colours=_COLOURS,
+                value="difference",
+                ends=("low", "high"),
+                neutral=0.0,
+                tick="limit",
+            ),
             f"{words(measure).capitalize()}: by how much the policy was better",
-            "The bounds after each pair hold at every moment. The policy is shown not to be worse"
-            " once the lower one is above the dashed line, the margin.",
+            "The bounds hold after every pair. The policy is shown not to be worse once the lower"
+            " one is above the tick, the margin.",
         )
-        for measure, of in by_measure.items()
+        for measure in dict.fromkeys(cell["measure"] for cell in drawn)
     ]
-    return Section("evidence", "Evidence", figures=figures, tables=[Table(rows)])
-
-
-def _curves(cells: list[dict[str, Any]], *, several_floors: bool) -> Drawing:
-    """Draw the bounds of each cell by pairs, with its margin."""
-    rows = [
-        {
-            "cell": cell["name"] + (f", {cell['layouts']}" if several_floors else ""),
-            "limit": -cell["margin"],
-            "verdict": cell["verdict"],
-            **point,
-        }
-        for cell in cells
-        for point in cell["curve"]
-    ]
-    names = list(dict.fromkeys(row["cell"] for row in rows))
-    colour = alt.Color(
-        "verdict:N",
-        legend=None,
-        scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())),
-    )
-    ends = [4 * cell["margin"] for cell in cells]
-    shown = alt.Scale(domain=[-max(ends), max(ends)], clamp=True)
-    percent = alt.Axis(format="+.0%") if cells[0]["unit"] == "" else alt.Axis(format="~g")
-
-    def chart(width: int) -> Any:
-        base = plot(rows).encode(x=alt.X("pairs:Q", title="pairs of episodes"))
-        area = base.mark_area(opacity=0.3).encode(
-            y=alt.Y("low:Q", title=None, axis=percent, scale=shown), y2="high:Q", color=colour
-        )
-        line = base.mark_line(strokeWidth=2).encode(y=alt.Y("low:Q", scale=shown), color=colour)
-        limit = base.mark_line(strokeDash=[4, 3], color="#0f172a").encode(
-            y=alt.Y("limit:Q", scale=shown)
-        )
-        layered = alt.layer(area, line, limit).properties(height=HEIGHT)
-        return side_by_side(layered, "cell", names, width, label_px(["+20%"]))
-
-    return draw(chart, FULL)
-
-
-def _limits(document: dict[str, Any]) -> Section:
-    rows = [{"limit": line} for line in document["limits"]]
-    return Section("limits", "What this does not say", tables=[Table(rows)])
+    return Section("evidence", "Evidence", figures=figures, two=True, tables=[Table(rows)])

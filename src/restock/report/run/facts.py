@@ -13,17 +13,18 @@ from restock.errors import RestockError, RunError
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.report.look.blocks import Rows, ask, rows_of, statements, words
+from restock.report.look.blocks import Rows, ask, statements, words
 from restock.train.run.kept_evaluations import (
     CloneQuality,
-    measures,
     read_clones,
     shown_evaluation,
+    summary_rows,
     trained_step,
 )
 from restock.train.run.replay_audit import fed_shares
 from restock.train.run.run import PolicyOrigin, Run, kept_policy, run_clocks
 from restock.train.run.run_profile import run_panel
+from restock.train.twin.calibration.twin_gap import TwinGap, gap_folder, read_gap
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.floors.placed import COMPARED, logged_drives, placed_on
@@ -32,8 +33,9 @@ PACKAGE = "restock.report.run"
 CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined."
 MAX_DOTS = 1500
-_TABLES = (  # tables of a run that run.sql reads
-    *("strata", "conditions", "actions", "ages", "policies", "evaluations", "probe", "progress"),
+_TABLES = (  # of a run, which run.sql reads
+    *("strata", "conditions", "actions", "ages", "policies", "practice"),
+    *("evaluations", "probe", "progress"),
 )
 
 
@@ -43,39 +45,38 @@ class Facts:
 
     run: Path
     config: dict[str, Any]
-    sampled: Rows  # per source and stratum: available, intended, drawn
-    fed: Rows = field(default_factory=list, kw_only=True)  # per stratum, of all rows fed
-    conditions: Rows  # in the batches, independent of the strata
-    actions: Rows  # in the batches, and wanted, by source, stratum and condition
+    # Results of `run.sql`, by the names of its statements.
+    sampled: Rows
+    conditions: Rows
+    actions: Rows
     ages: Rows
     policies: Rows
+    practice: Rows
     learning: Rows
     td: Rows
     lag: Rows
     loss: Rows
-    trained: dict[str, Any]  # steps, updates and time in all
-    cells: Rows  # results of `restock eval`, with Wilson intervals as low and high
     failures: Rows
+    clocks: dict[str, Any]  # environment steps, updates and seconds of training
+    cells: Rows  # measures of `restock eval` per policy, perturbation and condition
+    evaluation: str  # which of the driven episodes are shown
+    ways: Rows  # as `cells`, but on the routes of the logs
+    evaluation_on_ways: str  # which routes these are
+    policy: PolicyOrigin | None  # the run's policy that would drive now
+    driven_step: int | None  # training step of the policy in `cells`
+    clones: list[CloneQuality]  # clones of the logs' drivers
+    fed: Rows  # per stratum, of all rows fed
+    off_policy: Rows  # off-policy estimates, over all conditions
+    teacher: Rows  # what its filter did in the last interval
     panel: Panel | None = None
-    policy: PolicyOrigin | None = None  # the run's policy that would drive now
-    driven_step: int | None = None  # training step of the policy in `cells`
-    evaluation: str = ""  # which of the driven episodes are shown
-    ways: Rows = field(default_factory=list)  # as `cells`, but on the routes of the logs
-    evaluation_on_ways: str = ""  # which routes these are
-    floor: Warehouse | None = None  # the floor that the run drives on, if it is one
-    visited: Rows = field(default_factory=list)  # cells of the floor, by recordings in its frame
-    rare: Rows = field(default_factory=list)
-    elsewhere: int = 0  # recordings in other frames
+    floor: Warehouse | None = None  # the floor that is drawn
     floors: int = 1  # number of floors that the run drives on
-    recordings: Rows = field(default_factory=list)
-    logged: Rows = field(default_factory=list)  # share of logged rows per condition
-    off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
-    clones: list[CloneQuality] = field(default_factory=list)  # clones of the logs' drivers
-    practice: Rows = field(default_factory=list)  # per interval and arm of missions
-    teacher: Rows = field(default_factory=list)  # what its filter did in the last interval
+    visited: Rows = field(default_factory=list)  # cells of the floor, by recordings in its frame
+    rare: Rows = field(default_factory=list)  # where rare conditions were logged there
+    elsewhere: int = 0  # recordings in other frames
+    logged: Rows = field(default_factory=list)  # share of logged episodes per condition
+    gap: TwinGap | None = None  # between the twin and the logs
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
-    # Comparison runs, keyed as `headline` expects.
-    compared: dict[str, Rows] = field(default_factory=dict)
 
     @property
     def target_rule(self) -> str:
@@ -88,7 +89,7 @@ class Facts:
     @property
     def twin(self) -> bool:
         """Return whether the run had a twin to drive in."""
-        return bool(self.config.get("config", {}).get("env", {}).get("twin", True))
+        return _has_twin(self.config)
 
     @property
     def no_goal(self) -> bool:
@@ -109,57 +110,63 @@ def gather(path: Path) -> Facts:
         RunError: no run at `path`, or one without a single logged update.
     """
     run = Run.open(path)
+    evaluated, shown = shown_evaluation(path)
+    on_ways, ways = shown_evaluation(path, ways=True)
+    if ways == shown:  # they are what was driven last, and shown already
+        on_ways, ways = on_ways.slice(0, 0), ""
     with duckdb.connect() as connection:
+        connection.register("evaluated", evaluated)
         for name in _TABLES:
             connection.register(name, run.table(name))
-        evaluated, shown = shown_evaluation(path)
-        connection.register("evaluated", evaluated)
-        rows = {
-            name: rows_of(connection.execute(sql))
-            for name, sql in statements(PACKAGE, "run.sql").items()
-        }
-        on_ways, ways = shown_evaluation(path, ways=True)
-        if ways == shown:  # they are what was driven last, and shown already
-            on_ways, ways = on_ways.slice(0, 0), ""
-        connection.register("evaluated", on_ways)
-        rows["ways"] = ask(connection, statements(PACKAGE, "run.sql")["cells"])
+        rows = {name: ask(connection, sql) for name, sql in statements(PACKAGE, "run.sql").items()}
     if not rows["loss"]:
         raise RunError(
             "has no update to report on yet",
             where=str(path),
             remedy="let it train past its first logging interval",
         )
-    for row in rows["cells"]:
-        row |= measures(row.pop("driven"))
-        row["low"], row["high"] = row["success_low"], row["success_high"]
-    for row in rows["ways"]:
-        row |= measures(row.pop("driven"))
-    (trained,) = rows.pop("trained")
-    clocks = run_clocks(run)  # of an interrupted run they are later than its last logged interval
-    trained |= {name: max(value, clocks.get(name, value)) for name, value in trained.items()}
+    (clocks,) = rows.pop("clocks")
+    latest = run_clocks(run)  # of an interrupted run they are later than its last logged interval
+    twin, taught = _has_twin(run.document), run.table("teacher").to_pylist()
     facts = Facts(
         run=path,
         config=run.document,
-        trained=trained,
+        clocks={name: max(value, latest.get(name, value)) for name, value in clocks.items()},
+        cells=summary_rows(evaluated.to_pylist()),
+        evaluation=shown,
+        ways=summary_rows(on_ways.to_pylist()),
+        evaluation_on_ways=ways,
+        policy=kept_policy(run),
+        driven_step=trained_step(evaluated),
+        clones=read_clones(path),
+        fed=fed_shares(run),
+        off_policy=_off_policy(run, twin),
+        teacher=[row for row in taught if _clocks(row) == _clocks(taught[-1])],
         **rows,  # type: ignore[arg-type]
     )
-    facts.policy, facts.driven_step = kept_policy(run), trained_step(evaluated)
-    facts.evaluation, facts.evaluation_on_ways = shown, ways
-    facts.clones = read_clones(path)
-    facts.fed = fed_shares(run)
-    facts.off_policy = _off_policy(run, facts.twin)
-    facts.practice = run.table("practice").to_pylist()
-    taught = run.table("teacher").to_pylist()
-    facts.teacher = [row for row in taught if _clocks(row) == _clocks(taught[-1])]
     if absent := run.absent:
-        facts.missing.append(
-            f"Missing tables, taken as empty: {', '.join(absent)}. Restore them from a copy, unless"
-            " an earlier Restock wrote the run."
-        )
-    if not facts.cells and facts.twin:
+        facts.missing.append(f"Missing tables, taken as empty: {', '.join(absent)}.")
+    if not facts.cells and twin:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
+    facts.gap = _find_gap(facts)
     return facts
+
+
+def _has_twin(document: dict[str, Any]) -> bool:
+    return bool(document.get("config", {}).get("env", {}).get("twin", True))
+
+
+def _find_gap(facts: Facts) -> TwinGap | None:
+    """Find the gap of a run: RUN/gap, or the gap folder of its panel's store."""
+    places = [facts.run]
+    if facts.panel is not None and "://" not in str(facts.panel.header.store):
+        places.append(Path(facts.panel.header.store))
+    try:
+        return None if (folder := gap_folder(places)) is None else read_gap(folder)
+    except RestockError as error:
+        facts.missing.append(f"Not shown, since it could not be read: {error}")
+        return None
 
 
 def _off_policy(run: Run, twin: bool) -> Rows:
@@ -189,7 +196,6 @@ def _add_panel(facts: Facts) -> None:
         assert held is not None
         with Store(held.header.store) as store:
             _add_floor(facts, held, store)
-            facts.recordings = _store_rows(store, "recordings")
             facts.logged = _store_rows(store, "logged")
     except RestockError as error:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
@@ -207,14 +213,8 @@ def _add_floor(facts: Facts, panel: Panel, store: Store) -> None:
         floor.name: [name for name, drive in drives.items() if placed_on(floor, drive)]
         for floor in floors
     }
-    with_logs = [floor for floor in floors if on[floor.name]]
-    if len(floors) > 1 and not with_logs:
-        facts.missing.append(
-            f"No floor is drawn: the run drives on {len(floors)} floors, and no recording is in the"
-            " frame of one."
-        )
-        return
-    facts.floor, facts.floors = (with_logs or floors)[0], len(floors)
+    facts.floor = next((floor for floor in floors if on[floor.name]), floors[0])
+    facts.floors = len(floors)
     here = on[facts.floor.name]
     facts.elsewhere = len(drives) - len(here)
     x_m, y_m, yaw_rad = facts.floor.map_origin
@@ -253,7 +253,7 @@ def _by_condition(cells: Rows) -> dict[str, float]:
     """Return success by condition, over its cells."""
     found: dict[str, list[float]] = {}
     for row in cells:
-        found.setdefault(row["cell"].split(" (")[0], []).append(row["success"])
+        found.setdefault(row["condition"].split(" (")[0], []).append(row["success"])
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 

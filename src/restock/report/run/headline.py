@@ -6,21 +6,19 @@ A run without a twin is judged by logs that it did not learn from.
 
 from __future__ import annotations
 
-from typing import Any
-
 from restock.errors import RunError, quoted
 from restock.report.look.blocks import (
     Rows,
     Section,
     Table,
+    better_and_worse,
     estimate,
-    named,
+    listed,
     points_text,
     span,
     words,
 )
 from restock.report.run.facts import Facts, mean_success
-from restock.report.run.twin_gap import find_gap
 from restock.train.evaluation.regression import read_run_evaluation, regression
 from restock.train.twin.calibration.twin_gap import TRUSTED
 
@@ -79,21 +77,17 @@ def baseline(facts: Facts) -> str | None:
     return next((name for name in BASELINES if facts.clean_cells(name)), None)
 
 
-def compared(facts: Facts, name: str | None = None) -> Rows:
-    """Return `regression`'s rows against the baseline, by perturbation and condition.
+def compared(facts: Facts, name: str | None) -> Rows:
+    """Return `regression`'s rows against another policy, by perturbation and condition.
 
-    The baseline may be another that drove the same episodes. There are no rows without one.
+    There are none if it did not drive the same episodes, or if these have no success to compare.
     """
-    name = name or baseline(facts)
     if name is None or facts.no_goal:
         return []
-    if name not in facts.compared:
-        try:
-            rows = regression(read_run_evaluation(facts.run, name), read_run_evaluation(facts.run))
-        except RunError:  # the episodes have no success that can be compared
-            rows = []
-        facts.compared[name] = rows
-    return facts.compared[name]
+    try:
+        return regression(read_run_evaluation(facts.run, name), read_run_evaluation(facts.run))
+    except RunError:
+        return []
 
 
 def losses(facts: Facts) -> list[str]:
@@ -110,37 +104,35 @@ def losses(facts: Facts) -> list[str]:
 
 
 def _against_baseline(facts: Facts) -> str:
-    rows = [row for row in compared(facts) if row["perturbation"] == "none"]
+    name = baseline(facts)
+    rows = [row for row in compared(facts, name) if row["perturbation"] == "none"]
     if not rows:
-        ordered = sorted(facts.clean_cells(), key=lambda row: -row["success"])
-        shown = ordered if len(ordered) < 3 else [ordered[0], ordered[-1]]
-        each = " and ".join(f"{_alone(row)} in {words(row['cell'])}" for row in shown)
+        each = listed(
+            [
+                f"{row['success']:.0%} [{row['success_low']:.0%}, {row['success_high']:.0%}] in"
+                f" {words(row['condition'])}"
+                for row in facts.clean_cells()
+            ]
+        )
         return f"No baseline drove the same episodes: success {each}"
-    who = BASELINES[baseline(facts) or ""].removesuffix(",")
-    by: dict[str, Rows] = {}
-    for row in rows:
-        by.setdefault(row["verdict"], []).append(row)
-    differ = [verdict for verdict in ("better", "worse") if verdict in by]
-    if differ:
-        text = "; ".join(f"{verdict} than {who} in {named(by[verdict])}" for verdict in differ)
-        rest = len(rows) - sum(len(by[verdict]) for verdict in differ)
-        text += f"; no difference shown in {rest} more" if rest else ""
+    who = BASELINES[name or ""].removesuffix(",")
+    parts, differ = better_and_worse(
+        [row for row in rows if row["verdict"] in ("better", "worse")], f" than {who}"
+    )
+    if parts:
+        rest = len(rows) - differ
+        text = "; ".join(parts) + (f"; no difference shown in {rest} more" if rest else "")
         return text[0].upper() + text[1:]
-    if same := by.get("no difference shown"):
+    if same := [row for row in rows if row["verdict"] == "no difference shown"]:
         lowest = min(same, key=lambda row: row["difference"])
         where = words(lowest["condition"])
         return f"No difference from {who} is shown; the lowest is {points_text(lowest)} in {where}"
     return f"Too few of the same episodes to tell a difference from {who}"
 
 
-def _alone(row: dict[str, Any]) -> str:
-    return f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]"
-
-
 def _distrust(facts: Facts) -> str:
     """Say why success in the twin may mean little: its gap to these logs."""
-    gap = find_gap(facts)
-    verdicts = () if gap is None else gap.verdicts
+    verdicts = () if facts.gap is None else facts.gap.verdicts
     nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)
     if nominal == TRUSTED:
         return ""
@@ -149,19 +141,11 @@ def _distrust(facts: Facts) -> str:
 
 def lead(facts: Facts) -> str:
     """Say what the headline's numbers are of, and what they cost."""
-    took = facts.trained
+    took = facts.clocks
+    updates = f"{took['gradient_steps']:,} updates in {span(took['wall_s'])}"
     if not facts.twin:
-        return (
-            f"A DQN trained on logs alone, without a twin, for {took['gradient_steps']:,} updates"
-            f" in {span(took['wall_s'])}. Nothing has driven yet."
-        )
-    fed = "logs and fresh experience" if facts.panel is not None else "fresh experience alone"
-    if not took["updated_online"]:
-        fed = "logs alone, without an update in the twin,"
-    text = (
-        f"Cost: a DQN trained on {fed} for {took['env_steps']:,} environment steps and"
-        f" {took['gradient_steps']:,} updates in {span(took['wall_s'])}."
-    )
+        return f"A DQN trained on logs alone, without a twin: {updates}. Nothing has driven yet."
+    text = f"Cost: {took['env_steps']:,} environment steps and {updates}."
     if not facts.clean_cells() or facts.no_goal:
         return text
     if baseline(facts) is None:
@@ -209,28 +193,23 @@ def holds_out(facts: Facts) -> bool:
 
 def judged_section(facts: Facts) -> Section:
     """Show the estimates, or how to get them."""
-    if not facts.off_policy and not holds_out(facts):
-        return Section(
-            "judged",
-            "How good is it?",
-            intro=f"{NOTHING_DROVE} The logs are too short to hold any of them out: it learned "
-            "from all of them, so they cannot evaluate it. More recordings can.",
+    if facts.off_policy:
+        how = (
+            "These are estimates for episodes of the logs that it did not learn from, beside what"
+            " the logs' drivers achieved there. Do not choose a policy by them alone."
         )
-    if not facts.off_policy:
-        return Section(
-            "judged",
-            "How good is it?",
-            intro=f"{NOTHING_DROVE} `restock eval --on-logs own {quoted(facts.run)}` evaluates it"
-            " on episodes that it did not learn from.",
+    elif holds_out(facts):
+        how = (
+            f"`restock eval --on-logs own {quoted(facts.run)}` evaluates it on episodes that it did"
+            " not learn from."
         )
-    return Section(
-        "judged",
-        "How good is it?",
-        intro=f"{NOTHING_DROVE} These are estimates for episodes of the logs that it did not "
-        "learn from, beside what the logs' drivers achieved there. Do not choose a policy by "
-        "them alone.",
-        tables=[off_policy_table(facts.off_policy)],
-    )
+    else:
+        how = (
+            "The logs are too short to hold any of them out: it learned from all of them, so they"
+            " cannot evaluate it. More recordings can."
+        )
+    tables = [off_policy_table(facts.off_policy)] if facts.off_policy else []
+    return Section("judged", "How good is it?", intro=f"{NOTHING_DROVE} {how}", tables=tables)
 
 
 def off_policy_table(rows: Rows) -> Table:

@@ -18,7 +18,6 @@ SELECT source,
        sum(drawn_rows) AS drawn_rows,
        sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source) AS drawn_share,
        sum(effective_share * source_rows) / nullif(any_value(totals.rows), 0) AS effective_share,
-       sum(reward_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS reward_mean,
        sum(terminal_share * drawn_rows) / nullif(sum(drawn_rows), 0) AS terminal_share
 FROM drawn JOIN totals USING (source)
 GROUP BY source, stratum
@@ -40,41 +39,70 @@ GROUP BY source, condition
 ORDER BY source DESC, drawn_share DESC;
 
 -- name: actions
--- What batches held of each action, and what the policy wanted in the last quarter of the updates.
-WITH counted AS (
-    SELECT source, stratum, condition, action, any_value(name) AS name,
-           sum(drawn_rows) AS drawn_rows,
-           sum(greedy_rows) FILTER (
-               gradient_steps > 0.75 * (SELECT max(gradient_steps) FROM actions)
-           ) AS wanted_rows
-    FROM actions
+-- The actions that the policy wanted in the last quarter of the updates more than twice as often as the logs have them,
+-- by condition; of conditions with logged rows and at least 20 audited fresh ones.
+WITH shares AS (
+    SELECT condition, any_value(name) AS name,
+           sum(drawn_rows) FILTER (source = 'logs')
+               / sum(sum(drawn_rows) FILTER (source = 'logs')) OVER cell AS logged_share,
+           sum(drawn_rows) FILTER (source = 'fresh')
+               / sum(sum(drawn_rows) FILTER (source = 'fresh')) OVER cell AS drawn_share,
+           sum(wanted_rows) / nullif(sum(sum(wanted_rows)) OVER cell, 0) AS wanted_share,
+           sum(sum(wanted_rows)) OVER cell AS audited_rows
+    FROM (
+        SELECT *, CASE WHEN source = 'fresh' AND gradient_steps > 0.75 * max(gradient_steps) OVER ()
+                       THEN greedy_rows END AS wanted_rows
+        FROM actions
+    )
     WHERE condition <> 'unlabelled'
-    GROUP BY source, stratum, condition, action
+    GROUP BY condition, action
+    WINDOW cell AS (PARTITION BY condition)
 )
-SELECT source, stratum, condition, action, name, drawn_rows,
-       drawn_rows / sum(drawn_rows) OVER cell AS drawn_share,
-       wanted_rows / nullif(sum(wanted_rows) OVER cell, 0) AS wanted_share,
-       sum(wanted_rows) OVER cell AS audited_rows
-FROM counted
-WINDOW cell AS (PARTITION BY source, stratum, condition)
-ORDER BY source DESC, stratum, condition, action;
+SELECT condition, name, wanted_share, logged_share, drawn_share, CAST(audited_rows AS BIGINT) AS audited_rows
+FROM shares
+WHERE audited_rows >= 20 AND wanted_share > 2 * logged_share
+ORDER BY wanted_share - logged_share DESC, condition, name
+LIMIT 12;
 
 -- name: ages
--- Age histogram per source: days for logs, environment steps for fresh rows.
-SELECT source, unit, bucket, sum(count) AS rows,
-       sum(count) / sum(sum(count)) OVER (PARTITION BY source, unit) AS share
-FROM ages
-WHERE unit IN ('days', 'env_steps')
-GROUP BY source, unit, bucket
-ORDER BY source DESC, bucket;
+-- Quantiles of the ages, as the upper ends of their log2 buckets: days for logs, environment steps for fresh rows.
+WITH buckets AS (
+    SELECT source, unit, bucket, sum(sum(count)) OVER (PARTITION BY source, unit) AS rows,
+           sum(sum(count)) OVER (PARTITION BY source, unit ORDER BY bucket) AS up_to
+    FROM ages
+    WHERE unit IN ('days', 'env_steps')
+    GROUP BY source, unit, bucket
+), ends AS (
+    SELECT source, unit, rows, up_to, format('below {:,}', CAST(2 ** (bucket + 1) AS BIGINT)) AS age
+    FROM buckets
+)
+SELECT source, unit, CAST(any_value(rows) AS BIGINT) AS rows,
+       arg_min(age, up_to) FILTER (up_to >= 0.5 * rows) AS p50,
+       arg_min(age, up_to) FILTER (up_to >= 0.9 * rows) AS p90,
+       arg_min(age, up_to) FILTER (up_to >= 0.99 * rows) AS p99
+FROM ends
+GROUP BY source, unit
+ORDER BY source DESC;
 
 -- name: policies
 -- Whose experience was drawn.
-SELECT source, behaviour_policy, sum(rows) AS rows,
+SELECT source, behaviour_policy, CAST(sum(rows) AS BIGINT) AS rows,
        sum(rows) / sum(sum(rows)) OVER (PARTITION BY source) AS share
 FROM policies
 GROUP BY source, behaviour_policy
 ORDER BY source DESC, rows DESC;
+
+-- name: practice
+-- The missions that the twin gave: the shares of each arm at first, at last and of all missions that ended.
+SELECT any_value(rule) AS rule, arm, any_value(natural_share) AS natural_share,
+       first(wanted_share ORDER BY env_steps) AS first_share,
+       last(wanted_share ORDER BY env_steps) AS last_share,
+       sum(episodes) / nullif(sum(sum(episodes)) OVER (), 0) AS given_share,
+       CAST(sum(episodes) AS BIGINT) AS episodes,
+       sum(episodes * success) / nullif(sum(episodes), 0) AS success
+FROM (SELECT *, row_number() OVER () AS place FROM practice)
+GROUP BY arm
+ORDER BY min(place);
 
 -- name: learning
 -- Success per condition at each periodic greedy evaluation on fixed episodes.
@@ -94,9 +122,9 @@ ORDER BY gradient_steps, condition;
 
 -- name: lag
 -- How far the target network is behind.
-SELECT gradient_steps, target_q_lag
+SELECT gradient_steps, target_q_lag, 'relative value lag' AS what
 FROM progress
-WHERE gradient_steps > 0
+WHERE gradient_steps > 0 AND target_q_lag IS NOT NULL
 ORDER BY gradient_steps;
 
 -- name: loss
@@ -105,22 +133,9 @@ FROM progress
 WHERE updates > 0
 ORDER BY gradient_steps;
 
--- name: trained
--- What training took in all, with the steps in which no update was made.
-SELECT max(env_steps) AS env_steps, max(gradient_steps) AS gradient_steps, max(wall_s) AS wall_s,
-       coalesce(bool_or(phase <> 'offline' AND updates > 0), false) AS updated_online
+-- name: clocks
+SELECT max(env_steps) AS env_steps, max(gradient_steps) AS gradient_steps, max(wall_s) AS wall_s
 FROM progress;
-
--- name: cells
--- `restock eval`: success per policy, perturbation and condition, blocks apart.
-SELECT policy, perturbation,
-       CASE WHEN block IN ('partial', 'full') THEN condition || ' (' || block || ')' ELSE condition END AS cell,
-       list({'success': success, 'bumps': bumps, 'time_s': time_s, 'return': "return",
-             'discounted_return': discounted_return, 'distance_m': distance_m,
-             'closest_person_m': closest_person_m, 'time_lost_s': time_lost_s}) AS driven
-FROM evaluated
-GROUP BY ALL
-ORDER BY policy, perturbation, cell;
 
 -- name: failures
 -- Where the agent's episodes ended that did not reach the goal.

@@ -27,11 +27,6 @@ WHERE primary_condition <> 'nominal' AND list_contains($recordings, recording_id
 ORDER BY hash(transition_id)
 LIMIT $most;
 
--- name: recordings
-SELECT source_file, format, duration_s, episodes, transitions, recording_id, profile, profile_hash
-FROM recordings
-ORDER BY source_file;
-
 -- name: logged
 -- The conditions that logged episodes met: the nearest thing to deployment that there is. An
 -- episode that met several counts for each; one that met none is nominal.

@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from restock.errors import RestockError, counted
+from restock.errors import counted
 from restock.report.look import charts
-from restock.report.look.blocks import (
-    Drawing,
-    Figure,
-    Rows,
-    Section,
-    Table,
-    number,
-    words,
-)
+from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, words
 from restock.report.run.facts import Facts
 from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import AFTER, BEFORE
@@ -27,21 +18,12 @@ from restock.train.twin.calibration.twin_gap import (
     UNKNOWN,
     UNTRUSTED,
     TwinGap,
-    gap_folder,
-    read_gap,
 )
 
 COLOURS = {
     "nominal twin": "#b45309",
     "calibrated twin": "#0f766e",
     "odometry": "#64748b",
-    "persistence": "#94a3b8",
-}
-_MEANING = {
-    TRUSTED: "shown to be within the limits",
-    UNTRUSTED: "shown to be beyond a limit",
-    UNDECIDED: "the interval contains a limit: more logs would decide",
-    UNKNOWN: "too few segments or episodes",
 }
 
 
@@ -50,21 +32,9 @@ def source_name(source: str) -> str:
     return f"{source} twin" if source in (BEFORE, AFTER) else source
 
 
-def find_gap(facts: Facts) -> TwinGap | None:
-    """Find the gap of a run: RUN/gap, or the gap folder of its panel's store."""
-    places = [facts.run]
-    if facts.panel is not None and "://" not in str(facts.panel.header.store):
-        places.append(Path(facts.panel.header.store))
-    try:
-        return None if (folder := gap_folder(places)) is None else read_gap(folder)
-    except RestockError as error:
-        facts.missing.append(f"Not shown, since it could not be read: {error}")
-        return None
-
-
 def run_section(facts: Facts) -> Section | None:
     """Return the section of a run's report; None if no gap was measured."""
-    gap = find_gap(facts)
+    gap = facts.gap
     if gap is None:
         return None
     section, version = gap_section(gap), gap.about["store_version"]
@@ -87,17 +57,7 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         "lead": f"{counted(about['rows'], 'logged step')} of"
         f" {counted(about['episodes'], 'episode')}, driven again in the twin. Verdicts are on"
         f" the {source_name(about['judged'])}.",
-        "cards": [
-            {
-                "value": f"{sum(v.verdict == kind for v in gap.verdicts)} {kind}",
-                "label": f"of {counted(len(gap.verdicts), 'condition')}: {meaning}",
-            }
-            for kind, meaning in _MEANING.items()
-        ],
-        "sections": [
-            replace(gap_section(gap), callout=""),  # the headline says it
-            _steps_section(gap),
-        ],
+        "sections": [replace(gap_section(gap), callout="")],  # the headline says it
         "source": f"{about['store']}, version {about['store_version']}",
     }
 
@@ -150,7 +110,8 @@ def gap_section(gap: TwinGap) -> Section:
         f"condition is trusted if nine in ten segments of {limits['horizon_s']:g} s end within "
         f"{limits['position_m']:g} m of the log, and the error of the one-step reward is less than "
         f"{limits['reward_ratio']:g} times its standard deviation in the log (its spread), both "
-        "with 95 % confidence over episodes.",
+        "with 95 % confidence over episodes. Undecided: the interval contains a limit, and more "
+        "logs would decide. rewards.parquet has each term of the reward.",
         callout=headline(gap) + "." if gap.untrusted else "",
         figures=[
             Figure(
@@ -181,39 +142,6 @@ def _positions(rows: Rows) -> Drawing:
         title="metres",
         tick="p90",
         beside="horizon",
-    )
-
-
-def _steps_section(gap: TwinGap) -> Section:
-    """Show the gap of the reward of one step, by term."""
-    last = list(gap.about["twins"])[-1]
-    gaps: dict[tuple[str, str], dict[str, str]] = {}  # by source
-    for row in gap.rewards:
-        of_term = gaps.setdefault((row["condition"], row["term"]), {})
-        of_term[source_name(row["source"])] = number(row["mean_gap"])
-    moves = {(row["condition"], row["term"]) for row in gap.rewards if row["mean_gap"]}
-    rewards = [
-        {
-            "condition": words(row["condition"]),
-            "term": words(row["term"]),
-            "logged mean": number(row["logged_mean"]),
-            "logged spread": number(row["logged_spread"]),
-            **gaps[row["condition"], row["term"]],
-        }
-        for row in gap.rewards
-        if row["source"] == last
-        and (row["term"] == "reward" or (row["condition"], row["term"]) in moves)
-    ]
-    return Section(
-        "one-step",
-        "Reward of one step from each logged state",
-        intro="The twin starts from the logged state and drives the logged action for one control "
-        "period; the task's own functions compute the reward. Mean absolute differences;"
-        " persistence is the error of predicting that nothing changes. observations.parquet has"
-        " the same of each component of the observation.",
-        tables=[
-            Table(rewards, caption="Terms that are the same on both sides everywhere are left out.")
-        ],
     )
 
 
