@@ -321,7 +321,7 @@ class McapFile(Storage):
     # -- reading ---------------------------------------------------------------------------
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield loose messages first, then groups of chunks of about 8 MiB.
+        """Yield loose messages first, then groups of chunks of up to about 8 MiB.
 
         A batch is valid until the next one is read: its buffer is used again.
         """
@@ -355,17 +355,21 @@ class McapFile(Storage):
                 yield channel, buffer, mcap_records.messages_at(buffer, at - start)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
-        """Yield the chunks that hold these channels; the first alone, as some need one message."""
+        """Yield the chunks that hold these channels, in groups that grow to about 8 MiB.
+
+        The first chunk is alone, as some readers need no more than a few messages.
+        """
         group: list[Chunk] = []
-        size = GROUP_BYTES
+        size = most = 0
         for chunk in self._contents.chunks:
             known = self._chunks.walked.get(chunk.at, chunk.index)
             if known and not known.keys() & wanted:
                 continue
             group.append(chunk)
             size += chunk.size
-            if size >= GROUP_BYTES:
+            if size >= most:
                 yield group
+                most = min(2 * size, GROUP_BYTES)
                 group, size = [], 0
         if group:
             yield group

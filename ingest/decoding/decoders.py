@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -46,7 +46,7 @@ from restock.ingest.decoding.columns import (
     offsets_of,
     take,
 )
-from restock.ingest.decoding.definitions import TIMES, RosType, message_type
+from restock.ingest.decoding.definitions import KEPT, TIMES, RosType, message_type
 from restock.ingest.decoding.row_by_row import (
     Decoded,
     Decoder,
@@ -381,13 +381,16 @@ class _Compiler:
             plan.paths[wanted] = (kind, dims)
 
 
-def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> CdrPlan:
+@lru_cache(KEPT)
+def compile_plan(message: RosType, wanted: frozenset[str], *, ros1: bool = False) -> CdrPlan:
     """Compile the plan that reads these leaf paths of a message type (as `Leaf.path` gives them).
+
+    It holds nothing of the messages that it reads, so many recordings share one.
 
     Raises:
         CannotDecode: the type uses something unsupported.
     """
-    return _Compiler(message, frozenset(wanted), ros1).plan(message.name, "")
+    return _Compiler(message, wanted, ros1).plan(message.name, "")
 
 
 HEADER = 4  # bytes of the encapsulation header
@@ -413,7 +416,7 @@ class ColumnDecoder:
         self._ros1 = ros1
         # `name[]` is asked for and `name` compiled: brackets at the end add nothing.
         self._paths = {leaf.path: leaf.path.removesuffix("[]") for leaf in leaves}
-        self._plan = compile_plan(message, self._paths.values(), ros1=ros1)
+        self._plan = compile_plan(message, frozenset(self._paths.values()), ros1=ros1)
 
     def empty(self) -> Columns:
         """Return columns without a row."""

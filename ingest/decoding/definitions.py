@@ -170,7 +170,7 @@ EMPTY = "structure_needs_at_least_one_member"  # ROS's placeholder in a message 
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # one object a definition: plans are kept by it
 class RosType(MessageType):
     """A ROS message type with everything it is made of."""
 

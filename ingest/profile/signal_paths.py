@@ -446,9 +446,12 @@ def said_in(columns: Mapping[str, FieldColumn], path: str) -> F64:
     return values
 
 
+_SEPARATORS = re.compile(r"[/.:]")
+
+
 def last_part(kind: str) -> str:
     """Return a message type without package and namespace: "Twist" of `ros.geometry_msgs.Twist`."""
-    return re.split(r"[/.:]", kind)[-1]
+    return _SEPARATORS.split(kind)[-1]
 
 
 AXES = ("translation.x", "translation.y", "translation.z")
