@@ -38,17 +38,6 @@ def test_a_hold_takes_the_latest_sample_at_or_before_the_tick(samples, ticks, ma
             assert held.fresh[index] == in_time
 
 
-@given(stamps, stamps, st.integers(1, 5000))
-def test_later_samples_change_no_earlier_tick(samples, ticks, later_by):
-    tick_ns = np.array(ticks, np.int64)
-    end = max([*ticks, *samples, 0])
-    more = [*samples, end + later_by]
-    now = Samples(np.array(samples, np.int64), np.arange(len(samples))).hold(tick_ns, 1e-6)
-    then = Samples(np.array(more, np.int64), np.arange(len(more))).hold(tick_ns, 1e-6)
-    assert np.array_equal(now.row * now.known, then.row * then.known)
-    assert np.array_equal(now.fresh, then.fresh)
-
-
 def test_topics_without_a_header_are_put_on_the_header_clock():
     sim_offset = 1_701_217_691_789_000_000
     time = np.arange(0, 5, 0.1)
@@ -128,21 +117,6 @@ def test_ticks_at_commands_keep_their_distance():
     assert between == 2
 
 
-@given(st.integers(-(10**12), 10**12))
-def test_the_offset_between_clocks_does_not_matter(offset_ns):
-    """Sim time or wall time: the same ticks see the same messages."""
-    base = columns(np.arange(0, 3, 0.1), {})
-    command = columns(np.arange(0, 3, 0.2), {}, stamped=False)
-    shifted = {
-        name: TopicColumns(topic.log_time_ns + offset_ns, topic.publish_time_ns, topic.fields)
-        for name, topic in {"/odom": base, "/cmd": command}.items()
-    }
-    segments, _ = align(shifted, Clock())
-    expected, _ = align({"/odom": base, "/cmd": command}, Clock())
-    for name in shifted:
-        assert np.array_equal(segments[0].topics[name].stamp_ns, expected[0].topics[name].stamp_ns)
-
-
 # -- log times that do not go on ------------------------------------------------------------------
 
 
@@ -178,26 +152,15 @@ def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
     assert out.exists()
 
 
-def never_stamped(drive: Drive, *names: str) -> dict[str, Any]:
-    """Return a drive's typed topics, some of a driver that leaves header stamps at zero."""
-    found = dict(typed_topics(drive))
-    for name in names:
-        kind, topic = found[name]
-        fields = {**topic.fields, STAMP: np.zeros(len(topic), np.int64)}
-        found[name] = kind, TopicColumns(topic.log_time_ns, topic.publish_time_ns, fields)
-    return found
-
-
-@pytest.mark.parametrize("names", [("/imu",), ("/odom", "/imu")])
-def test_stamps_that_a_driver_left_at_zero_are_named(names, tmp_path, capsys):
-    bag = write_topics(never_stamped(Drive(4.0), *names), tmp_path / "bag")
+def test_stamps_that_a_driver_left_at_zero_are_named(tmp_path, capsys):
+    topics = typed_topics(Drive(4.0))
+    for name in ("/odom", "/imu"):
+        topics[name][1].fields[STAMP][:] = 0
+    bag = write_topics(topics, tmp_path / "bag")
     assert main(["ingest", str(bag), "--dry-run"]) == 2
     said = capsys.readouterr().err
-    for name in names:
-        assert (
-            f"200 of 200 messages of {name} were left out: their header stamps do not fit the "
-            "clock, 200 are zero"
-        ) in said
+    for name in ("/odom", "/imu"):
+        assert f"200 of 200 messages of {name} were left out: their header stamps do not" in said
     assert 'set [clock] alignment = "log_time" in the profile' in said
     assert main(["profile", "check", "warehouse_amr", str(bag)]) == 2
     assert "200 of 200 messages of /imu were left out" in capsys.readouterr().err

@@ -1,6 +1,5 @@
 """Bumpers of common types, with several fields, bits or detections: pressed if any of them is."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,15 +8,12 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 from support import driven_robot
 from support.driven_robot import Drive, columns, ragged, typed_topics, write_topics
+from support.ingested import proposed, steps_in
 from support.profile_texts import WAREHOUSE
 
-from restock.cli import main
-from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.live.observer import LiveObserver, _columns
-from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.signal_paths import pressed_in
-from restock.ingest.steps.episodes import steps_of
-from restock.ingest.steps.needs import read_topics
 
 SECONDS = 6.0
 PRESSED = (2.0, 2.5)  # from, to before
@@ -71,14 +67,11 @@ def test_a_bumper_of_a_known_type_is_proposed_and_read(kind, tmp_path, capsys):
     topics = typed_topics(Drive(SECONDS))
     del topics["/bumper"]
     bag = write_topics(topics | {"/touch": bumper(kind)}, tmp_path / "bag", storage="mcap")
-    out = tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(out)]) == 0
-    profile = load_profile(out)
+    profile = proposed(bag, tmp_path / "p.toml")
     assert profile.inputs.bumper is not None
     assert profile.inputs.bumper.topic == "/touch"
     assert profile.task.bump_terminates
-    with open_recording(bag) as recording:
-        steps = steps_of(profile, read_topics(recording, profile))
+    steps = steps_in(bag, profile)
     time_s = (steps.signals["stamp_ns"] - driven_robot.START_NS) * 1e-9
     due = (time_s >= PRESSED[0] + 0.01) & (time_s < PRESSED[1] + 0.01)
     apart = np.flatnonzero(steps.signals["bumped"] != due)
@@ -88,7 +81,7 @@ def test_a_bumper_of_a_known_type_is_proposed_and_read(kind, tmp_path, capsys):
     assert "inputs.bumper" not in capsys.readouterr().err
 
 
-def test_a_running_robot_reads_the_same(tmp_path: Path) -> None:
+def test_a_running_robot_reads_the_same() -> None:
     topic, pressed = "/hazard_detection", "detections[type=1].type"
     text = WAREHOUSE.replace('topic = "/bumper"', f'topic = "{topic}"')
     text = text.replace('pressed = "data"', f'pressed = "{pressed}"')

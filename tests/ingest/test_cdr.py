@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.bag_samples import STORE
 from support.rosbags_columns import RowDecoder
 
-from restock.ingest.decoding.columns import CannotDecode, Channel, Leaf, MessageBatch, equal
+from restock.ingest.decoding.columns import CannotDecode, Channel, MessageBatch, equal
 from restock.ingest.decoding.decoders import ColumnDecoder
 from restock.ingest.decoding.definitions import RosType, message_type
 
@@ -173,10 +173,6 @@ def test_both_byte_orders_in_one_batch():
 def one(kind: str, definition: str = "") -> RosType:
     form = "ros2msg" if definition else ""
     return message_type(Channel(1, "/t", kind, "cdr", form, definition.encode()), "humble")
-
-
-def leaf(message: RosType, path: str) -> Leaf:
-    return message.leaf(path)
 
 
 def test_xcdr2_and_parameter_lists_are_refused_by_name():

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.driven_robot import Drive, seen_alike, write_bag
+from support.ingested import ingested, steps_in
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -20,9 +22,7 @@ from restock.ingest.decoding.columns import Ragged, offsets_of
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.clouds import BEAM_RAD, cloud_reduction
-from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
-from restock.replay.store.store import Store
 from restock.replay.trace.moment import seen_of
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -127,30 +127,22 @@ def test_every_layout_of_the_same_points_is_the_same_scan():
 def test_bearings_and_a_lidar_upside_down():
     wall = np.array([[2.0, 1.0, 0.5], [2.0, -1.0, 0.5], [-3.0, 0.0, 0.5]])
     ahead = {"angle_rad": (-np.pi / 2, np.pi / 2)}
-    (seen,) = scans([packed(wall)], type(SOURCE)(**fields_of(SOURCE) | ahead))["ranges"]
+    (seen,) = scans([packed(wall)], structs.replace(SOURCE, **ahead))["ranges"]
     assert seen.shape == (360,)
     assert np.isfinite(seen).sum() == 2
     turned = {"upside_down": True, "height_m": (-0.6, -0.4)}
-    (seen,) = scans([packed(wall)], type(SOURCE)(**fields_of(SOURCE) | turned))["ranges"]
+    (seen,) = scans([packed(wall)], structs.replace(SOURCE, **turned))["ranges"]
     assert np.isfinite(seen).sum() == 3
 
 
-def fields_of(source: Any) -> dict[str, Any]:
-    return {name: getattr(source, name) for name in source.__struct_fields__}
-
-
-def cut(cloud: dict[str, Any]) -> dict[str, Any]:
-    return cloud | {"data": cloud["data"][:-5]}
-
-
-NOTHING = np.full((4, 3), np.nan)
+WHOLE, NOTHING = packed(around()), np.full((4, 3), np.nan)
 UNREAD = "cut short, or has no x, y, z as floats"
 UNSEEN = "no beam has a valid range"
 UNUSABLE = {
-    "cut short": (cut(packed(around())), UNREAD),
+    "cut short": (WHOLE | {"data": WHOLE["data"][:-5]}, UNREAD),
     "without z": (packed(around(), PLAIN[:2]), UNREAD),
     "of whole numbers": (packed(np.ones((64, 3)), [(axis, "i2") for axis in "xyz"]), UNREAD),
-    "beyond a point": (packed(around()) | {"point_step": 8}, UNREAD),
+    "beyond a point": (WHOLE | {"point_step": 8}, UNREAD),
     "with rows that overlap": (packed(around(), rows=16) | {"row_step": 0}, UNREAD),
     "empty": (packed(np.zeros((0, 3))), UNSEEN),
     "of NaN": (packed(NOTHING), UNSEEN),
@@ -196,15 +188,10 @@ def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str =
     return bag
 
 
-def read(bag: Path, text: str = PROFILE) -> Steps:
-    profile = parse_profile(text, where="cloud.toml")
-    with open_recording(bag) as recording:
-        return steps_of(profile, read_topics(recording, profile))
-
-
 def test_a_drive_with_clouds_has_the_clearance_of_its_scans(tmp_path):
     bag = with_clouds(tmp_path / "clouds")
-    by_cloud, by_scan = read(bag), read(tmp_path / "clouds" / "drive", WAREHOUSE)
+    by_cloud = steps_in(bag, PROFILE)
+    by_scan = steps_in(tmp_path / "clouds" / "drive", WAREHOUSE)
     assert by_cloud.problem == by_scan.problem
     for name in ("sector_clearance_m", "clearance_ahead_m", "plan_return_m"):
         np.testing.assert_allclose(by_cloud.signals[name], by_scan.signals[name], atol=0.02)
@@ -219,21 +206,21 @@ def test_a_drive_with_clouds_has_the_clearance_of_its_scans(tmp_path):
 
 
 @pytest.mark.parametrize("kind", UNUSABLE)
-def test_a_cloud_that_cannot_be_used_drops_its_steps_with_the_reason(kind, tmp_path):
+def test_an_unusable_cloud_drops_its_steps_with_the_reason(kind, tmp_path):
     spoilt, reason = UNUSABLE[kind]
-    problems = read(with_clouds(tmp_path / "clouds", spoilt)).problem
+    problems = steps_in(with_clouds(tmp_path / "clouds", spoilt), PROFILE).problem
     assert set(problems) == {"", f"scan: {reason}"}
 
 
 def test_a_cloud_in_a_fixed_frame_is_refused(tmp_path):
     bag = with_clouds(tmp_path / "clouds", frame="robot1/odom")
     with pytest.raises(RecordingError, match="its points in the frame robot1/odom"):
-        read(bag)
+        steps_in(bag, PROFILE)
 
 
 def test_a_running_robot_sees_by_clouds_what_ingest_stores(tmp_path):
     bag = with_clouds(tmp_path / "clouds", UNUSABLE["cut short"][0])
-    alike = seen_alike(bag, parse_profile(PROFILE, where="cloud.toml"), read(bag))
+    alike = seen_alike(bag, parse_profile(PROFILE, where="p"), steps_in(bag, PROFILE))
     assert min(alike[""], alike[f"scan: {UNREAD}"]) > 5
 
 
@@ -259,10 +246,6 @@ def test_a_proposal_says_how_to_read_a_cloud(tmp_path, capsys):
     table = re.search(r"(?m)^# \[inputs\.scan\].*(\n# .*)+", text)[0]
     own = table[2:].replace("\n# ", "\n").replace("[LOW, HIGH]", "[-0.2, 0.6]")
     profile.write_text(text.replace(table, own))
-    assert (
-        main(["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "s")]) == 0
-    )
-    with Store(tmp_path / "s") as store:
-        assert store.sql(
-            "SELECT count(*) > 10, count(clearance_m) = count(*) FROM transitions"
-        ).fetchall() == [(True, True)]
+    with ingested(bag, profile, tmp_path / "s") as store:
+        query = "SELECT count(*) > 10, count(clearance_m) = count(*) FROM transitions"
+        assert store.sql(query).fetchall() == [(True, True)]

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from support.driven_robot import START_NS, Drive, columns, without, write_topics
+from support.ingested import ingested, proposed
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.replay.store.store import Store
 
 TWIST = "geometry_msgs/msg/Twist"
 NAV, TELEOP, OUT, JOY = "/cmd_vel_nav", "/teleop_cmd_vel", "/cmd_vel", "/joy"
@@ -83,8 +83,7 @@ def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
 def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return a proposal without its sources of commands."""
     folder = tmp_path_factory.mktemp("plain")
-    bag, file = write_topics(taken_over(), folder / "bag"), folder / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    proposed(write_topics(taken_over(), folder / "bag"), file := folder / "p.toml")
     kept, skip = [], False
     for line in file.read_text().splitlines():
         skip = line.startswith("[command_sources") or (skip and not line.startswith("["))
@@ -100,15 +99,13 @@ def profile_of(plain: str, folder: Path, sources: str) -> Path:
 
 def policies(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
     """Seconds from the start and who drove, of each row."""
-    assert main(["ingest", str(bag), "--profile", str(profile), "--store", str(store)]) == 0
-    with Store(store) as opened:
+    with ingested(bag, profile, store) as opened:
         rows = opened.sql("SELECT stamp_ns, behaviour_policy FROM transitions ORDER BY 1")
         return [((stamp - START_NS) * 1e-9, policy) for stamp, policy in rows.fetchall()]
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_the_source_whose_command_is_in_force_is_who_drove(plain, storage, tmp_path, capsys):
-    bag = write_topics(taken_over(), tmp_path / "bag", storage=storage)
+def test_the_source_whose_command_is_in_force_is_who_drove(plain, tmp_path, capsys):
+    bag = write_topics(taken_over(), tmp_path / "bag")
     rows = policies(bag, profile_of(plain, tmp_path, SOURCES), tmp_path / "s")
     assert len(rows) > 50
     by_hand = [s for s, policy in rows if policy == "teleop"]
@@ -119,7 +116,7 @@ def test_the_source_whose_command_is_in_force_is_who_drove(plain, storage, tmp_p
     assert "whose command it equals: navigation, teleop" in capsys.readouterr().out
 
 
-def test_a_button_says_it_where_no_source_has_the_command(plain, tmp_path, capsys):
+def test_a_button_says_it_where_no_source_has_the_command(plain, tmp_path):
     topics = taken_over()
     del topics[TELEOP], topics[NAV]
     bag = write_topics(topics, tmp_path / "bag")
@@ -142,11 +139,9 @@ def test_no_later_command_says_who_drives_now(plain, tmp_path):
     assert {p for s, p in other if s > 5.2} == {"unknown"}
 
 
-def test_a_recording_without_sources_has_unknown_drivers(plain, tmp_path, capsys):
-    topics = taken_over()
-    profile = profile_of(plain, tmp_path, SOURCES)
-    with_sources, without = load_profile(profile), parse_profile(plain, where="p")
-    assert with_sources.hash != without.hash
+def test_a_recording_without_sources_has_unknown_drivers(plain, tmp_path):
+    topics, profile = taken_over(), profile_of(plain, tmp_path, SOURCES)
+    assert load_profile(profile).hash != parse_profile(plain, where="p").hash
     del topics[NAV], topics[TELEOP], topics[JOY]
     lone = write_topics(topics, tmp_path / "lone")
     assert {policy for _, policy in policies(lone, profile, tmp_path / "s")} == {"unknown"}
@@ -227,15 +222,13 @@ def test_a_button_that_is_not_there_is_named_with_its_key(plain, tmp_path, capsy
     assert "`command_sources.teleop.fields`: /joy: no field 'button'" in capsys.readouterr().err
 
 
-def test_a_proposal_finds_the_multiplexer_by_its_commands(tmp_path, capsys):
+def test_a_proposal_finds_the_multiplexer_by_its_commands(tmp_path):
     """Whatever the topics' names: the output is what follows, who drives what it follows."""
     topics = taken_over()
     topics["/cmd_vel_out_of_planner"] = topics.pop(NAV)
     topics["/wheels/command"] = topics.pop(OUT)
     bag = write_topics(topics, tmp_path / "bag")
-    file = tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    profile = load_profile(file)
+    profile = proposed(bag, file := tmp_path / "p.toml")
     assert profile.inputs.command.topic == "/wheels/command"
     sources = {name: one.topic for name, one in profile.command_sources.items()}
     assert sources == {"navigation": "/cmd_vel_out_of_planner", "teleop": TELEOP}
@@ -244,10 +237,9 @@ def test_a_proposal_finds_the_multiplexer_by_its_commands(tmp_path, capsys):
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
-def test_a_command_that_is_only_a_persons_is_teleop(tmp_path, capsys):
+def test_a_command_that_is_only_a_persons_is_teleop(tmp_path):
     topics = {n: t for n, t in taken_over().items() if n not in (NAV, TELEOP, JOY)}
     topics["/teleop/cmd_vel"] = topics.pop(OUT)
-    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    assert load_profile(file).behaviour_policy == "teleop"
+    bag = write_topics(topics, tmp_path / "bag")
+    assert proposed(bag, file := tmp_path / "p.toml").behaviour_policy == "teleop"
     assert 'behaviour_policy = "teleop"  # by the name of /teleop/cmd_vel' in file.read_text()

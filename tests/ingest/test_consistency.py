@@ -8,17 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 from support.driven_robot import BEAMS, FREE_M, START_NS, columns, scans, without, write_topics
+from support.ingested import ingested, proposed, steps_in
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.gather import Given
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.consistency import Finding
-from restock.ingest.steps.episodes import steps_of
-from restock.ingest.steps.needs import read_topics
-from restock.replay.store.store import Store
 
 NS = 10**9
 DURATION_S = 45.0
@@ -133,8 +131,7 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
 
 def found_in(topics: Topics, profile: Profile, folder: Path) -> tuple[list[Finding], Any]:
     """Return the findings, and each step's stamp, pose and command."""
-    with open_recording(written(topics, folder / "bag")) as recording:
-        steps = steps_of(profile, read_topics(recording, profile))
+    steps = steps_in(written(topics, folder / "bag"), profile)
     names = ("stamp_ns", "pose_x_m", "pose_y_m", "command_speed_mps", "command_yaw_rate_radps")
     return steps.findings, {name: steps.signals[name] for name in names}
 
@@ -196,7 +193,7 @@ def test_a_recorders_clock_that_is_set_back_begins_a_segment(profile, tmp_path, 
     )
     with open_recording(bag) as recording:
         proposed = propose_profile(recording, "r", Given(hindsight_goals=True))
-        steps = steps_of(profile, read_topics(recording, profile))
+    steps = steps_in(bag, profile)
     assert parse_profile(proposed.toml, where="t").task.control_period_s == 0.1
     (found,) = steps.findings
     assert (found.kind, found.topic, found.repaired) == ("clock", "all topics", True)
@@ -210,8 +207,7 @@ def test_a_topic_that_alone_lies_out_of_order_is_no_set_back(profile, tmp_path):
     late = without(topics["/imu"], topics["/imu"].log_time_ns < middle)
     rest = without(topics["/imu"], topics["/imu"].log_time_ns >= middle)
     typed = {name: (TYPES[name], one) for name, one in (topics | {"/imu": rest}).items()}
-    with open_recording(write_topics(typed, tmp_path / "bag", {"/imu": late})) as recording:
-        steps = steps_of(profile, read_topics(recording, profile))
+    steps = steps_in(write_topics(typed, tmp_path / "bag", {"/imu": late}), profile)
     assert steps.findings == []
     assert steps.segment.max() == 0
 
@@ -256,7 +252,7 @@ def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
         for name, one in (("clean", winding()), ("wrong", two_publishers(winding())))
     )
     file, store = tmp_path / "p.toml", tmp_path / "store"
-    assert main(["profile", "new", str(clean), "--out", str(file), "--hindsight-goals"]) == 0
+    proposed(clean, file, "--hindsight-goals")
     capsys.readouterr()
     assert main(["profile", "check", str(file), str(wrong)]) == 3
     assert "contradicts itself: /odom: its poses step at" in capsys.readouterr().out
@@ -275,18 +271,15 @@ def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
 
 def test_profile_new_does_not_use_wheels_that_are_none(tmp_path):
     bag = written(scaled(winding(), "/odom", 0, SPEED, RATE), tmp_path / "bag")
-    file, store = tmp_path / "p.toml", tmp_path / "store"
-    assert main(["profile", "new", str(bag), "--out", str(file), "--hindsight-goals"]) == 0
-    made = load_profile(file)
+    made = proposed(bag, file := tmp_path / "p.toml", "--hindsight-goals")
     assert (made.inputs.wheels, made.motion is None) == (None, False)
-    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
-    with Store(store) as opened:
+    with ingested(bag, file, tmp_path / "store") as opened:
         ((mean,),) = opened.sql("SELECT avg(wheel_speed_mps) FROM transitions").fetchall()
     assert mean == pytest.approx(motion(np.arange(0, DURATION_S, 0.1))[0].mean(), abs=0.02)
 
 
 def test_profile_new_names_two_publishers(tmp_path):
     wrong, file = written(two_publishers(winding()), tmp_path / "wrong"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(wrong), "--out", str(file), "--hindsight-goals"]) == 3
+    proposed(wrong, file, "--hindsight-goals", codes=(3,))
     assert "localiser_m" not in file.read_text()
     assert "# CONTRADICTS ITSELF: /odom: its poses step" in file.read_text()

@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 from support.driven_robot import BEAMS, Drive, columns, ragged, scans, typed_topics, write_topics
+from support.ingested import steps_in
 from support.profile_texts import WAREHOUSE
 
-from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.signal_paths import conventions_of
-from restock.ingest.steps.episodes import Steps, steps_of
-from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.episodes import Steps
 
 SECONDS, TURN_RADPS = 6.0, 0.4
 Topics = dict[str, tuple[str, TopicColumns]]
@@ -50,14 +49,12 @@ def drive(**unknown: Any) -> Topics:
     return topics
 
 
-def steps_in(topics: Topics, folder: Path, profile: Profile | str = "warehouse_amr") -> Steps:
-    profile = load_profile(profile) if isinstance(profile, str) else profile
-    with open_recording(write_topics(topics, folder / "bag", storage="mcap")) as recording:
-        return steps_of(profile, read_topics(recording, profile))
+def steps_of(topics: Topics, folder: Path, profile: str = WAREHOUSE) -> Steps:
+    return steps_in(write_topics(topics, folder / "bag", storage="mcap"), profile)
 
 
 def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
-    steps = steps_in(drive(angular_velocity=slice(None)), tmp_path)
+    steps = steps_of(drive(angular_velocity=slice(None)), tmp_path)
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(TURN_RADPS)
     assert steps.signals["accel_x_mps2"] == pytest.approx(0.3)
     reported = (
@@ -74,7 +71,7 @@ def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
 def test_only_what_is_unknown_is_left_out(tmp_path: Path) -> None:
     """The gyroscope fails half way; there is no accelerometer."""
     half = slice(150, None)
-    steps = steps_in(drive(angular_velocity=half, linear_acceleration=slice(None)), tmp_path)
+    steps = steps_of(drive(angular_velocity=half, linear_acceleration=slice(None)), tmp_path)
     gyro = steps.signals["gyro_yaw_rate_radps"]
     measured = np.arange(len(gyro)) < len(gyro) // 2 + 1
     assert gyro[measured][:-1] == pytest.approx(0.1)
@@ -84,7 +81,7 @@ def test_only_what_is_unknown_is_left_out(tmp_path: Path) -> None:
 
 
 def test_a_known_covariance_changes_nothing(tmp_path: Path) -> None:
-    steps = steps_in(drive(angular_velocity=slice(0)), tmp_path)
+    steps = steps_of(drive(angular_velocity=slice(0)), tmp_path)
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(0.1)
     assert not [note for note in steps.notes if "estimate" in note]
 
@@ -95,7 +92,7 @@ def test_odometry_without_speeds_makes_no_rows(tmp_path: Path) -> None:
     unknown = np.zeros((len(topics["/odom"][1]), 36))
     unknown[:, 0] = -1
     fields["twist.covariance"] = unknown
-    steps = steps_in(topics, tmp_path)
+    steps = steps_of(topics, tmp_path)
     assert set(steps.problem) == {"wheels: no estimate"}
 
 
@@ -127,7 +124,7 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
         f'path = "{path}"\nunit = "1"\nmax_age_s = 0.5\n{more}\n'
         for name, (topic, kind, path, more) in wanted.items()
     )
-    steps = steps_in(topics, tmp_path, parse_profile(text, where="p"))
+    steps = steps_of(topics, tmp_path, text)
     found = {name: steps.custom.table[name].to_pylist() for name in wanted}
     assert set(found["gyro"]) == {None}
     assert found["share"][:15] == pytest.approx([0.8] * 15, abs=1e-6)
@@ -153,7 +150,7 @@ def test_a_scan_of_a_wall_that_is_too_close_is_near(tmp_path: Path) -> None:
         ranges[50] = -np.inf if name == "reported" else 0.0  # covered: it knows of nothing
         topics = drive()
         topics["/scan"] = ("sensor_msgs/msg/LaserScan", columns(tenth, scans(ranges)))
-        found.append(steps_in(topics, tmp_path / name))
+        found.append(steps_of(topics, tmp_path / name))
     measured, reported = found
     usable = np.array(measured.problem) == ""
     assert reported.problem == measured.problem
