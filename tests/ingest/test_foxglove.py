@@ -20,34 +20,27 @@ from support.foxglove_robot import (
     pose,
     write_robot,
 )
+from support.ingested import steps_in
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.drives import robot_traits
-from restock.ingest.steps.episodes import Steps, steps_of
-from restock.ingest.steps.needs import read_topics
 
 
-def proposed(path: Path, capsys: Any, code: int = 0) -> tuple[str, list[str]]:
-    """Return the proposal's TOML, and what it is told to lack."""
-    assert main(["profile", "new", str(path), "--json"]) == code
+def proposed(path: Path, capsys: Any) -> str:
+    """Return the proposal's TOML, which is usable."""
+    assert main(["profile", "new", str(path), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    return said["toml"], said["problems"]
-
-
-def read(path: Path, toml: str) -> tuple[Profile, Steps]:
-    profile = parse_profile(toml, where="p")
-    with open_recording(path) as recording:
-        return profile, steps_of(profile, read_topics(recording, profile))
+    assert said["problems"] == []
+    return str(said["toml"])
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
 def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, capsys, encoding):
     path = write_robot(tmp_path / "run.mcap", encoding, drive())
-    toml, problems = proposed(path, capsys)
-    assert problems == []
-    profile, steps = read(path, toml)
+    profile = parse_profile(proposed(path, capsys), where="p")
+    steps = steps_in(path, profile)
     assert {name: source.topic for name, source in profile.inputs.items()} == {
         "command": "/cmd_vel",
         "pose": "/pose",
@@ -77,8 +70,7 @@ def test_a_lidar_is_where_the_pose_in_its_scans_says(tmp_path, capsys):
     for _, topic, _, values in messages:
         if "scan" in topic:
             values["pose"] = pose(0.4, 0.0, np.pi)
-    toml, problems = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
-    assert problems == []
+    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
     body = parse_profile(toml, where="p").task.body
     assert body.lidar_x_m == pytest.approx(0.4)
     assert abs(body.lidar_yaw_rad) == pytest.approx(np.pi, abs=1e-3)
@@ -91,12 +83,10 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, capsys):
     for time_s in np.arange(0, 20, 0.2).tolist():
         messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
     path = write_robot(tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda one: one[0]))
-    toml, problems = proposed(path, capsys)
-    assert problems == []
+    toml = proposed(path, capsys)
     assert "fixes of 0.02 m, mostly" in toml
-    profile, steps = read(path, toml)
-    assert profile.inputs.pose is not None
-    assert profile.inputs.pose.topic == "/gps/fix"
+    assert parse_profile(toml, where="p").inputs.pose.topic == "/gps/fix"
+    steps = steps_in(path, toml)
     usable = np.array([problem == "" for problem in steps.problem])
     radius = SPEED_MPS / YAW_RATE_RADPS
     x, y = (steps.signals[f"pose_{axis}_m"][usable] for axis in "xy")
@@ -112,8 +102,7 @@ def test_goals_and_plans_are_not_taken_for_poses(tmp_path, capsys):
         (0.0, "/plan", "foxglove.PosesInFrame", plan),
         *drive(),
     ]
-    toml, problems = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
-    assert problems == []
+    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
     inputs = parse_profile(toml, where="p").inputs
     topics = inputs.goal.topic, inputs.plan.topic, inputs.pose.topic
     assert topics == ("/goal_pose", "/plan", "/pose")
@@ -140,10 +129,8 @@ def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, capsys, encoding
         else:
             messages += [(time_s, "/moves", "foxglove.FrameTransform", one) for one in links]
     path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
-    toml, problems = proposed(path, capsys)
-    assert problems == []
-    profile, steps = read(path, toml)
-    assert profile.frames is not None
+    profile = parse_profile(proposed(path, capsys), where="p")
+    steps = steps_in(path, profile)
     assert profile.inputs.pose is None
     assert (profile.frames.fixed, profile.frames.base) == ("map", "base_link")
     assert profile.frames.topic == ("/tf" if together else "/moves")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.ingested import proposed, steps_in
 from support.paths import SHARED
 
 from restock.cli import main
@@ -12,8 +13,6 @@ from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.definitions import choose_definitions, folder_types
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.episodes import steps_of
-from restock.ingest.steps.needs import read_topics
 
 NEATO = SHARED / "fleet-neato" / "2025-redhot" / "drive_square"
 RACECAR = SHARED / "robots" / "racecar-ackermann" / "BIGPATH.bag"
@@ -68,10 +67,9 @@ def test_a_type_that_nobody_knows_is_read_by_its_definition(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_car_is_read_by_its_steering_angle(tmp_path, capsys):
+def test_a_car_is_read_by_its_steering_angle(tmp_path):
     file = tmp_path / "p.toml"
-    assert main(["profile", "new", str(RACECAR), "--out", str(file)]) == 0
-    profile = load_profile(file)
+    profile = proposed(RACECAR, file)
     command = profile.inputs.command
     assert command.topic == "/vesc/low_level/ackermann_cmd"  # of seven, nearest to the motor
     assert command.wheelbase_m is not None
@@ -80,11 +78,10 @@ def test_a_car_is_read_by_its_steering_angle(tmp_path, capsys):
     file.write_text(text)
     profile = load_profile(file)
     with open_recording(RACECAR) as recording:
-        topics = read_topics(recording, profile)
         raw = recording.read(
             {"/vesc/high_level/ackermann_cmd": ["drive.speed", "drive.steering_angle"]}
         )["/vesc/high_level/ackermann_cmd"]
-    steps = steps_of(profile, topics)
+    steps = steps_in(RACECAR, profile)
     reported = zip(raw.fields["drive.speed"], raw.fields["drive.steering_angle"], strict=True)
     rates = {round(float(v) * math.tan(d) / command.wheelbase_m, 4) for v, d in reported}
     found = set(np.round(steps.signals["command_yaw_rate_radps"], 4).tolist())

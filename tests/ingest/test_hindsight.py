@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
+from support.ingested import ingested, proposed
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
@@ -54,25 +55,13 @@ class Waiting(Unguided):
         return 1.0 + 0.5 * np.maximum(time_s - 60.0, 0.0)
 
 
-def proposed(drive: Drive, folder: Path, *flags: str) -> tuple[Path, Path]:
-    """Return a bag of the drive, and its proposed profile."""
-    bag, file = folder / "bag", folder / f"robot{len(flags)}.toml"
-    if not bag.exists():
-        write_bag(drive, bag)
-    assert main(["profile", "new", str(bag), "--out", str(file), *flags]) == 0
-    return bag, file
-
-
-def ingested(bag: Path, profile: Path, store: Path) -> Store:
-    assert main(["ingest", str(bag), "--profile", str(profile), "--store", str(store)]) == 0
-    return Store(store)
-
-
 @pytest.fixture(scope="module")
 def unguided(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of a bag without goals, its proposal `robot0.toml`, and its `store`."""
     folder = tmp_path_factory.mktemp("unguided")
-    ingested(*proposed(Unguided(26.0), folder), folder / "store").close()
+    bag = write_bag(Unguided(26.0), folder / "bag")
+    proposed(bag, folder / "robot0.toml")
+    ingested(bag, folder / "robot0.toml", folder / "store").close()
     return folder
 
 
@@ -141,12 +130,11 @@ def test_only_goal_and_route_features_depend_on_the_future(unguided, tmp_path):
 
 
 def test_a_robot_that_mostly_stood_has_goals_if_requested(tmp_path):
-    _, file = proposed(Turntable(20.0), tmp_path / "nowhere")
-    assert load_profile(file).task.goal == "none"
-    _, file = proposed(Waiting(72.0), tmp_path / "stood")
-    assert load_profile(file).task.goal == "none"
-    bag, file = proposed(Waiting(72.0), tmp_path / "stood", "--hindsight-goals")
-    assert load_profile(file).goal_source == "hindsight"
+    turntable = write_bag(Turntable(20.0), tmp_path / "turntable")
+    assert proposed(turntable, tmp_path / "a.toml").task.goal == "none"
+    bag, file = write_bag(Waiting(72.0), tmp_path / "stood"), tmp_path / "c.toml"
+    assert proposed(bag, tmp_path / "b.toml").task.goal == "none"
+    assert proposed(bag, file, "--hindsight-goals").goal_source == "hindsight"
     with ingested(bag, file, tmp_path / "store") as store:
         query = "SELECT DISTINCT goal_source, count(*) OVER () BETWEEN 100 AND 120 FROM transitions"
         assert store.sql(query).fetchall() == [("hindsight", True)]
@@ -172,7 +160,9 @@ def test_where_a_drive_turns_back_it_has_arrived():
 
 def test_no_goal_was_passed_before_its_mission_ends(tmp_path):
     """Half of a drive that ended on its way out had reached its goal while it drove on."""
-    with ingested(*proposed(Returning(13.6), tmp_path), tmp_path / "store") as store:
+    bag, file = write_bag(Returning(13.6), tmp_path / "bag"), tmp_path / "p.toml"
+    proposed(bag, file)
+    with ingested(bag, file, tmp_path / "store") as store:
         ((rows,),) = store.sql("SELECT count(*) FROM transitions").fetchall()
     assert 68 - rows <= 6  # the ends of its missions
     # Out, round, and back onto the way out: to where it passes first, to the far end, and back.

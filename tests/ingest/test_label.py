@@ -47,11 +47,10 @@ def rows(path: Path, columns: str = "*") -> list[tuple]:
         return opened.sql(query).fetchall()
 
 
-def test_the_same_conditions_over_the_store_give_the_same_labels(store, capsys):
+def test_the_same_conditions_over_the_store_give_the_same_labels(store):
     """Also at the last transition of each episode, which looks at a step that is no row."""
     before = rows(store, "primary_condition, conditions")
     assert any(name == "soon" for name, _ in before)
-    found = {}
     profile = load_profile(store.parent / "amr.toml")
     # One more condition that never holds: another version, the same labels otherwise.
     conditions = [*profile.conditions, Condition("never", "pre", "false")]
@@ -119,31 +118,3 @@ def test_what_cannot_be_labelled_again_is_refused(store, tmp_path, capsys):
     writer.rows = lambda *key: original(*key).replace_schema_metadata(None)
     with pytest.raises(StoreError, match="lack the ends of their episodes"):
         relabel_store(writer, lambda name: [Condition("always", "pre", "true")])
-
-
-def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """Return the recordings whose labels or profile the audit calls stale."""
-    capsys.readouterr()
-    main(["audit", str(store), "--json"])
-    audits = json.loads(capsys.readouterr().out)["audits"]
-    (one,) = [audit for audit in audits if audit["audit"] == "stale_labels"]
-    return [Path(row["source_file"]).name for row in one["sample"]]
-
-
-@pytest.mark.long
-def test_the_audit_names_stale_labels_until_they_are_run_again(store, tmp_path, capsys):
-    """End to end: a changed condition, one recording ingested by it, the other one labelled."""
-    profile = tmp_path / "amr.toml"
-    assert stale(store, capsys) == []
-    profile.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
-    bag = str(tmp_path / "b")
-    assert main(["ingest", bag, "--store", str(store), "--profile", str(profile)]) == 0
-    assert stale(store, capsys) == ["a"]
-    assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
-    assert stale(store, capsys) == []
-    bags = [str(tmp_path / name) for name in "ab"]
-    command = ["ingest", *bags, "--store", str(store), "--profile", str(profile), "--json"]
-    capsys.readouterr()
-    assert main(command) == 0
-    said = json.loads(capsys.readouterr().out)["recordings"]
-    assert [one["status"] for one in said] == ["unchanged", "unchanged"]

@@ -1,6 +1,5 @@
 """A robot with several lidars, or one beside its middle: clearance as one in the middle sees it."""
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.driven_robot import Drive, columns, scans, seen_alike, transforms, without, write_bag
+from support.ingested import proposed, steps_in
 from support.profile_texts import WAREHOUSE
 
-from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.steps.aligned_inputs import align_inputs
-from restock.ingest.steps.episodes import Steps, steps_of
+from restock.ingest.steps.episodes import Steps
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.task.surroundings import MovedMap, outline_reach, with_unseen
 from restock.replay.trace.moment import seen_of
@@ -102,12 +101,6 @@ def two_lidars(front: str = "", rear: str = "") -> str:
     return WAREHOUSE[:start] + both + WAREHOUSE[end:]
 
 
-def read(bag: Path, text: str) -> Steps:
-    profile = parse_profile(text, where="p")
-    with open_recording(bag) as recording:
-        return steps_of(profile, read_topics(recording, profile))
-
-
 def sectors_of(steps: Steps) -> Any:
     """Clearance (T, K) at the usable ticks."""
     return steps.signals["sector_clearance_m"][[problem == "" for problem in steps.problem]]
@@ -170,7 +163,7 @@ def test_two_lidars_at_corners_see_what_one_in_the_middle_sees(tmp_path):
     """And neither alone does."""
     two = Corridor().bag(tmp_path / "two")
     one = Corridor(mounted=(("/scan", (0.0, 0.0, 0.0)),), field_rad=2 * np.pi).bag(tmp_path / "one")
-    expected, found = sectors_of(read(one, WAREHOUSE)), sectors_of(read(two, two_lidars()))
+    expected, found = (sectors_of(steps_in(*of)) for of in ((one, WAREHOUSE), (two, two_lidars())))
     assert found.shape == expected.shape
     assert len(found) > 10
     apart_m = np.abs(found - expected)
@@ -183,7 +176,7 @@ def test_two_lidars_at_corners_see_what_one_in_the_middle_sees(tmp_path):
         alone = alone.replace("/scan_front", topic)
         alone = alone.replace(f"[{FRONT[0]}, {FRONT[1]}]", f"[{place[0]}, {place[1]}]")
         alone = alone.replace(f"lidar_yaw_rad = {FRONT[2]}", f"lidar_yaw_rad = {place[2]}")
-        seen = sectors_of(read(two, alone))
+        seen = sectors_of(steps_in(two, alone))
         assert (np.abs(seen - expected) < 0.05).mean() < 0.9
 
 
@@ -195,18 +188,18 @@ def test_a_tick_without_one_of_the_lidars_is_dropped_by_its_name(tmp_path):
             early = rear.log_time_ns < rear.log_time_ns[0] + 2 * 10**9
             return found | {"/scan_rear": without(rear, early)}
 
-    steps = read(Silenced().bag(tmp_path / "bag"), two_lidars())
+    steps = steps_in(Silenced().bag(tmp_path / "bag"), two_lidars())
     reasons = Counter(steps.problem)
     assert reasons["scan_2: stale"] > 10
     assert reasons[""] > 5
     absent = Corridor(mounted=(("/scan_front", FRONT),)).bag(tmp_path / "absent")
     with pytest.raises(RecordingError, match="/scan_rear"):
-        read(absent, two_lidars())
+        steps_in(absent, two_lidars())
 
 
 def test_a_running_robot_sees_by_all_lidars_what_ingest_stores(tmp_path):
     bag, text = Corridor().bag(tmp_path / "bag"), two_lidars()
-    assert seen_alike(bag, parse_profile(text, where="p"), read(bag, text))[""] > 10
+    assert seen_alike(bag, parse_profile(text, where="p"), steps_in(bag, text))[""] > 10
 
 
 def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path):
@@ -225,29 +218,23 @@ def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path):
         assert y.max() < LEFT_M + 0.05
 
 
-def proposed(drive: Corridor, folder: Path, capsys: Any, *more: str) -> tuple[Profile, str, str]:
-    bag = drive.bag(folder / "bag")
-    assert main(["profile", "new", str(bag), "--json", *more]) in (0, 3)
-    said = json.loads(capsys.readouterr().out)
-    return parse_profile(said["toml"], where="p"), said["toml"], json.dumps(said["advice"])
-
-
-def test_a_scan_made_of_the_others_is_the_one(tmp_path, capsys):
+def test_a_scan_made_of_the_others_is_the_one(tmp_path):
     class Joined(Corridor):
         def topics(self) -> dict[str, TopicColumns]:
             found = super().topics()
             times_s = np.arange(0, self.duration_s, 0.1)
             return found | {"/z_scan": self.scan(times_s, (0.0, 0.0, 0.0), "base_link")}
 
-    profile, _, _ = proposed(Joined(12.0), tmp_path, capsys)
+    bag = Joined(12.0).bag(tmp_path / "bag")
+    profile = proposed(bag, tmp_path / "p.toml", codes=(0, 3))
     assert {name: one.topic for name, one in profile.inputs.scans.items()} == {"scan": "/z_scan"}
     assert profile.inputs.scans["scan"].lidar_at_m is None
 
 
-def test_one_lidar_beside_the_middle_has_its_place(tmp_path, capsys):
+def test_one_lidar_beside_the_middle_has_its_place(tmp_path):
     """That it is beside the middle was said, and ignored."""
-    drive = Corridor(12.0, mounted=(("/scan", FRONT),))
-    profile, text, _ = proposed(drive, tmp_path, capsys)
+    bag = Corridor(12.0, mounted=(("/scan", FRONT),)).bag(tmp_path / "bag")
+    profile = proposed(bag, tmp_path / "p.toml", codes=(0, 3))
     scan = profile.inputs.scans["scan"]
     assert scan.lidar_at_m == pytest.approx(FRONT[:2], abs=1e-3)
     assert scan.optional
@@ -255,7 +242,7 @@ def test_one_lidar_beside_the_middle_has_its_place(tmp_path, capsys):
     middle = (lidar.angle_min_rad + lidar.angle_max_rad) / 2
     assert middle == pytest.approx(FRONT[2], abs=0.02)
     assert lidar.angle_max_rad - lidar.angle_min_rad == pytest.approx(THREE_QUARTERS, abs=0.02)
-    usable = sectors_of(read(tmp_path / "bag", text))
+    usable = sectors_of(steps_in(bag, profile))
     clear_m = LEFT_M - 1 - profile.task.body.width_m / 2
     assert np.median(usable[:, 27]) == pytest.approx(clear_m, abs=0.01)
 

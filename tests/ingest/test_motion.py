@@ -1,7 +1,6 @@
 """Speeds from poses, where a robot has no odometry."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,15 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import SPEED_MPS, Drive, write_bag
-from support.paths import SHARED
+from support.ingested import ingested, proposed
 
 from restock.cli import main
-from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.episodes import steps_of
 from restock.ingest.steps.frames import PoseSeries, motion_at
-from restock.ingest.steps.needs import read_topics
 
 NS = 10**9
 
@@ -65,16 +60,6 @@ def test_it_is_the_slope_of_a_line_through_the_last_poses(seed, speed, turn, win
         assert found.yaw_rate_radps[index] == pytest.approx(rate, abs=1e-6)
 
 
-@given(seed=st.integers(0, 1000), known=st.integers(0, 79))
-def test_no_speed_sees_a_later_pose(seed, known):
-    rng = np.random.default_rng(seed)
-    poses = circle(np.cumsum(rng.uniform(0.02, 0.12, 80)), 0.5, 0.7, 0.01, seed)
-    now = poses.stamp_ns[known : known + 1]
-    past = PoseSeries(*(c[: known + 1] for c in vars(poses).values()))
-    for name, column in vars(motion_at(poses, now, 0.4, 1.0)).items():
-        assert column.tolist() == getattr(motion_at(past, now, 0.4, 1.0), name).tolist()
-
-
 def test_poses_that_arrive_together_are_no_speed():
     """Of stamps that jitter, a pose 6 ms after the one before it gave ten times the speed."""
     even = np.arange(0, 20, 0.1)
@@ -104,15 +89,12 @@ class Relocalised(Drive):
 
 def test_a_jump_that_no_robot_drives_is_counted_as_one(tmp_path, capsys):
     """Jumps of less than max_pose_jump_m were speeds of up to five times the fastest action."""
-    bag, file, store = write_bag(Relocalised(8.0), tmp_path / "b"), tmp_path / "p", tmp_path / "s"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    bag, file = write_bag(Relocalised(8.0), tmp_path / "bag"), tmp_path / "p.toml"
+    proposed(bag, file)
+    query = "SELECT max(wheel_speed_mps), count(*) > 30 FROM transitions"
+    with ingested(bag, file, tmp_path / "s") as store:
+        assert store.sql(query).fetchall() == [(pytest.approx(SPEED_MPS), True)]
     assert "wheels: a pose jump within" in capsys.readouterr().out
-    query = "SELECT max(wheel_speed_mps) AS high, count(*) AS rows FROM transitions"
-    assert main(["sql", str(store), query, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["high"] == pytest.approx(SPEED_MPS)
-    assert row["rows"] > 30
 
 
 class NoOdometry(Drive):
@@ -124,15 +106,12 @@ class NoOdometry(Drive):
 
 def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):
     bag, file, store = write_bag(NoOdometry(), tmp_path / "bag"), tmp_path / "p", tmp_path / "s"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert "wheel_slip" not in proposed(bag, file).shipped_conditions
     assert "# [inputs.wheels]  # no usable odometry; instead: speeds from poses" in file.read_text()
-    assert "wheel_slip" not in load_profile(file).shipped_conditions
-    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    with ingested(bag, file, store) as opened:
+        query = "SELECT min(wheel_speed_mps), max(wheel_speed_mps) FROM transitions"
+        assert opened.sql(query).fetchall() == [(pytest.approx(SPEED_MPS),) * 2]
     assert "no wheels: speeds from the poses of the last" in capsys.readouterr().out
-    query = "SELECT min(wheel_speed_mps) AS low, max(wheel_speed_mps) AS high FROM transitions"
-    assert main(["sql", str(store), query, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["low"] == pytest.approx(SPEED_MPS) == row["high"]
     main(["audit", str(store), "--json"])
     said = json.loads(capsys.readouterr().out)["audits"]
     (found,) = [each for each in said if each["audit"] == "speeds_from_poses"]
@@ -141,7 +120,7 @@ def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):
 
 def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
     bag, file = write_bag(NoOdometry(), tmp_path / "bag"), tmp_path / "p.toml"
-    main(["profile", "new", str(bag), "--out", str(file)])
+    proposed(bag, file)
     text = file.read_text()
     for wrong, what in (
         (text.replace("[motion]", "# [motion]").replace("window_s", "# window_s"), "no `motion`"),
@@ -152,23 +131,3 @@ def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
         capsys.readouterr()
         assert main(["profile", "check", str(file), str(bag)]) == 2
         assert what in capsys.readouterr().err
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_real_robot_in_motion_capture(tmp_path, capsys):
-    rows = []
-    for name in ("test_2026-02-19-10-53-01", "test_2026-02-19-10-53-01.bag"):
-        path, file = SHARED / "jackal-mocap" / name, tmp_path / f"{name}.toml"
-        assert main(["profile", "new", str(path), "--out", str(file)]) == 0
-        rows.append(_speeds(path, file))
-    assert len(rows[0]) == 266
-    assert np.array_equal(rows[0], rows[1])
-
-
-def _speeds(path: Path, profile: Path) -> Any:
-    with open_recording(path) as recording:
-        made = load_profile(profile)
-        steps = steps_of(made, read_topics(recording, made))
-    names = ("wheel_speed_mps", "wheel_yaw_rate_radps", "pose_x_m", "command_speed_mps")
-    return np.stack([steps.signals[name] for name in names], axis=1)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.driven_robot import Drive, columns, scans, typed_topics, write_bag, write_topics
+from support.driven_robot import Drive, columns, scans, write_bag
+from support.ingested import ingested, proposed
 from support.profile_texts import WAREHOUSE
 
-from restock.cli import main
 from restock.errors import MixtureError
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.pipeline import IngestResult, ingest
@@ -107,7 +107,7 @@ def test_a_traced_row_has_no_term_of_what_a_lidar_sees(blind):
     assert trace_row(path, str(row)).origin.reward_parts["tight"] == 0.0
 
 
-def test_an_unseen_wall_beside_the_robot_costs_nothing(drives, tmp_path):
+def test_an_unseen_wall_beside_the_robot_costs_nothing(tmp_path):
     """`tight` is 0 where clearance is unknown; with the lidar the same steps cost .05 each."""
 
     class Tight(Drive):
@@ -196,23 +196,10 @@ def test_the_limiter_without_a_lidar_limits_speed_alone():
     assert limited.command[:, 0].tolist() == [0.5, limits.fastest[0]]
 
 
-def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path, capsys):
-    profile, store = tmp_path / "mine.toml", tmp_path / "store"
-    assert main(["profile", "new", str(drives / "blind"), "--out", str(profile)]) in (0, 3)
+def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path):
+    profile = tmp_path / "mine.toml"
+    proposed(drives / "blind", profile, codes=(0, 3))
     assert "sectors = 0  # no lidar" in profile.read_text()
-    command = ["ingest", str(drives / "blind"), "--profile", str(profile), "--store", str(store)]
-    assert main(command) == 0
     query = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
-    with Store(store) as opened:
+    with ingested(drives / "blind", profile, tmp_path / "store") as opened:
         assert opened.sql(query).fetchall() == [(None,)]
-
-
-@pytest.mark.parametrize("has_scan", [False, True])
-def test_a_point_cloud_alone_is_told_what_to_do(has_scan, tmp_path, capsys):
-    frames = {"header.frame_id": np.full(60, "velodyne", object)}
-    cloud = "sensor_msgs/msg/PointCloud2", columns(np.arange(0, 6.0, 0.1), frames)
-    topics = typed_topics(Drive() if has_scan else BlindDrive()) | {"/points": cloud}
-    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
-    assert main(["profile", "new", str(bag), "--out", str(tmp_path / "p.toml")]) == 0
-    hint = "/points is a point cloud, of which a slice can be read as a scan"
-    assert (hint in capsys.readouterr().err) is not has_scan

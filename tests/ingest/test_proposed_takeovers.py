@@ -1,17 +1,15 @@
 """What Restock's own node published: a proposal reads it as `node --write-profile` does."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.driven_robot import START_NS, Drive, columns, typed_topics, write_topics
+from support.ingested import ingested, proposed
 
 from restock.cli import main
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
-from restock.ingest.profile.profile import Profile, load_profile
-from restock.replay.store.store import Store
 
 TWIST, BOOL = "geometry_msgs/msg/Twist", "std_msgs/msg/Bool"
 TAKEN_S = (4.0, 8.0)
@@ -47,25 +45,13 @@ def in_shadow() -> Topics:
     }
 
 
-def proposed(topics: Topics, folder: Path, name: str = "robot") -> tuple[Path, Path, Profile]:
-    """Return the bag, its proposal, and that as a profile."""
-    bag, file = write_topics(topics, folder / f"{name}_bag"), folder / f"{name}.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    return bag, file, load_profile(file)
-
-
-def rows(bag: Path, file: Path, query: str) -> list[Any]:
-    store = file.with_suffix("")
-    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
-    with Store(store) as opened:
-        return opened.sql(query).fetchall()
-
-
 def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
-    bag, file, profile = proposed(taken_over(), tmp_path)
+    bag, file = write_topics(taken_over(), tmp_path / "bag"), tmp_path / "p.toml"
+    profile = proposed(bag, file)
     assert list(profile.command_sources) == ["operator"]
     assert "shadow_action" not in profile.signals
-    said = rows(bag, file, "SELECT stamp_ns, behaviour_policy FROM transitions ORDER BY 1")
+    with ingested(bag, file, tmp_path / "store") as store:
+        said = store.sql("SELECT stamp_ns, behaviour_policy FROM transitions").fetchall()
     by_hand = [(stamp - START_NS) * 1e-9 for stamp, policy in said if policy == "operator"]
     assert len(by_hand) == pytest.approx((TAKEN_S[1] - TAKEN_S[0]) / 0.2, abs=1)
     assert min(by_hand) >= TAKEN_S[0]
@@ -75,13 +61,14 @@ def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
 
 
 def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
-    assert proposed(taken_over("std_msgs/msg/String"), tmp_path)[2].command_sources == {}
+    bag = write_topics(taken_over("std_msgs/msg/String"), tmp_path / "bag")
+    assert proposed(bag, tmp_path / "p.toml").command_sources == {}
 
 
 def test_what_a_policy_would_have_driven_does_not_drive(tmp_path, capsys):
     """In shadow it publishes twists beside the command, more of them."""
-    topics = in_shadow()
-    bag, file, profile = proposed(topics, tmp_path)
+    bag, file = write_topics(in_shadow(), tmp_path / "bag"), tmp_path / "p.toml"
+    profile = proposed(bag, file)
     assert profile.inputs.command.topic == "/cmd_vel"
     assert profile.inputs.nav_command is None
     assert profile.command_sources == {}

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.driven_robot import Drive, transforms, typed_topics, write_topics
+from support.ingested import ingested, proposed
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.roles import choose_robot
-from restock.replay.store.store import Store
 
 NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")
 
@@ -63,7 +63,7 @@ def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("robots", [(1, 2), (2,)])
-def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_path, capsys):
+def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_path):
     """As Nav2 has them where several robots are on one graph: `/robot2/tf`."""
     drive, topics = Drive(duration_s=4.0), {}
     at_s = np.arange(0, 4, 0.05)
@@ -72,13 +72,10 @@ def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_pat
         topics |= {f"/robot{n}{name}": own[name] for name in ("/cmd_vel", "/odom")}
         base = ("odom", "base_link", drive.x_at(at_s) + n, 1.0)
         topics[f"/robot{n}/tf"] = transforms(at_s, ("map", "odom", 0.0, 5.0), base)
-    bag, file, store = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml", tmp_path / "s"
-    assert main(["profile", "new", str(bag), "--robot", "/robot2", "--out", str(file)]) == 0
-    frames = parse_profile(file.read_text(), where="p").frames
-    assert frames is not None
+    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
+    frames = proposed(bag, file, "--robot", "/robot2").frames
     assert (frames.fixed, frames.topic) == ("map", "/robot2/tf")
-    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
-    with Store(store) as opened:
+    with ingested(bag, file, tmp_path / "s") as opened:
         x, y = opened.sql("SELECT min(pose_x_m), max(pose_y_m) FROM transitions").fetchall()[0]
     assert (x, y) == (pytest.approx(3.0, abs=0.2), pytest.approx(6.0))
 

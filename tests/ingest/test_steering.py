@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from support.driven_robot import columns, write_topics
 from support.long import one_in
-from support.paths import SHARED
 from twin.test_robot_drives import CAR, OUTLINE
 
 from restock.cli import main
@@ -111,25 +110,4 @@ def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path, capsys
     assert profile.robot is not None
     assert profile.robot.drive == "ackermann"
     assert profile.robot.origin_of("drive") == "logs"
-    assert all(speed or not turn for speed, turn in profile.task.actions)
-
-
-REAL = {
-    "jetacker": "CONFIRM THAT IT STEERS LIKE A CAR: commanded to turn on the spot",
-    "robots/racecar-ackermann/BIGPATH.bag": "its commands are steering angles",
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", REAL)
-def test_real_robots_that_steer_are_taken_as_such(name: str, tmp_path: Path) -> None:
-    if not (SHARED / name).exists():
-        pytest.skip(f"no shared bags: {name}")
-    file = tmp_path / "car.toml"
-    assert main(["profile", "new", str(SHARED / name), "--out", str(file)]) == 0
-    assert REAL[name] in " ".join(file.read_text().split("\n# "))
-    profile = load_profile(file)
-    assert profile.robot is not None
-    assert profile.robot.drive == "ackermann"
-    # No action that it cannot drive: as a differential robot's it turned on the spot in the twin.
     assert all(speed or not turn for speed, turn in profile.task.actions)

@@ -2,10 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.driven_robot import Drive, write_bag
+from support.ingested import queried
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -27,11 +27,6 @@ def ingest(bag: Path, store: Path, *options: str) -> int:
     return main(["ingest", str(bag), "--store", str(store), "--profile", profile, *options])
 
 
-def requested(store: Path, query: str) -> list[tuple[Any, ...]]:
-    with Store(store) as opened:
-        return opened.sql(query).fetchall()
-
-
 def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, capsys):
     store = tmp_path / "store"
     assert ingest(bag, store, "--tag", "robot=amr-07", "--tag", "line=b = c", "--json") == 0
@@ -40,7 +35,7 @@ def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, capsys):
     assert (row["status"], row["tags"]) == ("written", tags)
     for view in ("recordings", "transitions", "episodes"):
         query = f"SELECT DISTINCT robot, site, firmware, map, shift, tags FROM {view}"
-        assert requested(store, query) == [("amr-07", None, None, None, None, tags)]
+        assert queried(store, query) == [("amr-07", None, None, None, None, tags)]
 
 
 def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
@@ -65,7 +60,7 @@ def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
 def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
     store, others = tmp_path / "store", "FROM (SELECT * EXCLUDE (ingest_id, tags, robot, site)"
     assert ingest(bag, store, "--tag", "site=oslo") == 0
-    rows = requested(store, f"{others} FROM transitions) ORDER BY transition_id")
+    rows = queried(store, f"{others} FROM transitions) ORDER BY transition_id")
     capsys.readouterr()
     assert ingest(bag, store, "--tag", "robot=amr-07", "--json") == 0
     (row,) = json.loads(capsys.readouterr().out)["recordings"]
@@ -74,15 +69,15 @@ def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
     assert row["notes"] == [
         "tags kept from the earlier ingest: site=oslo (--tag NAME= removes one)"
     ]
-    assert requested(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
-    assert requested(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
+    assert queried(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
+    assert queried(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
     capsys.readouterr()
     assert ingest(bag, store) == 0  # who says nothing changes nothing
     assert "unchanged" in capsys.readouterr().out
     assert ingest(bag, store, "--force") == 0
-    assert requested(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
+    assert queried(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
     assert ingest(bag, store, "--tag", "site=") == 0
-    assert requested(store, "SELECT robot, site, tags FROM recordings") == [
+    assert queried(store, "SELECT robot, site, tags FROM recordings") == [
         ("amr-07", None, {"robot": "amr-07"})
     ]
 
@@ -93,7 +88,7 @@ def test_relabelling_keeps_the_tags(bag, tmp_path):
     other = tmp_path / "other.toml"
     other.write_text(WAREHOUSE + '\n[[condition]]\nname = "never"\ntiming = "pre"\nsql = "false"\n')
     assert main(["store", "label", str(store), "--profile", str(other)]) == 0
-    assert requested(store, "SELECT DISTINCT robot FROM transitions") == [("amr-07",)]
+    assert queried(store, "SELECT DISTINCT robot FROM transitions") == [("amr-07",)]
 
 
 @pytest.mark.parametrize(
