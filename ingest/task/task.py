@@ -23,7 +23,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints, stacked
 from restock.toml import Checked
 
 Signals = dict[str, NDArray[Any]]  # by name; the leading axis is the step, or the environment
@@ -382,7 +382,7 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
     routed = 1.0 if task.goal == "route" else 0.0  # without a goal these entries are all zero
     clearance = _nearness(now["sector_clearance_m"], task.range_max_m)
     closing = clearance - _nearness(before["sector_clearance_m"], task.range_max_m)
-    scalars = _stacked(
+    scalars = stacked(
         np.sin(near) * routed,
         np.cos(near) * routed,
         np.sin(far) * routed,
@@ -496,20 +496,12 @@ def clearance_ahead(
     return np.asarray(np.minimum.reduce(nearest, axis=1), np.float64)
 
 
-def _stacked(*columns: NDArray[Any]) -> NDArray[Any]:
-    """Return arrays (...) of one shape and type as one (..., K): `np.stack` for small arrays."""
-    joined = np.empty((*columns[0].shape, len(columns)), columns[0].dtype)
-    for place, column in enumerate(columns):
-        joined[..., place] = column
-    return joined
-
-
 def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
     """Return what the navigation stack proposes, (N, 3): whether it is known, speed, yaw rate.
 
     In units of the fastest action on each axis, up to twice that; all 0 where it is not known.
     """
-    command = _stacked(now["nav_speed_mps"], now["nav_yaw_rate_radps"])
+    command = stacked(now["nav_speed_mps"], now["nav_yaw_rate_radps"])
     known = np.isfinite(command).all(axis=-1, keepdims=True)
     scaled = (np.where(known, command, 0.0) / _fastest(task.actions)).clip(-2.0, 2.0)
     return np.concatenate([known, scaled], axis=-1)

@@ -15,3 +15,11 @@ F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Codes = NDArray[np.signedinteger[Any]]  # indices of texts in a dictionary; -1: no text
 Bools = NDArray[np.bool_]
+
+
+def stacked(*columns: NDArray[Any]) -> NDArray[Any]:
+    """Return arrays (...) of one shape and type as one (..., K): `np.stack` for small arrays."""
+    joined = np.empty((*columns[0].shape, len(columns)), columns[0].dtype)
+    for place, column in enumerate(columns):
+        joined[..., place] = column
+    return joined
