@@ -335,7 +335,7 @@ LEFT_OUT: tuple[Fault, ...] = (
     # Units are mounted turned, or drivers exchange axes: novatel_oem7_driver 41, imu_tools 219.
     *(Fault("accelerometer turned on its mount", f"by {by} degrees",
             says("accel", rf"{UNFIT}|ax[ei]s|turned|rotat|mount|sideways|lateral|exchang|frame"
-                 r"|heading|yaw", "SHIFT|BIAS|MIRROR|REPEAT|UNCHANGED"),
+                 r"|heading|yaw", SIMPLE),
             turned_accelerometer(np.radians(by))) for by in (30, 60, 90)),
     # Dust, rain and sunlight give a lidar single near returns, which drivers can filter out.
     *(Fault("lidar sees specks of dust", f"in {s:.1%} of the readings",
