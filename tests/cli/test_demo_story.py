@@ -11,9 +11,7 @@ from restock.cli.output import stdout
 from restock.cli.start import demo
 from restock.cli.start.stages import Settings
 from restock.replay.panel.panel import Panel
-from restock.train.run.kept_evaluations import FILE
 from restock.train.run.run import Run
-from restock.train.run.run_tables import EVAL_EPISODES
 
 LOGS = ROOT / "sample_logs" / "amr_tuesday"
 STEPS = ROOT / "benchmarks" / "evidence" / "step-quotas.toml"
@@ -33,10 +31,19 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return to
 
 
-def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported, capsys, monkeypatch):
+def driven(policy: str, condition: str, success: float | None) -> dict[str, Any]:
+    ends = dict.fromkeys(("success_low", "success_high"))
+    return {
+        "policy": policy,
+        "perturbation": "none",
+        "condition": condition,
+        "success": success,
+    } | ends
+
+
+def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported, capsys):
     """The plan of the panel was printed, as if it had been drawn."""
-    monkeypatch.setattr(demo, "before_and_after", lambda to: [])
-    demo.tell(reported, stdout())
+    demo.tell(reported, {"results": [driven("agent", "nominal", 1.0)]}, stdout())
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     drawn_rows = Run.open(reported.run).table("strata").to_pylist()
     whole = sum(row["drawn_rows"] for row in drawn_rows)
@@ -50,62 +57,20 @@ def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported, capsys, m
 
 def test_a_rare_event_is_followed_from_its_message_to_an_update(reported: Settings) -> None:
     lines = demo.rare_event(reported)
-    links = [line.split()[0] for line in lines if not line.startswith(" ")]
-    assert links == ["recording", *["message"] * 2, "row", "stratum", "update", "All"]
+    assert [line.split()[0] for line in lines] == ["recording", "row", "update", "All"]
     assert str(LOGS) in lines[0]
-    assert any("/scan" in line and "m away" in line for line in lines)
     assert "nominal" not in "".join(lines)
-    command = lines[-1].removeprefix("All of it: restock ").split()
+    command = lines[-1].partition(": restock ")[2].split()
     assert cli.main([*command, "--json"]) == 0
 
 
-def driven(policy: str, condition: str, success: bool | None, seed: int) -> dict[str, Any]:
-    known = {
-        "policy": policy,
-        "perturbation": "none",
-        "condition": condition,
-        "success": success,
-        "episode_seed": seed,
-    }
-    return {name: known.get(name) for name in EVAL_EPISODES.names}
-
-
-def write(run: Path, rows: list[dict[str, Any]]) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    (run / FILE).parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.Table.from_pylist(rows, schema=EVAL_EPISODES), run / FILE)
-
-
-def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
+def test_policies_stand_side_by_side_by_kind_of_mission(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path)
-    alone = f"run:{demo.logs_alone(to)}"
-    after = [driven(alone, "wheel_slip", n < 1, n) for n in range(4)]
-    after += [driven("agent", "wheel_slip", n < 3, n) for n in range(4)]
-    easy = [driven("planner", "nominal", True, n) for n in range(2)]
-    write(to.run, [*after, *easy, *(driven("planner", "wheel_slip", n < 2, n) for n in range(4))])
-    easy_row, slip, rare = demo.before_and_after(to)
-    assert (easy_row["mission"], slip["mission"], rare["mission"]) == (
-        "nominal",
-        "wheel_slip",
-        demo.RARE,
-    )
-    assert slip["logs alone"].startswith("1 of 4 [")
-    assert slip["agent"].startswith("3 of 4 [")
-    assert slip["planner"] == rare["planner"]
-    assert easy_row["planner"].startswith("2 of 2 [")
-    assert easy_row["logs alone"] == ""
-    assert "fed uniformly" not in slip
-    uniform = f"run:{demo.fed_uniformly(to)}"
-    write(to.run, [*after, *easy, *(driven(uniform, "wheel_slip", n < 2, n) for n in range(4))])
-    beside = demo.before_and_after(to)[1]
-    assert beside["fed uniformly"].startswith("2 of 4 [")
-    assert list(beside)[1:] == ["logs alone", "fed uniformly", "agent", "planner"]
-
-
-def test_without_a_goal_no_success_is_told(tmp_path: Path) -> None:
-    to = Settings(("logs",), tmp_path)
-    policies = f"run:{demo.logs_alone(to)}", "agent", "planner"
-    write(to.run, [driven(policy, "nominal", None, 0) for policy in policies])
-    assert demo.before_and_after(to) == []
+    alone, uniform = f"run:{demo.logs_alone(to)}", f"run:{demo.fed_uniformly(to)}"
+    rows = [driven(policy, "wheel_slip", 0.5) for policy in (alone, uniform, "agent", "random")]
+    other = driven("agent", "wheel_slip", 0.0) | {"perturbation": "friction"}
+    rows += [driven("planner", kind, 1.0) for kind in ("nominal", "wheel_slip")]
+    slip, easy = demo.before_and_after({"results": [*rows, other]})
+    success = {"logs alone": "0.50", "fed uniformly": "0.50", "agent": "0.50", "planner": "1.00"}
+    assert slip == {"mission": "wheel_slip"} | success
+    assert easy == {"mission": "nominal", "planner": "1.00"}

@@ -156,7 +156,7 @@ def test_commands_and_poses_in_different_recordings(tmp_path, capsys):
     assert code == 3
     why = "bags/commands has a command (/cmd_vel) and no pose: one recording must hold both"
     assert why in document["stopped"]["why"]
-    assert "give recordings that contain it" in document["stopped"]["remedies"][0]
+    assert str(tmp_path / "out" / "profile.toml") in document["stopped"]["remedies"][0]
 
 
 def test_an_edited_profile_is_taken_and_never_replaced(tmp_path, capsys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import shlex
 from collections.abc import Collection
@@ -16,7 +15,6 @@ from restock.errors import ConfigError, counted
 from restock.files import read_json
 
 if TYPE_CHECKING:
-    from restock.cli.start.start import StartCommand
     from restock.ingest.task.task import Task
 
 STEPS_A_SECOND = 500  # in the twin on a free core, for which draws are planned
@@ -25,7 +23,6 @@ UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with all other s
 INTERVALS = 20  # at least so many points of every curve
 DRIVERS = "behaviour_policies"  # key in a row of the coverage
 INSIDE = 0.5  # share of ticks: with more returns inside the outline, the outline is wrong
-NOT_AGAIN = ("paths", "out", "dry_run", "json")  # options that stages do not depend on
 
 
 class Stop(Exception):
@@ -59,40 +56,22 @@ def edited(profile: Path | str | None, out: Path) -> bool:
     return not proposed.is_file() or read_json(proposed)["toml"] != path.read_text("utf-8")
 
 
-def several_kinds(kinds: list[Any], requested: StartCommand) -> Stop:
-    """Stop at recordings of several kinds of robots, with one call for each kind as remedy.
-
-    With the options that were given; what describes one robot is for the first kind alone.
-    """
-    out = requested.out
+def several_kinds(kinds: list[Any], out: Path) -> Stop:
+    """Stop at recordings of several kinds of robots, with one call for each kind as remedy."""
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
     reported = [
         f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds
     ]
-    calls = []
-    for kind, folder in zip(kinds, folders, strict=True):
-        options = _options(requested, but=() if folder == out else ("urdf",))
-        words = [*kind["recordings"], "--out", str(folder), *options]
-        calls.append(f"restock start {shlex.join(words)}")
+    calls = [
+        f"restock start {shlex.join([*kind['recordings'], '--out', str(folder)])}"
+        for kind, folder in zip(kinds, folders, strict=True)
+    ]
     return Stop(
         f"these are recordings of {len(kinds)} kinds of robots, but a profile describes one kind: "
         f"{' | '.join(reported)}",
         *calls,
         f"or add --accept: recordings of the other kinds are left out of {out}",
     )
-
-
-def _options(requested: StartCommand, *, but: Collection[str]) -> list[str]:
-    """Return the options of a call that are not the default, as they are typed."""
-    words = []
-    for field in dataclasses.fields(requested):
-        value = getattr(requested, field.name)
-        if field.name in (*NOT_AGAIN, *but) or value == field.default:
-            continue
-        flag = f"--{field.name.replace('_', '-')}"
-        for one in value if isinstance(value, tuple) else (value,):
-            words += [flag] if one is True else [flag, str(one)]
-    return words
 
 
 def proposal(out: Path) -> tuple[list[str], str | None]:
@@ -143,11 +122,6 @@ def _task(profile: Path | str | None) -> Task | None:
     if profile is None or (isinstance(profile, Path) and not profile.is_file()):
         return None
     return load_profile(str(profile)).task
-
-
-def practice_settings(profile: Path | str | None) -> list[str]:
-    """Return settings that practise missions that go wrong, if the task has a goal."""
-    return ["practice.rule=success"] if has_goal(profile) else []
 
 
 NO_ROOM = "no mission fits on the floor that the recordings show"
@@ -268,27 +242,3 @@ def updates_settings(
     if not twin and updates < INTERVALS * usual.record.every_updates:
         settings.append(f"record.every_updates={max(updates // INTERVALS, 1)}")
     return settings
-
-
-def robot_line(profile: Path | str | None) -> str:
-    """Describe the robot that the twin builds, and where each figure is from."""
-    from restock.ingest.profile.profile import load_profile
-
-    robot = None if profile is None else load_profile(str(profile)).robot
-    if robot is None:
-        return "the twin's default robot, because nothing describes yours: give --urdf FILE"
-    reported = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
-    guessed = []
-    for key, name, unit in (
-        ("wheel_radius_m", "wheel radius", "m"),
-        ("track_m", "track", "m"),
-        ("mass_kg", "mass", "kg"),
-    ):
-        if (value := getattr(robot, key)) is None:
-            guessed.append(name)
-        else:
-            origin = robot.origin.get(key, "the profile")
-            reported.append(f"{name} {value:g} {unit} (from {origin})")
-    if guessed:
-        reported.append(f"{', '.join(guessed)} guessed from its outline: give --urdf FILE")
-    return ", ".join(reported)

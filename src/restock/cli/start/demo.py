@@ -9,22 +9,20 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from restock.cli.output import print_json, print_table, stderr, stdout
 from restock.cli.start import stages
+from restock.cli.start.outcomes import Document
 from restock.cli.start.stages import Settings, Stage
 from restock.cli.start.work import Work, escape, speaker
-from restock.errors import ConfigError, ExitCode, RestockError, policy_words, quoted
-from restock.stats import wilson
+from restock.errors import ConfigError, ExitCode, policy_words, quoted
+from restock.stats import interval_text
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from restock.replay.trace.trace import Trace
 
 
 @dataclass
@@ -61,12 +59,18 @@ class DemoCommand:
         if self.episodes < 1:
             raise ConfigError(f"must be at least 1, got {self.episodes}", where="--episodes")
         found = find_logs()
-        logs = self.out / "logs" if found is None else found
-        rule = ("practice.rule=success",)
         to = Settings(
-            (str(logs),), self.out, seconds=self.seconds, episodes=self.episodes, train=rule
+            (str(found or self.out / "logs"),),
+            self.out,
+            seconds=self.seconds,
+            episodes=self.episodes,
+            train=("practice.rule=success",),
         )
-        plan = plan_of(to) if found is not None else [record(logs), *plan_of(to)]
+        plan = plan_of(to)
+        if found is None:
+            file = self.out / "logs" / "sample.mcap"
+            command = ["twin", "record", "--out", str(file), "--missions", "60"]
+            plan.insert(0, Stage("record", "Record", command, writes=(file.parent,)))
         console = stderr() if self.json else stdout()
         say = speaker(console)
         work = Work(self.out, main, say, plan=self.dry_run, why=WHY)
@@ -80,7 +84,8 @@ class DemoCommand:
         if self.json:
             print_json({"stages": [ended.summary() for ended in work.ended], "report": str(report)})
         elif not self.dry_run:
-            tell(to, console)
+            evaluated = next(ended for ended in work.ended if ended.name == "eval")
+            tell(to, evaluated.document, console)
             say(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
         return int(ExitCode.OK)
 
@@ -102,11 +107,6 @@ def logs_alone(to: Settings) -> Path:
 def fed_uniformly(to: Settings) -> Path:
     """Return the run that is fed the logs as they are."""
     return to.out / "fed-uniformly"
-
-
-def record(logs: Path) -> Stage:
-    command = ["twin", "record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
-    return Stage("record", "Record", command, writes=(logs,))
 
 
 def plan_of(to: Settings) -> list[Stage]:
@@ -203,8 +203,9 @@ def steps_of(run: Path) -> int:
     return max(Run.open(run).table("progress")["env_steps"].to_pylist(), default=0)
 
 
-def tell(to: Settings, console: Console) -> None:
+def tell(to: Settings, evaluated: Document, console: Console) -> None:
     """Print the results, read from what the stages wrote."""
+    from restock.train.evaluation.film import FOLDER
     from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls
     from restock.train.run.run import Run
 
@@ -215,17 +216,20 @@ def tell(to: Settings, console: Console) -> None:
                 console.print(line, markup=False, soft_wrap=True)
         sys.stdout.flush()
 
-    if rows := before_and_after(to):
-        what = "Missions that reached their goal without a contact; in brackets, in percent,"
-        show("Before and after fine-tuning", [f"{what} what other missions might give (95 %)."])
-        print_table(rows)
-        console.print(steps_line(to))
+    steps = steps_of(to.run)
+    what = "Missions that reached their goal without a contact, with 95 % intervals."
+    driven = f"The agent is the fine-tuned policy: {steps:,} steps in the twin here."
+    if not steps:
+        driven = "The time was up before anything was driven: give more --seconds."
+    show("Before and after fine-tuning", [what, driven, *SAMPLE_OF_ONE])
+    print_table(before_and_after(evaluated))
     if fed := fed_shares(Run.open(to.run)):
         show("What the critic was fed, in % of all rows (`FROM fed` of the run)", shortfalls(fed))
         print_table(fed_table(fed))
-    show("Failing before, arriving after: films", films(to))
+    films = sorted((to.run / FOLDER).glob("*-rescue.webp"))
+    show("Failing before, arriving after: films, also in the report", [str(path) for path in films])
     show("One rare event, from its message to an update", rare_event(to))
-    show("What to try next", next_steps(to))
+    show("What to try next", NEXT.format(store=quoted(to.store), run=quoted(to.run)).splitlines())
 
 
 OPENING = """\
@@ -244,166 +248,69 @@ At the end you see the policies before and after, what the critic was fed of
 each condition, one rare event followed from the recording's message
 to the update that learned from it, and what to try with your own recordings."""
 
+NEXT = """\
+restock start BAG --out mine
+    the same stages on your own bag or MCAP file; it proposes how topics become signals
+restock sql {store} "FROM coverage_by_condition"
+    your questions, in SQL: docs/sql.md lists tables and columns
+restock coverage gaps {store} --mixture coverage
+    what the logs lack, and which missions would fill the gaps
+restock diagnose {run}
+    why a critic fails: because of what it was fed, or of its target?"""
+
+SAMPLE_OF_ONE = (
+    "Fed uniformly has the same network, settings, seed and steps; every row of the logs has the"
+    " same probability.",
+    "One seed each is a sample of one: docs/evidence.md has ten, and what 128,000 steps gave.",
+)
 UPDATES = 2000  # of the policy from the logs alone, as many as before driving in the twin
-RARE = "all rare ones"
-FULL_STEPS = 128_000  # in docs/evidence.md
 
 
-def before_and_after(to: Settings) -> list[dict[str, str]]:
-    """Count the missions of each kind that succeeded, before and after fine-tuning.
-
-    Beside these stand the policy fed uniformly and the planner, all on the floor that was trained
-    on. Empty if the task has no goal: nothing succeeds or fails.
-    """
-    from restock.train.run.kept_evaluations import shown_evaluation
-
-    rows = [row for row in shown_evaluation(to.run)[0].to_pylist() if row["perturbation"] == "none"]
-    others = [f"run:{path}" for path in (logs_alone(to), fed_uniformly(to))]
-    there = {row["policy"] for row in rows}
-    names = policy_words(one for one in (*others, "agent", "planner") if one in there)
-    driven = {n: [row for row in rows if row["policy"] == policy] for policy, n in names.items()}
-    if any(row["success"] is None for of in driven.values() for row in of):
-        return []
-    found = {row["condition"] for of in driven.values() for row in of}
-    kinds = sorted(found, key=lambda kind: (kind != "nominal", kind))
-    return [
-        {"mission": kind} | {name: _arrived(of, kind) for name, of in driven.items()}
-        for kind in [*kinds, RARE]
+def before_and_after(evaluated: Document) -> list[dict[str, str]]:
+    """Return a row for each kind of mission, with each policy's success on the training floor."""
+    rows = [
+        row
+        for row in evaluated["results"]
+        if row["perturbation"] == "none" and row["policy"] != "random"
     ]
-
-
-def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
-    """Count missions of a kind that arrived without a contact, with a 95 % interval."""
-    of = [
-        bool(row["success"])
-        for row in rows
-        if row["condition"] == kind or (kind == RARE and row["condition"] != "nominal")
-    ]
-    if not of:
-        return ""
-    low, high = wilson(sum(of), len(of))
-    return f"{sum(of)} of {len(of)} [{100 * low:.0f}, {100 * high:.0f}]"
-
-
-def steps_line(to: Settings) -> str:
-    """Say how far fine-tuning came, and how the other policy was fed."""
-    most, uniform = steps_of(to.run), fed_uniformly(to)
-    lines = [f"The agent is the fine-tuned policy: {most:,} steps in the twin here."]
-    if not most:
-        lines = ["The time was up before anything was driven: give more --seconds."]
-    if uniform.is_dir():
-        lines += [
-            "Fed uniformly has the same network, settings, seed and steps; every row of the logs"
-            " has the same probability.",
-            "One seed each is a sample of one: docs/evidence.md has ten, and says what"
-            f" {FULL_STEPS:,} steps gave.",
-        ]
-    return "\n".join(lines)
-
-
-def films(to: Settings) -> list[str]:
-    """Return where the films are, with the failing policy beside the fine-tuned one."""
-    from restock.train.evaluation.film import FOLDER
-
-    found = [str(path) for path in sorted((to.run / FOLDER).glob("*-rescue.webp"))]
-    where = "The policy that failed is on the left; the report shows them, too."
-    return [*found, where] if found else []
+    names = policy_words(row["policy"] for row in rows)
+    table: dict[str, dict[str, str]] = {}
+    for row in rows:
+        value = row["success"], row["success_low"], row["success_high"]
+        shown = table.setdefault(row["condition"], {"mission": row["condition"]})
+        shown[names[row["policy"]]] = interval_text(*value)
+    return list(table.values())
 
 
 def rare_event(to: Settings) -> list[str]:
-    """Follow a logged row of a rare condition from its message to an update, if there is one."""
-    row = _chosen(to.run)
-    if row is None:
-        return []
+    """Follow a logged row of a rare condition to its update and its recording, if there is one.
+
+    It is the one of the rarest condition with the largest TD error, of those audited.
+    """
     from restock.replay.trace.trace import trace_row
-
-    name = f"{row['gradient_step']}/{row['batch_row']}"
-    trace = trace_row(to.run, name)
-    recording = trace.origin.transition["source_file"] if trace.origin is not None else ""
-    command = f"restock trace {quoted(to.run)} {name}"
-    if recording and Path(recording).exists():
-        command += f" --recording {quoted(recording)}"
-        with suppress(RestockError):  # one that changed since is no reason to end the demo
-            trace = trace_row(to.run, name, recording=Path(recording))
-    return [*_told(trace, to), f"All of it: {command}"]
-
-
-def _chosen(run: Path) -> dict[str, Any] | None:
-    """Return the audited logged row of the rarest condition with the largest TD error."""
     from restock.train.run.run import Run
 
     rows = [
         row
-        for row in Run.open(run).table("audit").to_pylist()
+        for row in Run.open(to.run).table("audit").to_pylist()
         if row["source"] == "logs" and row["condition"] not in (None, "nominal", "unlabelled")
     ]
+    if not rows:
+        return []
     often = Counter(row["condition"] for row in rows)
-
-    def rank(row: dict[str, Any]) -> tuple[int, str, float]:
-        return -often[row["condition"]], row["condition"], abs(row["td"])
-
-    return max(rows, key=rank, default=None)
-
-
-def _told(trace: Trace, to: Settings) -> list[str]:
-    """Write the chain, with a line or two for each link."""
-    from restock.replay.panel.panel import Panel
-    from restock.train.run.replay_audit import fed_shares
-    from restock.train.run.run import Run
-
-    assert trace.audit is not None
-    audit, origin, run, panel = trace.audit, trace.origin, Run.open(to.run), Panel.open(to.panel)
-    lines = []
-    if origin is not None:
-        moment = origin.moment["log_time"].replace("T", " ").split("+")[0]
-        lines.append(f"recording  {origin.transition['source_file']}, {moment} UTC")
-        for message in origin.messages:
-            if said := _message(message.input, message.fields):
-                lines.append(f"message    {message.topic}, {message.age_s:.2f} s before: {said}")
-    stratum = next(one for one in panel.strata if one.name == audit["stratum"])
-    fed = next(row for row in fed_shares(run) if row["stratum"] == audit["stratum"])
-    drawn = [r for r in run.table("sampled_episodes").to_pylist() if r["source"] == "logs"]
-    often = sum(row["drawn_rows"] for row in drawn if row["episode"] == audit["episode"])
-    share = float((panel.meta_column("episode_id") == audit["episode"]).mean())
-    even = share * sum(row["drawn_rows"] for row in drawn)
-    ended = ", and its episode ends here" if audit["discount"] == 0 else ""
+    row = max(rows, key=lambda row: (-often[row["condition"]], row["condition"], abs(row["td"])))
+    name = f"{row['gradient_step']}/{row['batch_row']}"
+    trace = trace_row(to.run, name)
+    recorded, command = [], f"restock trace {quoted(to.run)} {name}"
+    if trace.origin is not None:
+        file = trace.origin.transition["source_file"]
+        recorded = [f"recording  {file}, {trace.origin.moment['log_time']}"]
+        command += f" --recording {quoted(file)}" if Path(file).exists() else ""
     return [
-        *lines,
-        f"row        {audit['transition_id']}, driven by the {audit['behaviour_policy']}",
-        f"           labelled {audit['condition']}; reward {audit['reward']:.2f}{ended}",
-        f"stratum    {stratum.name}: {stratum.natural_share:.1%} of the logs,"
-        f" {fed['drawn_share']:.1%} of the rows fed ({fed['logs_share']:.1%} logged)",
-        f"           its episode's rows were drawn {often:,} times; with equal probability: "
-        f"{even:,.0f}",
-        f"update     {audit['gradient_step']:,}, row {audit['batch_row']} of its batch",
-        f"           the critic predicted {audit['q']:.2f}, its target was"
-        f" {audit['q'] - audit['td']:.2f}",
-    ]
-
-
-def _message(name: str, fields: dict[str, Any]) -> str:
-    """Summarise a message in a few words; "" if that would be of little use."""
-    if name == "scan":
-        ranges = [r for r in fields.get("ranges", ()) if r is not None and math.isfinite(r)]
-        return f"the nearest return is {min(ranges):.2f} m away" if ranges else "no return"
-    if name == "command":
-        speed, turn = fields.get("linear.x", 0.0), fields.get("angular.z", 0.0)
-        return f"asked for {speed:.2f} m/s and {turn:.2f} rad/s"
-    return ""
-
-
-def next_steps(to: Settings) -> list[str]:
-    """List what to try on one's own logs: a command, and what it does."""
-    run, store = to.run, to.store
-    return [
-        "restock start BAG --out mine",
-        "    the same stages on your own bag or MCAP file; it proposes how topics become signals",
-        f'restock sql {quoted(store)} "FROM coverage_by_condition"',
-        "    your questions, in SQL: docs/sql.md lists tables and columns",
-        f"restock coverage gaps {quoted(store)} --mixture coverage",
-        "    what the logs lack, and which missions would fill the gaps",
-        f"restock diagnose {quoted(run)}",
-        "    why a critic fails: because of what it was fed, or of its target?",
-        "docs/tutorial.md, docs/your-robot.md",
-        "    what replay and target do, cell by cell; your robot, from bags to a policy",
+        *recorded,
+        f"row        {row['transition_id']}, driven by the {row['behaviour_policy']},"
+        f" labelled {row['condition']}; reward {row['reward']:.2f}",
+        f"update     {row['gradient_step']:,}, drawn from the stratum {row['stratum']}: the critic"
+        f" predicted {row['q']:.2f}, its target was {row['q'] - row['td']:.2f}",
+        f"All of it, with the messages: {command}",
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -44,17 +45,17 @@ def propose(document: Document) -> list[str]:
 
 def check(document: Document) -> list[str]:
     """Say what the profile finds, and what stands in for missing inputs."""
-    lines = [*document["problems"]]
     if (outcome := document["outcome"]) is None:
-        return lines
+        return list(document["problems"])
     made = counted(outcome["transitions"], "transition")
     episodes = counted(outcome["episodes"], "episode")
-    lines.append(f"{made} in {episodes} of {_time(outcome['duration_s'])}")
-    missing = [f"{item['input']} ({item['instead']})" for item in outcome["stand_ins"]]
-    shown = [line for line in missing if line.split()[0] in _TELLING]
-    if shown:
-        lines.append(f"not in the recording: {'; '.join(shown)}")
-    return lines
+    lines = [*document["problems"], f"{made} in {episodes} of {_time(outcome['duration_s'])}"]
+    missing = [
+        f"{item['input']} ({item['instead']})"
+        for item in outcome["stand_ins"]
+        if item["input"].split()[0] in _TELLING
+    ]
+    return lines + ([f"not in the recording: {'; '.join(missing)}"] if missing else [])
 
 
 _TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # named if missing
@@ -73,19 +74,18 @@ def ingest(document: Document) -> list[str]:
     ]
     if copies := len(held) - len(good):
         lines.append(f"{counted(copies, 'recording')} given again, as a copy: not counted")
-    dropped: dict[str, int] = {}
-    for row in good:
-        for drop in row["drops"]:
-            dropped[drop["reason"]] = dropped.get(drop["reason"], 0) + drop["count"]
     unknown = {
         one["condition"]: one["because"] for row in good for one in row["unknown_conditions"] or []
     }
     if unknown:
         why = ", ".join(dict.fromkeys(unknown.values()))
         lines.append(f"unknown for some or all rows ({why}): {', '.join(unknown)}")
+    dropped: Counter[str] = Counter()
+    for drop in (drop for row in good for drop in row["drops"]):
+        dropped[drop["reason"]] += drop["count"]
     if dropped:
-        worst = sorted(dropped.items(), key=lambda item: -item[1])[:3]
-        lines.append(f"ticks left out: {', '.join(f'{why} {n:,}' for why, n in worst)}")
+        worst = ", ".join(f"{why} {n:,}" for why, n in dropped.most_common(3))
+        lines.append(f"ticks left out: {worst}")
     failed = [row["error"].splitlines()[0] for row in rows if row["status"] == "failed"]
     lost = [f"lost: {row['path']}: {what}" for row in good for what in row["losses"]]
     return lines + _some([f"not ingested: {why}" for why in failed]) + _some(lost)
@@ -98,27 +98,18 @@ def _some(lines: list[str], most: int = 3) -> list[str]:
 
 
 def coverage(document: Document) -> list[str]:
-    """Count the rows that hold each condition."""
-    rows = document["rows"]
-    held = [f"{row['condition']} {row['rows_held']:,}" for row in rows if row["rows_held"]]
-    none = [row["condition"] for row in rows if row["rows_held"] == 0]
-    unknown = [row["condition"] for row in rows if row["rows_held"] is None]
-    lines = [f"rows that hold each condition: {', '.join(held)}"]
-    lines += [f"no row of {', '.join(none)}"] if none else []
-    return lines + (
-        [f"unknown (a signal or a plan is missing): {', '.join(unknown)}"] if unknown else []
-    )
+    """Count the rows that hold each condition; unknown: a signal or a plan is missing."""
+    counts = {row["condition"]: row["rows_held"] for row in document["rows"]}
+    shown = [f"{name} {'unknown' if n is None else f'{n:,}'}" for name, n in counts.items()]
+    return [f"rows that hold each condition: {', '.join(shown)}"]
 
 
 def audit(document: Document) -> list[str]:
     """Name the audits that failed or warned."""
     lines = []
     for status, word in (("fail", "failed"), ("warn", "warned")):
-        found = [item for item in document["audits"] if item["status"] == status]
-        if found:
-            lines.append(f"{len(found)} {word}: {', '.join(item['audit'] for item in found)}")
-        if status == "fail":
-            lines += [f"{item['audit']}: {item['doc']}" for item in found]
+        names = [item["audit"] for item in document["audits"] if item["status"] == status]
+        lines += [f"{len(names)} {word}: {', '.join(names)}"] if names else []
     return [*lines, "`restock audit STORE` explains each one"] if lines else ["all passed"]
 
 
@@ -149,18 +140,17 @@ def floor(document: Document) -> list[str]:
 
 
 def fit(document: Document) -> list[str]:
-    """Say which parameters the logs determine, and the distance before and after."""
-    (first, *_) = document["fits"]
-    reported = [
+    """Say which parameters the logs determine, and which they do not."""
+    estimates = document["fits"][0]["estimates"]
+    fitted = [
         f"{item['name']} {interval_text(item['value'], item['low'], item['high'], '.3g')}"
-        for item in first["estimates"]
+        for item in estimates
         if item["fitted"]
     ]
-    untold = [item["name"] for item in first["estimates"] if not item["fitted"]]
-    lines = [f"fitted: {', '.join(reported) or 'nothing'}"]
-    if untold:
-        lines.append(f"not identified by these logs: {', '.join(untold)}")
-    return lines
+    unknown = [item["name"] for item in estimates if not item["fitted"]]
+    return [f"fitted: {', '.join(fitted) or 'nothing'}"] + (
+        [f"not identified by these logs: {', '.join(unknown)}"] if unknown else []
+    )
 
 
 def gap(document: Document) -> list[str]:
@@ -191,21 +181,15 @@ def train(document: Document) -> list[str]:
 
 def driven(document: Document) -> list[str]:
     """Show success (or return) of each policy in the twin, with intervals by condition."""
-    clean = [row for row in document["results"] if row["perturbation"] == "none"]
-    lines = []
-    for policy in dict.fromkeys(row["policy"] for row in clean):
-        cells = []
-        for row in clean:
-            if row["policy"] != policy:
-                continue
-            if row["success"] is None:
-                cells.append(f"{row['condition']} return {row['return']:.2f}")
-            else:
-                ends = row["success_low"], row["success_high"]
-                cells.append(f"{row['condition']} {interval_text(row['success'], *ends)}")
-        lines.append(f"{policy}: {', '.join(cells)}")
-    lines += [clone["text"] for clone in document.get("clones", [])]
-    return lines
+    cells: dict[str, list[str]] = {}
+    for row in document["results"]:
+        text = f"return {row['return']:.2f}"
+        if row["success"] is not None:
+            text = interval_text(row["success"], row["success_low"], row["success_high"])
+        if row["perturbation"] == "none":
+            cells.setdefault(row["policy"], []).append(f"{row['condition']} {text}")
+    lines = [f"{policy}: {', '.join(of)}" for policy, of in cells.items()]
+    return lines + [clone["text"] for clone in document.get("clones", [])]
 
 
 def driven_on_ways(document: Document) -> list[str]:
@@ -237,11 +221,6 @@ def _estimate(row: Mapping[str, Any]) -> str:
         return "refused"
     text = interval_text(row["value"], row["low"], row["high"])
     return text if row["low"] is not None else f"{text} (no interval)"
-
-
-def report(document: Document) -> list[str]:
-    """Return no lines: the page is the outcome."""
-    return []
 
 
 def errors(text: str) -> list[str]:

@@ -49,7 +49,6 @@ class Settings:
     seconds: float = 150.0  # of training time
     episodes: int = 20  # evaluated per kind, policy and perturbation
     kinds: tuple[str, ...] = ()  # kinds of missions; none: all that the floor has room for
-    device: str = "cpu"
     mixture: str = "coverage"
     definitions: str | None = None  # as `open_recording` takes them
     salvage: bool = False
@@ -106,7 +105,7 @@ class Settings:
         settings = (word for setting in self.train for word in ("--set", setting))
         seconds = ["--seconds", f"{self.seconds:g}"] if timed else []
         place = ("--panel", str(panel), "--out", str(run))
-        return ["train", *place, *seconds, "--device", self.device, *settings]
+        return ["train", *place, *seconds, *settings]
 
 
 def own_file(name: Path | str | None) -> tuple[Path, ...]:

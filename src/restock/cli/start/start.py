@@ -15,10 +15,10 @@ from restock.cli.start.outcomes import Document
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Ended, Work, escape, speaker
 from restock.cli.words import Option, Positional, Repeated
-from restock.errors import ConfigError, ExitCode, RecordingError, counted, quoted
+from restock.errors import ConfigError, ExitCode, RecordingError, quoted
 
 HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
-ODOMETRY = "--odometry-as-command"
+AGAIN = "then run the same command again: finished stages are kept"
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
 
@@ -32,14 +32,12 @@ class Way:
     def __init__(self, requested: StartCommand, work: Work, first: str | None = None) -> None:
         self.requested, self.work = requested, work
         self.first = requested.paths[0] if first is None else first
-        self.again = f"then run the same command again: finished stages are kept in {requested.out}"
         self.to = Settings(
             logs=requested.paths,
             out=requested.out,
             profile=requested.profile or requested.out / "profile.toml",
             seconds=30.0 * requested.minutes,
             episodes=max(round(4 * requested.minutes), 1),
-            device=requested.device,
             mixture=requested.mixture,
             definitions=requested.definitions,
             salvage=requested.salvage,
@@ -68,11 +66,9 @@ class Way:
         found = self.work.do(stages.info(self.to))
         readable = list(found.document.get("recordings", ()))
         if not (found.good or readable):
-            known = "give a file, a bag's folder, or a folder of bags"
-            if any("cannot be read" in why for why in found.errors):
-                known = "see the message for each above, or give other recordings"
             damaged = any("--salvage" in why for why in found.errors)
-            raise Stop("no recording can be read", SALVAGING if damaged else known)
+            other = "give other recordings: the messages above say why"
+            raise Stop("no recording can be read", SALVAGING if damaged else other)
         if not found.good:
             intact = f"the {len(readable)} that can be read"
             self.work.say(f"   continuing with {intact}; or {SALVAGING}")
@@ -83,33 +79,21 @@ class Way:
         requested, to = self.requested, self.to
         recording = decisions.fullest(readable) or self.first
         own = requested.profile is not None
-        proposed = not own and not decisions.edited(to.profile, requested.out)
-        if proposed:
+        if not own and not decisions.edited(to.profile, requested.out):
             self._propose(requested.paths if len(readable) != 1 else (recording,))
         elif requested.urdf is not None:
-            why = "given" if own else "edited"
-            self._warn(
-                f"{to.profile} was {why}: --urdf can only change a proposal, and has no effect"
-            )
+            self._warn(f"--urdf can only change a proposal, and has no effect on {to.profile}")
         left_out, base = ([], None) if own or self.work.plan else decisions.proposal(requested.out)
         mine = [row for row in readable if row["path"] not in left_out]
         if len(mine) < len(readable):
             self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
             recording = decisions.fullest(mine) or recording
-        recording = base or recording
-        checked = self.work.do(stages.check(to, recording))
+        checked = self.work.do(stages.check(to, base or recording))
         if not checked.good:
-            known = "; if it is from another robot, give only the recordings of this one"
-            raise Stop(
-                f"the profile does not fit {recording}",
-                f"edit {to.profile}{known if len(readable) > 1 else ''}",
-                self.again,
-            )
+            raise Stop(f"the profile does not fit {base or recording}", f"edit {to.profile}", AGAIN)
         outline = decisions.wrong_outline(checked.document, to.profile)
         if outline is not None and not requested.accept:
             raise outline
-        if not self.work.plan:
-            self.work.say(f"   the robot in the twin: {escape(decisions.robot_line(to.profile))}")
 
     def _propose(self, sources: tuple[str, ...]) -> None:
         requested, to = self.requested, self.to
@@ -123,23 +107,16 @@ class Way:
             Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
             raise Stop("; ".join(document["problems"]), "give recordings of a robot on wheels")
         if problems := document.get("problems"):
-            reported = f"edit {to.profile}: its first lines list what is missing"
-            if document.get("missing"):
-                reported = (
-                    "give recordings that contain it; or, if a topic in these recordings does, "
-                    f"edit {to.profile}, whose first lines list the topics"
-                )
-            if any(ODOMETRY in problem for problem in problems):
-                reported = (
-                    f"propose it by `restock profile new {quoted(sources[0])} {ODOMETRY}"
-                    f" --hindsight-goals --out FILE.toml`, and add --profile FILE.toml to this"
-                    f" command; or {reported}"
-                )
-            raise Stop("; ".join(problems), reported, self.again)
+            raise Stop(
+                "; ".join(problems),
+                f"edit {to.profile}, whose first lines list the topics and what is missing; or give"
+                " recordings that contain it, or a profile of your own (--profile)",
+                AGAIN,
+            )
         if requested.accept:
             return
         if kinds := document.get("kinds"):
-            raise decisions.several_kinds(kinds, requested)
+            raise decisions.several_kinds(kinds, requested.out)
         if driving := document.get("commands", []):
             raise Stop(
                 f"several topics may be the command that drives the robot: {', '.join(driving)}; "
@@ -152,7 +129,7 @@ class Way:
         """Ingest and mix; return the documents of coverage and panel."""
         to, do = self.to, self.work.do
         if not do(stages.ingest(to)).good:
-            raise Stop("nothing could be ingested", f"edit {to.profile}", self.again)
+            raise Stop("nothing could be ingested", f"edit {to.profile}", AGAIN)
         covered = do(stages.coverage(to))
         do(stages.audit(to))
         mixed = do(stages.mix(to))
@@ -160,7 +137,7 @@ class Way:
             raise Stop(
                 "the mixture does not fit these logs",
                 "write one that fits (docs/mixture.md), and add --mixture FILE to the command",
-                self.again,
+                AGAIN,
             )
         return covered.document, mixed.document
 
@@ -171,22 +148,14 @@ class Way:
             return None
         floor = self.work.do(stages.floor(to))
         if not floor.good and to.map is not None:
-            sized = (
-                f"measure the robot, and edit length_m and width_m of [task.body] in {to.profile}"
-            )
             raise Stop(
                 f"{to.map} cannot be the floor of these recordings",
-                *([sized] if any("[task.body]" in why for why in floor.errors) else ()),
+                *floor.errors[:1],
                 "give the map.yaml in which the robot was localised, or leave out --map: the "
                 "floor is then made from the recordings",
-                self.again,
+                AGAIN,
             )
-        if others := floor.document.get("elsewhere"):
-            self._warn(
-                f"{counted(len(others), 'recording')} in other frames: their routes are not on the"
-                " floor"
-            )
-        settings = decisions.practice_settings(to.profile)
+        settings = ["practice.rule=success"] if decisions.has_goal(to.profile) else []
         if floor.good:
             kinds, unseen = decisions.possible_kinds(to, floor.document)
             settings += decisions.floor_settings(to, kinds)
@@ -229,7 +198,7 @@ class Way:
         self.to = replace(self.to, train=tuple(settings))
         trained = self.work.do(stages.train(self.to, twin=twin))
         if not trained.good:
-            raise Stop("training did not finish", *trained.errors[:2], self.again)
+            raise Stop("training did not finish", *trained.errors[:2], AGAIN)
 
     def _judge(self, floor: Ended | None, panel: Document) -> None:
         """Evaluate in the twin and on held-out logs, and write one page."""
@@ -250,11 +219,11 @@ class Way:
                 f"be evaluated{'' if floor is None else ' on logs'}. Ingest more recordings.[/]"
             )
         if not do(stages.report(to)).good:
-            raise Stop("there is no report", self.again)
+            raise Stop("there is no report", AGAIN)
         if failed := [ended for ended in judged if not ended.good]:
             why_failed = [one for ended in failed for one in ended.errors[:1]]
             names = " and ".join(f"`{ended.command}`" for ended in failed)
-            raise Stop(f"the report lacks the stages that failed: {names}", *why_failed, self.again)
+            raise Stop(f"the report lacks the stages that failed: {names}", *why_failed, AGAIN)
 
 
 @dataclass
@@ -300,8 +269,6 @@ class StartCommand:
     the limits of `restock twin gap`."""
     accept: bool = False
     """Continue with the proposal as it is, even if it left a choice to a person."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network trains."""
     dry_run: bool = False
     """Print the commands that would run; run nothing."""
     json: bool = False
@@ -355,44 +322,29 @@ class StartCommand:
         for path in [path for name in self.paths for path in recordings_in(name)]:
             try:
                 refuse_no_recording(path)
+                return str(path)
             except RecordingError as error:
                 wrong.append(error)
-            else:
-                return str(path)
         raise wrong[0]
 
     def _check(self) -> None:
-        """Check what is given beside the recordings, before anything is written.
+        """Read what is given beside the recordings, before anything is written.
 
         Raises:
-            ConfigError, RecordingError: it cannot.
+            ConfigError, RecordingError: it cannot be read.
         """
-        if self.tag:
-            from restock.ingest.profile.tag_rules import parse_tags
-
-            parse_tags(self.tag, empty=True)
-        if self.out.exists() and not self.out.is_dir():
-            raise ConfigError(
-                "is a file",
-                where=str(self.out),
-                remedy="give a folder with --out: it need not exist",
-            )
         from restock.ingest.decoding.definitions import choose_definitions
+        from restock.ingest.profile.profile import load_profile
+        from restock.ingest.profile.tag_rules import parse_tags
+        from restock.ingest.propose.robot_choice import read_urdf
         from restock.replay.mixture.mixture import load_mixture
 
+        parse_tags(self.tag, empty=True)
         choose_definitions(self.definitions)
         load_mixture(self.mixture)
         if self.profile is not None:
-            from restock.ingest.profile.profile import load_profile
-
             load_profile(self.profile)
-        if self.device != "cpu":
-            from restock.train.dqn.learner import open_device
-
-            open_device(self.device)
         if self.urdf is not None:
-            from restock.ingest.propose.robot_choice import read_urdf
-
             read_urdf(self.urdf)
         if self.map is not None:
             from restock.train.twin.floors.floor_files import read_grid

@@ -110,12 +110,10 @@ class Work:
             return self._note(Ended(stage.name, stage.line(), "planned"))
         stamp = self._stamp(stage)
         if (kept := self._before(stage, stamp)) is not None:
-            self._stamps.append(stamp)
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]  [dim]done before[/dim]")
             return self._note(kept)
         if stage.decided is not None:
             if (command := stage.decided()) is None:
-                self._stamps.append(stamp)
                 return self._note(Ended(stage.name, "", "kept", outcome=["nothing to do"]))
             stage = replace(stage, command=command)
         began = self._known.get(stage.name, {})
@@ -128,7 +126,6 @@ class Work:
         # Begun, not ended: if this process dies now, the stage is run again.
         self._known[stage.name] = {"stamp": stamp, "status": "begun"}
         self._keep()
-        self._stamps.append(stamp)
         return self._note(self._run(stage, stamp), reported=stage.shows_progress)
 
     def _run(self, stage: Stage, stamp: str) -> Ended:
@@ -192,7 +189,8 @@ class Work:
     def _stamp(self, stage: Stage) -> str:
         """Hash all that decides a result: the command, the user's files, and the stages before."""
         parts = [stage.line(), *self._stamps[-1:], *(_fingerprint(path) for path in stage.reads)]
-        return hashlib.blake2b(os.fsencode("\n".join(parts)), digest_size=12).hexdigest()
+        self._stamps.append(_digest(os.fsencode("\n".join(parts))))
+        return self._stamps[-1]
 
     def _clear(self, stage: Stage) -> None:
         """Remove what an earlier call made of the stage; a run, which took long, is put aside."""
@@ -293,6 +291,10 @@ def _fingerprint(path: Path) -> str:
         status = file.stat()
         reported = f"{status.st_size} {status.st_mtime_ns}"
         if status.st_size <= SMALL_BYTES:
-            reported = hashlib.blake2b(file.read_bytes(), digest_size=12).hexdigest()
+            reported = _digest(file.read_bytes())
         parts.append(f"{file} {reported}")
     return "\n".join(parts)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=12).hexdigest()
