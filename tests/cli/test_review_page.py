@@ -5,7 +5,6 @@ import http.client
 import json
 import shutil
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -23,7 +22,6 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.review.events import doubtful_events
 from restock.replay.review.journal import NAME, Entry, Journal
 from restock.replay.store.store import Store
-from restock.report.fleet import review as review_module
 from restock.report.fleet.review import PORT, Review, Server
 from restock.stats import wilson
 
@@ -344,17 +342,6 @@ def test_another_port_is_taken_if_it_is_in_use(in_process, store):
         assert second.server_port != PORT
     review.close()
     assert f"port {PORT} is in use: this review has port" in said[-1]
-
-
-def test_a_browser_that_closes_is_said_once(in_process, monkeypatch):
-    server, said = in_process
-    said.clear()
-    server.review.state(0, "anna")
-    monkeypatch.setattr(review_module, "ALONE_S", -1.0)
-    while not said:  # the server's thread says it
-        time.sleep(0.05)
-    assert len(said) == 1
-    assert "no page is open any more: 0 verdicts are kept in" in said[0]
 
 
 def given(review: Review, place: int = 0, **changed: object) -> Entry:

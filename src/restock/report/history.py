@@ -11,15 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import altair as alt
-
 from restock.errors import RestockError, RunError, counted
 from restock.ingest.store.location import Location
 from restock.replay.places import kind_beside
 from restock.replay.store.store import Store, is_store
 from restock.report.fleet.coverage import coverage_weeks
-from restock.report.look import blocks, charts
-from restock.report.look.blocks import Figure, Rows, Section, Table, better_and_worse, count, words
+from restock.report.look.blocks import Rows, Section, Table, better_and_worse, count, words
 from restock.stats import interval_text
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.judge.compare import diff_runs, last_evaluation
@@ -65,15 +62,18 @@ def history_page(folder: Path) -> dict[str, Any]:
     fed_from = ((one.run.document.get("panel") or {}).get("store") for one in runs)
     weeks = list(_read(_weeks, stores or map(Path, filter(None, dict.fromkeys(fed_from))), missing))
     changes = [_change(a.run, b.run) for a, b in itertools.pairwise(runs)]
+    headline = f"{counted(len(runs), 'run')}, {counted(len(weeks), 'store')}"
+    if changes:
+        before, last = _names(runs)[-2:]
+        headline = f"{last}, the latest run, against {before}: {_outcome(changes[-1])}"
     return {
         "kicker": "runs and weeks",
         "title": folder.resolve().name,
-        "headline": _headline(runs, changes, len(weeks)),
+        "headline": headline,
         "lead": "Runs are in the order in which they began, each beside the run before it.",
         "sections": [
             _runs(runs),
             _changes(runs, changes),
-            _fed(runs),
             *weeks,
             Section("missing", "What could not be read", tables=[Table(missing)])
             if missing
@@ -147,14 +147,6 @@ def _change(before: Run, run: Run) -> dict[str, Any]:
         return {"why": str(error), "settings": [], "evaluation": []}
 
 
-def _headline(runs: Sequence[_Seen], changes: Rows, stores: int) -> str:
-    """Say what the last run does better or worse than the one before it."""
-    if not changes:
-        return f"{counted(len(runs), 'run')}, {counted(stores, 'store')}"
-    before, last = _names(runs)[-2:]
-    return f"{last}, the latest run, against {before}: {_outcome(changes[-1])}"
-
-
 def _outcome(change: dict[str, Any]) -> str:
     """Name the conditions whose success differs, by the interval of the paired episodes."""
     if "why" in change:
@@ -171,17 +163,18 @@ def _outcome(change: dict[str, Any]) -> str:
 def _runs(runs: Sequence[_Seen]) -> Section | None:
     if not runs:
         return None
-    table, dots = [], []
+    table = []
     for name, one in zip(_names(runs), runs, strict=True):
         panel, began = one.run.document.get("panel") or {}, _began(one.run) / 1e9
         logs = f"{Path(panel['store']).name}@{panel['store_version']}" if panel else "none"
-        known = [row for row in one.success if row["success"] is not None]
+        fed = [f"{words(row['stratum'])} {row['drawn_share']:.1%}" for row in one.fed]
         table.append(
             {
                 "run": name,
                 "began": f"{datetime.fromtimestamp(began, UTC):%Y-%m-%d %H:%M}",
                 "logs": logs,
                 "logged rows": count(panel.get("rows")),
+                "fed": ", ".join(fed),
                 "environment steps": count(one.env_steps),
                 "driven by": one.by,
                 "episodes": count(sum(row["episodes"] for row in one.success)),
@@ -189,18 +182,18 @@ def _runs(runs: Sequence[_Seen]) -> Section | None:
                     words(row["condition"]): interval_text(
                         row["success"], row["success_low"], row["success_high"]
                     )
-                    for row in known
+                    for row in one.success
+                    if row["success"] is not None
                 },
             }
         )
-        dots += [row | {"run": name} for row in known]
     return Section(
         "runs",
         "Which runs, and how well do they drive?",
-        intro="Success by condition with 95 % Wilson intervals, unperturbed: of `restock eval` if"
-        " there is one, else of the last evaluation in training. Runs may have driven other"
-        " missions: the table below counts only those that both of a pair drove.",
-        figures=[Figure(_dots(dots), "Success by run and condition")] if dots else [],
+        intro="Fed: shares of all rows that the critic was fed. Success by condition with 95 %"
+        " Wilson intervals, unperturbed: of `restock eval` if there is one, else of the last"
+        " evaluation in training. Runs may have driven other missions: the table below counts only"
+        " those that both of a pair drove.",
         tables=[_even(table)],
     )
 
@@ -209,21 +202,6 @@ def _even(rows: Rows) -> Table:
     """Return a table of rows of which not all have the same columns."""
     columns = dict.fromkeys(column for row in rows for column in row)
     return Table([dict.fromkeys(columns, "") | row for row in rows])
-
-
-def _dots(rows: Rows) -> blocks.Drawing:
-    shown = charts.in_words(rows)
-    return charts.estimates(
-        shown,
-        y="run",
-        series="condition",
-        names=charts.ordered(shown, "condition", blocks.WORDS_COLOURS),
-        colours=blocks.WORDS_COLOURS,
-        value="success",
-        ends=("success_low", "success_high"),
-        title="success",
-        x_scale=alt.Scale(domain=[0, 1]),
-    )
 
 
 def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
@@ -269,25 +247,6 @@ def _logs(panels: dict[str, Any] | None) -> str:
         return str(panels["note"])
     rows = panels["rows"]
     return f"{rows['in']:,} rows in, {rows['out']:,} out, {rows['both']:,} in both"
-
-
-def _fed(runs: Sequence[_Seen]) -> Section | None:
-    if not any(one.fed for one in runs):
-        return None
-    table = [
-        {"run": name}
-        | {
-            words(row["stratum"]): f"{row['drawn_share']:.1%} (of {row['wanted_share']:.1%})"
-            for row in one.fed
-        }
-        for name, one in zip(_names(runs), runs, strict=True)
-    ]
-    return Section(
-        "fed",
-        "What was each critic fed?",
-        intro="Share of all rows fed, and the share that its mixture wanted.",
-        tables=[_even(table)],
-    )
 
 
 def _weeks(place: Path) -> Section | None:

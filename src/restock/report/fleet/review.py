@@ -14,12 +14,11 @@ import json
 import secrets
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import jinja2
@@ -116,7 +115,6 @@ PORT = 7474  # taken if it is free, so that an SSH tunnel can be prepared
 HOSTS = ("127.0.0.1", "localhost")
 NOTHING = "default-src 'none'"  # a policy of what is not a page
 MAX_BODY_BYTES = 256 << 10
-WATCHED_S, ALONE_S = 12.0, 15.0  # without a sign of a page: others look there, nobody is there
 
 
 class Review:
@@ -130,7 +128,6 @@ class Review:
         self.moments = Moments(self.store)
         self._now = self.store  # of the newest version, against which verdicts are checked
         self._lock = threading.RLock()  # neither store nor journal is for several threads
-        self._watching: dict[str, tuple[str, float]] = {}  # browser -> event, when
 
     def close(self) -> None:
         """Close the stores."""
@@ -156,13 +153,10 @@ class Review:
         event: dict[str, Any] = events[place]
         return event
 
-    def state(self, after: int, by: str, at: str = "") -> dict[str, Any]:
-        """Return the journal's lines from one on, and what others look at."""
+    def state(self, after: int) -> dict[str, Any]:
+        """Return the journal's lines from one on, and the conflicts among its verdicts."""
         with self._lock:
             self.journal.refresh()
-            now = time.monotonic()
-            if by:
-                self._watching[by] = (at, now)
             lines = self.journal.lines
             whole = not 0 < after <= len(lines)
             return {
@@ -170,11 +164,6 @@ class Review:
                 "all": whole,
                 "next": len(lines),
                 "conflicts": msgspec.to_builtins(self.journal.conflicts()),
-                "watched": [
-                    event
-                    for browser, (event, when) in self._watching.items()
-                    if browser != by and now - when < WATCHED_S and event
-                ],
             }
 
     def give(self, entries: list[Entry]) -> None:
@@ -202,19 +191,12 @@ class Review:
             self._now = Store(self.place)
         return self._now
 
-    def is_alone(self) -> bool:
-        """Return whether there was a page, and there is none any more."""
-        last = max((when for _, when in self._watching.values()), default=None)
-        return last is not None and time.monotonic() - last > ALONE_S
-
 
 class _Asked(msgspec.Struct):
     """What the page sends."""
 
     entries: list[Entry] = []  # verdicts that it gives
     after: int = 0  # lines of the journal that it has
-    by: Annotated[str, msgspec.Meta(max_length=40)] = ""
-    at: Annotated[str, msgspec.Meta(max_length=200)] = ""  # the event that it shows
 
 
 class Server(ThreadingHTTPServer):
@@ -225,7 +207,6 @@ class Server(ThreadingHTTPServer):
     def __init__(self, review: Review, say: Callable[[str], None]) -> None:
         self.review, self.say = review, say
         self.token = secrets.token_urlsafe(18)
-        self._alone = False
         try:
             super().__init__(("127.0.0.1", PORT), Handler)
         except OSError:
@@ -235,18 +216,6 @@ class Server(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         return f"http://127.0.0.1:{self.server_port}/{self.token}/"
-
-    def service_actions(self) -> None:
-        """Say once that no browser has the page open any more."""
-        alone = self.review.is_alone()
-        if alone and not self._alone:
-            count = len(self.review.journal.counting())
-            self.say(
-                f"no page is open any more: {count} verdicts are kept in"
-                f" {self.review.journal.path}; the address still works, Ctrl-C writes them into"
-                " the store"
-            )
-        self._alone = alone
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Let a browser that went away be; say anything else."""
@@ -324,13 +293,13 @@ class Handler(BaseHTTPRequestHandler):
             review.give(posted.entries)
         elif path == "write":
             written = review.write()
-            state = review.state(posted.after, posted.by)
+            state = review.state(posted.after)
             self._send(200, json.dumps(written.document | {"state": state}, default=str))
             return
         elif path != "state":
             self._send(404, json.dumps({"error": "there is nothing here"}))
             return
-        self._send(200, json.dumps(review.state(posted.after, posted.by, posted.at)))
+        self._send(200, json.dumps(review.state(posted.after)))
 
     def _send(
         self, status: int, text: str, kind: str = "application/json", policy: str | None = None

@@ -41,7 +41,7 @@ POLICY_COLOURS = {
     "random": "#9ca3af",
 }
 # Colours of other policies, distinct from each other and from those above in both themes.
-POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d")
+POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d", "#cc79a7", "#84643a")
 
 FEW_POINTS = 10  # a line of at most so many points shows each of them
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
@@ -339,19 +339,9 @@ def shares(rows: Sequence[Row], y: str, colours: Mapping[str, str]) -> Drawing:
     return draw(chart)
 
 
-# None is a reference's: planner and operator have their colours of every report.
-ARM_COLOURS = ("#0f766e", "#7c3aed", "#cc79a7", "#84643a", "#56b4e9", "#b58900", "#6b7280")
 _PERCENT = alt.Axis(format=".1~%", values=[0, 0.25, 0.5, 0.75, 1])
 _SHARE = alt.Scale(domain=[0, 1])
 _QUIET = alt.Axis(grid=False, ticks=False)
-
-
-def colours(arms: list[str]) -> dict[str, str]:
-    """Return a colour for each arm, the same in every chart; references have their own."""
-    found = {arm: POLICY_COLOURS[arm] for arm in arms if arm in POLICY_COLOURS}
-    free = [colour for colour in ARM_COLOURS if colour not in found.values()]
-    others = [arm for arm in arms if arm not in found]
-    return found | {arm: free[place % len(free)] for place, arm in enumerate(others)}
 
 
 def intervals(rows: Rows, arms: list[str]) -> Drawing:
@@ -361,7 +351,7 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
         y="condition",
         series="arm",
         names=arms,
-        colours=colours(arms),
+        colours=POLICY_COLOURS,
         value="value",
         ends=("low", "high"),
         title="success",
@@ -387,7 +377,7 @@ def differences(rows: Rows) -> Drawing:
         y="condition",
         series="perturbation",
         names=names,
-        colours=colours(names),
+        colours=POLICY_COLOURS,
         value="difference",
         ends=ends,
         title="difference in success (points)",
@@ -405,7 +395,7 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
         across = math.ceil(len(conditions) / math.ceil(len(conditions) / most))  # even lines
         base = plot(shown).encode(
             x=alt.X("env_steps:Q", title="environment steps", axis=x_axis(width // across)),
-            color=coloured("arm", arms, colours(arms), width),
+            color=coloured("arm", arms, POLICY_COLOURS, width),
         )
         axis, domain = alt.Axis(format=".1~%"), alt.Scale(domain=[0, 1], padding=4)
         band = (

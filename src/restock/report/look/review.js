@@ -29,7 +29,7 @@
       return own;
     }
   })();
-  let lines = [], read = 0, disputes = [], watched = [];
+  let lines = [], read = 0, disputes = [];
   const given = [];  // ids of what was given here, an action each: for undo
 
   function counting() {
@@ -69,12 +69,11 @@
     lines = state.all ? state.lines : [...lines, ...state.lines];
     read = state.next;
     disputes = state.conflicts;
-    watched = state.watched;
     settle();
   }
   async function give(entries) {
     if (page.online) {
-      take(await ask("verdicts", { entries, after: read, by: me }));
+      take(await ask("verdicts", { entries, after: read }));
     } else {
       lines.push(...entries);
       try {
@@ -106,7 +105,7 @@
   function nextOpen() {
     const place = queue.indexOf(here);
     const rest = [...queue.slice(place + 1), ...queue.slice(0, place + 1)];
-    return rest.find((e) => open(e) && !watched.includes(e.event)) ?? rest.find(open) ?? null;
+    return rest.find(open) ?? null;
   }
   function move(by) {
     const place = queue.indexOf(here) + by;
@@ -656,7 +655,7 @@
   async function write() {
     if (page.online) {
       try {
-        const done = await ask("write", { after: read, by: me });
+        const done = await ask("write", { after: read });
         take(done.state);
         const held = done.held_back.length ? ` Held back: ${done.held_back.join("; ")}.` : "";
         say(`${done.verdicts} verdicts are in the store${done.version === null ? "" : `, version ${done.version}`}.${held}`, held ? "bad" : "good");
@@ -687,10 +686,10 @@
 
   async function begin() {
     if (page.online) {
-      take(await ask("state", { after: 0, by: me }));
+      take(await ask("state", { after: 0 }));
       setInterval(async () => {
         try {
-          take(await ask("state", { after: read, by: me, at: here?.event ?? "" }));
+          take(await ask("state", { after: read }));
           refresh();
         } catch (error) { say(error.message, "bad"); }
       }, 3000);

@@ -10,7 +10,7 @@ from restock.errors import counted
 from restock.report.look import charts
 from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, words
 from restock.report.run.facts import Facts
-from restock.stats import ConfidenceInterval
+from restock.stats import ConfidenceInterval, interval_text
 from restock.train.twin.calibration.gap import AFTER, BEFORE
 from restock.train.twin.calibration.twin_gap import (
     TRUSTED,
@@ -149,6 +149,5 @@ def _interval(interval: ConfidenceInterval, unit: str) -> str:
     if math.isnan(interval.value):
         return ""
     form = ".3f" if 0 < interval.value < 0.1 else ".2f"
-    text = f"{interval.value:{form}} {unit}".strip()
-    ends = f" [{interval.low:{form}}, {interval.high:{form}}]"
-    return text if math.isnan(interval.low) else text + ends
+    low = None if math.isnan(interval.low) else interval.low
+    return f"{interval_text(interval.value, low, interval.high, form)} {unit}".strip()
