@@ -1,9 +1,9 @@
 """Probabilities of conditions, named parts of their rules, and the noise that a profile states."""
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from support.profile_texts import WAREHOUSE
+from support.step_tables import steps
 from support.stores import recording_transitions, write_store
 
 from restock.errors import ConfigError
@@ -18,7 +18,6 @@ from restock.ingest.task.conditions import (
     shipped,
     too_near_to_call,
 )
-from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Noise
 from restock.replay.store.store import Store
 
@@ -37,20 +36,6 @@ CASE WHEN step_index > 0 THEN 1 / (1 + exp(-smooth_mps / lidar_noise_m)) END
 """
 
 
-def steps(speeds: list[float]) -> pa.Table:
-    count = len(speeds)
-    given = {
-        "wheel_speed_mps": speeds,
-        "step_index": np.arange(count),
-        "stamp_ns": np.arange(count) * 200_000_000,
-    }
-    columns = [
-        pa.array(given.get(field.name, np.zeros(count))).cast(field.type, safe=False)
-        for field in steps_schema()
-    ]
-    return pa.table(columns, schema=steps_schema())
-
-
 def condition(text: str = FILE, noise_m: float = 0.1) -> Condition:
     made = Condition(name="fast", **settings_of(text))
     return made.with_constants(Noise(lidar_m=noise_m).constants)
@@ -61,7 +46,7 @@ def test_parts_of_a_condition_file():
     assert (fast.doc, fast.timing, fast.priority) == ("Fast, for a while.", "pre", 35)
     assert list(fast.let) == ["over_mps", "smooth_mps"]
     assert fast.constants == {"lidar_noise_m": 0.1}  # what it names, and no more
-    table = steps([0.5, 0.7, 0.1, 0.9, 0.9])
+    table = steps(5, wheel_speed_mps=np.array([0.5, 0.7, 0.1, 0.9, 0.9]))
     assert label(table, [fast])["fast"].tolist() == [False, True, False, False, True]
     given = probabilities(table, [fast])["fast"]
     assert np.isnan(given[0])
@@ -71,7 +56,7 @@ def test_parts_of_a_condition_file():
 
 
 def test_more_noise_makes_a_probability_less_sure():
-    table = steps([0.5, 0.7, 0.9])
+    table = steps(3, wheel_speed_mps=np.array([0.5, 0.7, 0.9]))
     sure, unsure = (probabilities(table, [condition(noise_m=n)])["fast"][2] for n in (0.05, 0.5))
     assert sure > 0.95 > unsure > 0.5
 
@@ -100,7 +85,7 @@ def test_the_version_of_labels_follows_what_can_change_them():
 )
 def test_a_probability_keeps_the_rules_of_a_label(text, said):
     with pytest.raises(ConfigError, match=said):
-        probabilities(steps([0.5, 0.7, 0.9]), [condition(text)])
+        probabilities(steps(3), [condition(text)])
 
 
 def test_noise_of_a_profile_does_not_change_rows():

@@ -5,50 +5,19 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.step_tables import changed, steps
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task import conditions
 from restock.ingest.task.conditions import Condition, label, let_values, primary, shipped
-from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.task import STAND_IN_LIMITS, Noise
 
 SHIPPED = list(shipped().values())
 
 
-def steps(count: int, episodes: list[int] | None = None, **signals: object) -> pa.Table:
-    """Return steps of a robot that drives at .5 m/s with nothing near, but for these signals."""
-    usual = {
-        "stamp_ns": np.arange(count) * 200_000_000,
-        "pose_stamp_ns": np.arange(count) * 200_000_000,
-        "wheel_speed_mps": np.full(count, 0.5),
-        "localised_speed_mps": np.full(count, 0.5),
-        "clearance_m": np.full(count, 2.0),
-        "clearance_ahead_m": np.full(count, 2.0),
-        "plan_return_m": np.full(count, 4.0),
-        "plan_gap_m": np.full(count, 4.0),
-        "bumped": np.zeros(count, np.bool_),
-        "command_speed_mps": np.full(count, 0.5),
-        "waypoint_near_x_m": np.ones(count),
-        "waypoint_far_x_m": np.full(count, 2.2),
-    } | signals
-    of = np.zeros(count, np.int32) if episodes is None else np.array(episodes, np.int32)
-    columns = {
-        column.name: pa.array(usual.get(column.name, np.zeros(count))).cast(column.type, safe=False)
-        for column in SIGNAL_COLUMNS
-    }
-    step = np.concatenate([np.arange((of == e).sum()) for e in np.unique(of)])
-    return pa.table({"episode_index": of, "step_index": step, **columns})
-
-
 def given_to(table: pa.Table, name: str) -> list[int]:
     return np.flatnonzero(label(table, [shipped()[name]])[name]).tolist()
-
-
-def changed(value: float, usual: float, count: int, at: slice) -> np.ndarray:
-    column = np.full(count, usual)
-    column[at] = value
-    return column
 
 
 def test_nothing_is_labelled_where_nothing_happens():
@@ -181,9 +150,6 @@ def test_who_walks_up_is_seen_whatever_the_control_period(period_s: float):
             assert set(range(held[0], ends)) <= set(held)
         else:
             assert held == []
-
-
-values = st.floats(-2, 4, width=32)
 
 
 @st.composite

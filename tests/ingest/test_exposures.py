@@ -8,12 +8,11 @@ import pyarrow as pa
 import pytest
 from support.driven_robot import Drive, write_bag
 from support.profile_texts import WAREHOUSE as TEXT
+from support.step_tables import changed, steps
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
-from restock.ingest.store.manifest import label_scores
 from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
-from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.replay.store.store import Store
 
 SHIPPED = list(shipped().values())
@@ -28,40 +27,21 @@ sql = "pose_x_m > 2"
 """
 
 
-def steps(count: int, **signals: object) -> pa.Table:
-    """Return steps of one episode at .5 m/s with nothing near, but for these signals."""
-    usual = {"wheel_speed_mps": np.full(count, 0.5), "localised_speed_mps": np.full(count, 0.5),
-             "clearance_m": np.full(count, 2.0), "clearance_ahead_m": np.full(count, 2.0),
-             "plan_return_m": np.full(count, 4.0)} | signals  # fmt: skip
-    columns = {
-        column.name: pa.array(usual.get(column.name, np.zeros(count))).cast(column.type, safe=False)
-        for column in SIGNAL_COLUMNS
-    }
-    index = np.arange(count)
-    return pa.table({"episode_index": np.zeros(count, np.int32), "step_index": index, **columns})
-
-
-def changed(value: float, usual: float, at: slice) -> np.ndarray:
-    column = np.full(20, usual)
-    column[at] = value
-    return column
-
-
 def exposed(table: pa.Table, name: str) -> list[int]:
     return np.flatnonzero(label(table, [shipped(kind="exposure")[name]])[name]).tolist()
 
 
 def test_each_situation_is_told_by_what_is_known_before_acting():
     assert exposed(steps(20), "closing_traffic") == []
-    someone = steps(20, came_nearer_m=changed(0.1, 0.0, slice(8, 10)))
+    someone = steps(20, came_nearer_m=changed(0.1, 0.0, 20, slice(8, 10)))
     assert exposed(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
     noise = steps(20, came_nearer_m=np.full(20, 0.03))
     assert exposed(noise, "closing_traffic") == []
-    pallet = {"plan_return_m": changed(1.5, 4.0, slice(5, 15))}
+    pallet = {"plan_return_m": changed(1.5, 4.0, 20, slice(5, 15))}
     assert exposed(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
-    walker = {"came_nearer_m": changed(0.15, 0.0, slice(3, 5))}
+    walker = {"came_nearer_m": changed(0.15, 0.0, 20, slice(3, 5))}
     assert exposed(steps(20, **pallet, **walker), "plan_blocked") == []
-    ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, slice(10, 12)))
+    ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, 20, slice(10, 12)))
     assert exposed(ice, "slippery_floor") == list(range(11, 17))
     assert exposed(steps(20), "slippery_floor") == []
 
@@ -69,7 +49,7 @@ def test_each_situation_is_told_by_what_is_known_before_acting():
 def test_an_exposure_takes_no_row_from_a_condition():
     first = Condition("busy", "pre", "true", priority=0, kind="exposure")
     every = [*SHIPPED, first]
-    table = steps(20, clearance_m=changed(0.05, 2.0, slice(8, 10)))
+    table = steps(20, clearance_m=changed(0.05, 2.0, 20, slice(8, 10)))
     labels = label(table, every)
     assert labels["busy"].all()
     named = primary(labels, every)
@@ -128,21 +108,3 @@ def test_changed_exposures_are_told_again_from_the_store(store, profile, tmp_pat
             " WHERE len(exposures) > 0"
         ).fetchall() == [(True, "nominal")]
         assert "2.2" in opened.exposures()[-1].sql
-
-
-def test_exposures_are_scored_against_their_own_truth():
-    rows = pa.table(
-        {
-            "episode_index": [0] * 6,
-            "step_index": list(range(6)),
-            "conditions": [[], ["wheel_slip"], [], [], [], []],
-            "true_condition": ["nominal", "wheel_slip", "nominal", "nominal", "nominal", None],
-            "exposures": [["busy"], ["busy"], [], [], [], []],
-            "true_exposure": ["nominal", "busy", "busy", "nominal", "nominal", None],
-        }
-    )
-    by_name = {one.condition: one for one in label_scores(rows, ["wheel_slip"], 0.2)}
-    assert (by_name["wheel_slip"].agreed, by_name["wheel_slip"].support) == (1, 1)
-    busy = by_name["busy"]
-    assert (busy.known, busy.labelled, busy.support, busy.agreed) == (5, 2, 2, 1)
-    assert (busy.event_support, busy.event_found) == (1, 1)

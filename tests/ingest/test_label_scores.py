@@ -42,13 +42,15 @@ def test_a_row_of_several_conditions_is_scored_for_each():
             "condition": ["recovery", "near_collision", "nominal", "near_collision"],
             "conditions": [["near_collision", "recovery"], ["near_collision"], [], None],
             "true_condition": ["near_collision,recovery", "nominal", "near_collision", None],
-            "exposures": pa.array([[]] * 4, pa.list_(pa.string())),
-            "true_exposure": pa.nulls(4, pa.string()),
+            "exposures": [["busy"], ["busy"], [], []],
+            "true_exposure": ["nominal", "busy", "busy", None],
         }
     )
-    near, after = label_scores(rows, ["near_collision", "recovery"], 0.2)
+    near, after, busy = label_scores(rows, ["near_collision", "recovery"], 0.2)
     assert (near.precision, near.recall, near.labelled, near.support) == (0.5, 0.5, 2, 2)
     assert (after.precision, after.recall, after.labelled, after.support) == (1, 1, 1, 1)
+    assert (busy.condition, busy.known, busy.labelled, busy.support) == ("busy", 3, 2, 2)
+    assert (busy.agreed, busy.event_support, busy.event_found) == (1, 1, 1)  # by its own truth
 
 
 @st.composite

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.driven_robot import Drive
 from support.profile_texts import WAREHOUSE
+from support.rooms import Disc, ranges_in_room
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
@@ -30,22 +31,7 @@ TASK = Task(body=Body(length_m=0.7, width_m=0.5), actions=((0.0, 0.0), (1.0, 0.0
 BEARINGS = (np.arange(180) + 0.5) * (2 * np.pi / 180) - np.pi
 LIDAR = Lidar(BEARINGS)
 PERIOD_S = TASK.control_period_s
-Disc = tuple[float, float, float]  # x, y, radius
 Array = NDArray[np.float64]
-
-
-def ranges(pose: tuple[float, float, float], discs: list[Disc], walls_m: float) -> Array:
-    x, y, yaw = pose
-    rays = np.stack([np.cos(BEARINGS + yaw), np.sin(BEARINGS + yaw)], axis=-1)
-    reach = np.where(rays > 0, walls_m - np.array([x, y]), walls_m + np.array([x, y]))
-    found: Array = (reach / np.abs(rays)).min(axis=1)
-    for cx, cy, radius in discs:
-        to = np.array([cx - x, cy - y])
-        along = rays @ to
-        off2 = (to**2).sum() - along**2
-        near = along - np.sqrt(np.maximum(radius**2 - off2, 0.0))
-        found = np.where((off2 < radius**2) & (along > 0), np.minimum(found, near), found)
-    return found[None]
 
 
 def steps(
@@ -61,7 +47,8 @@ def steps(
     rng, pose, made = np.random.default_rng(seed), [-2.0, 0.0, 0.0], []
     for step in range(count):
         stamp_ns = np.array([round((step + 1) * PERIOD_S * 1e9)])
-        seen = ranges((pose[0], pose[1], pose[2]), discs(step * PERIOD_S), walls_m)
+        at = (pose[0], pose[1], pose[2])
+        seen = ranges_in_room(BEARINGS, at, discs(step * PERIOD_S), walls_m)
         values = (speed, turn, speed, 0.0)
         names = ("wheel_speed_mps", "gyro_yaw_rate_radps", "localised_speed_mps")
         now = {
