@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from PIL import Image
+from support.bag_samples import write_channels
 from support.cameras import (
     CAMERAS,
     FRONT,
@@ -184,13 +184,8 @@ def test_other_and_missing_image_topics(bag):
     [("string format\nstring data", "data"), ("uint32[] format\nuint8[] data", "format")],
 )
 def test_an_image_type_with_other_fields_is_refused(tmp_path, fields, named):
-    file = tmp_path / "run.mcap"
-    with file.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(COMPRESSED, "ros2msg", fields.encode())
-        writer.add_message(writer.register_channel(FRONT, "cdr", schema), 1, b"\0\1\0\0", 1)
-        writer.finish()
+    front = (FRONT, "cdr", COMPRESSED, "ros2msg", fields.encode(), [b"\0\1\0\0"])
+    file = write_channels(tmp_path / "run.mcap", front)
     with pytest.raises(RecordingError, match=rf"`cameras\.front`: .* has no '{named}' as ROS de"):
         ingest(file, profile_with(FRONT_ONLY), store=None)
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from support.bag_samples import write_channels
 
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
@@ -45,14 +45,7 @@ MSG += "float32 left\nfloat64 right\n"
 
 
 def recorded(path: Path, form: str, text: str, name: str = "a_msgs/msg/Twist") -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(name, form, text.encode())
-        channel = writer.register_channel("/twist", "cdr", schema)
-        writer.add_message(channel, 10**9, PAYLOAD, 10**9)
-        writer.finish()
-    return path
+    return write_channels(path, ("/twist", "cdr", name, form, text.encode(), [PAYLOAD]))
 
 
 @pytest.mark.parametrize(

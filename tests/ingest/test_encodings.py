@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,33 +11,14 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from google.protobuf.descriptor_pb2 import FileDescriptorSet as Files
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
-from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.typesys import Stores, get_typestore
+from support.bag_samples import START_NS, Written, write_channels
 
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import CannotDecode, Ragged
 from restock.ingest.decoding.protobuf_messages import protobuf_type
 from restock.ingest.decoding.row_by_row import JsonType
-
-START_NS = 1_700_000_000_000_000_000
-Topic = tuple[str, str, str, str, bytes, Sequence[bytes]]  # topic, encoding, type, format, …
-
-
-def write(path: Path, *topics: Topic) -> Path:
-    """Write an MCAP file of these topics, a message a millisecond."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        for topic, encoding, kind, form, definition, payloads in topics:
-            schema = writer.register_schema(kind, form, definition) if form else 0
-            channel = writer.register_channel(topic, encoding, schema)
-            for row, payload in enumerate(payloads):
-                stamp = START_NS + row * 1_000_000
-                writer.add_message(channel, stamp, payload, stamp)
-        writer.finish()
-    return path
-
 
 # -- JSON ---------------------------------------------------------------------------------------
 
@@ -83,7 +63,7 @@ def pose(row: int) -> dict[str, Any]:
 def test_json_with_and_without_a_schema(schema, tmp_path):
     payloads = [json.dumps(pose(row)).encode() for row in range(4)]
     form = "jsonschema" if schema else ""
-    path = write(tmp_path / "j.mcap", ("/pose", "json", "Pose", form, schema, payloads))
+    path = write_channels(tmp_path / "j.mcap", ("/pose", "json", "Pose", form, schema, payloads))
     with open_recording(path) as recording:
         assert recording.topics["/pose"].skipped is None
         assert recording.topics["/pose"].definition == ("embedded" if schema else "inferred")
@@ -121,7 +101,7 @@ def test_json_that_does_not_decode_is_counted_by_reason(tmp_path):
         b'{"x": %s, "stamp": {"sec": 1, "nanosec": 2}}' % (b"9" * 400): "not JSON",
     }
     payloads = [good, *bad, b'{"x": NaN, "stamp": {"sec": 1, "nanosec": 3}}']
-    path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
+    path = write_channels(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
     with open_recording(path) as recording:
         columns = recording.read({"/t": ["x", "stamp"]})["/t"]
         account = recording.accounts["/t"]
@@ -135,7 +115,7 @@ def test_json_that_does_not_decode_is_counted_by_reason(tmp_path):
 
 def test_json_keeps_integers_that_float64_cannot_hold(tmp_path):
     payloads = [b'{"big": %d, "small": 3}' % (START_NS + row) for row in range(3)]
-    path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
+    path = write_channels(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
     with open_recording(path) as recording:
         fields = recording.read({"/t": ["big", "small"]})["/t"].fields
     assert fields["big"].tolist() == [START_NS, START_NS + 1, START_NS + 2]  # type: ignore[union-attr]
@@ -236,13 +216,13 @@ def scan(row: int) -> bytes:
     return bytes(made.SerializeToString())
 
 
-def protobuf(payloads: Sequence[bytes]) -> Topic:
+def protobuf(payloads: Sequence[bytes]) -> Written:
     definition = scan_files().SerializeToString()
     return "/scan", "protobuf", "lab.Scan", "protobuf", definition, payloads
 
 
 def test_protobuf(tmp_path):
-    path = write(tmp_path / "p.mcap", protobuf([scan(row) for row in range(4)]))
+    path = write_channels(tmp_path / "p.mcap", protobuf([scan(row) for row in range(4)]))
     with open_recording(path) as recording:
         leaves = recording.leaves("/scan")
         assert leaves == [
@@ -275,7 +255,7 @@ def test_protobuf_that_does_not_parse_is_counted(tmp_path):
     beyond = scan_class()()
     beyond.timestamp.seconds = 2**62
     payloads = [scan(1), b"\xff\xff", scan(2)[:-1], bytes(beyond.SerializeToString()), scan(3)]
-    path = write(tmp_path / "p.mcap", protobuf(payloads))
+    path = write_channels(tmp_path / "p.mcap", protobuf(payloads))
     with open_recording(path) as recording:
         columns = recording.read({"/scan": ["timestamp", "mode"]})["/scan"]
         account = recording.accounts["/scan"]
@@ -327,7 +307,7 @@ def test_ros1_messages_in_mcap(tmp_path):
         point = make["geometry_msgs/msg/Point"](row * 1.5, 0.0, 0.0)
         payloads.append(bytes(store.serialize_ros1(make[kind](header, point), kind)))
     name = "geometry_msgs/PointStamped"
-    path = write(
+    path = write_channels(
         tmp_path / "r.mcap", ("/p", "ros1", name, "ros1msg", definition.encode(), payloads)
     )
     with open_recording(path) as recording:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
-from support.bag_samples import write_bag, write_mcap
+from support.bag_samples import write_bag, write_channels, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 from support.long import one_in
@@ -402,15 +402,9 @@ def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path):
     packed = zstandard.ZstdCompressor().compress(
         b"\0\1\0\0" + (8 << 20).to_bytes(4, "little") + bytes(8 << 20)
     )
-    with (tmp_path / "run.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("pkg/msg/T", "ros2msg", b"uint8[] a")
-        channel = writer.register_channel("/t", "cdr", schema)
-        for row in range(90):
-            writer.add_message(channel, row, packed, row)
-        writer.finish()
-    done = limited("-c", READ, str(tmp_path / "run.mcap"), "no field")
+    channel = ("/t", "cdr", "pkg/msg/T", "ros2msg", b"uint8[] a", [packed] * 90)
+    path = write_channels(tmp_path / "run.mcap", channel)
+    done = limited("-c", READ, str(path), "no field")
     assert done.stdout.split()[-2:] == ["0", "90"], done.stderr
 
 
@@ -418,18 +412,13 @@ def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path):
 def test_definitions_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
     """Check thirty definitions of 40 kB that differ, against a tenth of the limit."""
     monkeypatch.setattr(recording, "MAX_DEFINED_BYTES", recording.MAX_DEFINED_BYTES // 10)
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        for number in range(30):
-            text = f"bool data\n# {number}\n".encode() + b"# nothing\n" * 4_000
-            schema = writer.register_schema("pkg/msg/T", "ros2msg", text)
-            for twin in "ab":  # the same again costs nothing
-                channel = writer.register_channel(f"/t{number:02}{twin}", "cdr", schema)
-                writer.add_message(channel, 1, b"\0\1\0\0\1", 1)
-        writer.finish()
-    with open_recording(path) as opened:
+    texts = [f"bool data\n# {n}\n".encode() + b"# nothing\n" * 4_000 for n in range(30)]
+    channels = (
+        (f"/t{number:02}{twin}", "cdr", "pkg/msg/T", "ros2msg", text, [b"\0\1\0\0\1"])
+        for number, text in enumerate(texts)
+        for twin in "ab"  # the same again costs nothing
+    )
+    with open_recording(write_channels(tmp_path / "run.mcap", *channels)) as opened:
         skipped = [name for name, topic in opened.topics.items() if topic.skipped]
         assert skipped == [f"/t{number:02}{twin}" for number in range(20, 30) for twin in "ab"]
         assert "more than 838,860 bytes" in str(opened.topics["/t29a"].skipped)

@@ -11,7 +11,7 @@ import pytest
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from support.bag_samples import TOPICS, write_bag
+from support.bag_samples import TOPICS, write_bag, write_channels
 from support.panels import panel_of
 from support.paths import SHARED
 
@@ -196,13 +196,9 @@ def test_hostile_names_stay_names(tmp_path, capsys):
 
 
 def test_a_topic_that_cannot_be_decoded_is_refused(tmp_path, capsys):
-    with (tmp_path / "a.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema("own_msgs/msg/Own", "ros2msg", b"")
-        channel = writer.register_channel("/own", "cbor", schema)
-        writer.add_message(channel, 0, b"x", 0)
-        writer.finish()
+    write_channels(
+        tmp_path / "a.mcap", ("/own", "cbor", "own_msgs/msg/Own", "ros2msg", b"", [b"x"])
+    )
     assert cli.main(["sql", str(tmp_path / "a.mcap"), 'FROM "/own"']) == 2
     assert "/own cannot be decoded" in capsys.readouterr().err
 

@@ -1,6 +1,6 @@
 """Small recordings for tests: the same messages written as a sqlite3 bag and as MCAP."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +139,25 @@ def write_mcap(
             data = bytes(STORE.serialize_cdr(message, TOPICS[topic]))
             data = zstandard.ZstdCompressor().compress(data) if packed else data
             writer.add_message(channels[topic], log, data, publish_time=log)
+        writer.finish()
+    return path
+
+
+# topic, encoding, type, format of the definition, definition, messages
+Written = tuple[str, str, str, str, bytes, Sequence[bytes]]
+
+
+def write_channels(path: Path, *channels: Written) -> Path:
+    """Write an MCAP file of these channels, a message a millisecond in each."""
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        for topic, encoding, kind, form, definition, payloads in channels:
+            schema = writer.register_schema(kind, form, definition) if form else 0
+            channel = writer.register_channel(topic, encoding, schema)
+            for row, payload in enumerate(payloads):
+                stamp = START_NS + row * 1_000_000
+                writer.add_message(channel, stamp, payload, stamp)
         writer.finish()
     return path
 
