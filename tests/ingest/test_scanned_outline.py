@@ -1,14 +1,13 @@
 """The outline by what the lidar never saw inside, its own parts, and where transforms put it."""
 
-import json
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
+from support import ingested
 from support.driven_robot import (
     BEAMS,
-    KINDS,
     Drive,
     columns,
     pose,
@@ -21,7 +20,7 @@ from support.paths import SHARED
 
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.profile.profile import Profile
 from restock.replay.store.store import Store
 
 KEPT = ("/cmd_vel", "/amcl_pose", "/odom", "/scan")
@@ -55,11 +54,11 @@ class Turning(Drive):
         return found
 
 
-def proposed(tmp_path: Any, capsys: Any, drive: Drive, **more: TopicColumns) -> tuple[Profile, str]:
-    bag = write_topics(typed_columns(drive.topics() | more), tmp_path / "bag", storage="mcap")
-    assert main(["profile", "new", str(bag), "--json"]) in (0, 3)
-    text = json.loads(capsys.readouterr().out)["toml"]
-    return parse_profile(text, where="p"), text
+def proposed(topics: dict[str, TopicColumns], folder: Path, *options: str) -> tuple[Profile, str]:
+    """Return the profile that is proposed for these topics, and its text."""
+    bag = write_topics(typed_columns(topics), folder / "bag", storage="mcap")
+    profile = ingested.proposed(bag, folder / "p.toml", *options, codes=(0, 3))
+    return profile, (folder / "p.toml").read_text()
 
 
 @pytest.mark.parametrize(
@@ -71,8 +70,8 @@ def proposed(tmp_path: Any, capsys: Any, drive: Drive, **more: TopicColumns) -> 
         (Turning(12.0, nearest_m=0.06), 0.1, ""),  # than robots are
     ],
 )
-def test_no_outline_reaches_to_what_the_lidar_saw(drive, length_m, said, tmp_path, capsys):
-    profile, text = proposed(tmp_path, capsys, drive)
+def test_no_outline_reaches_to_what_the_lidar_saw(drive, length_m, said, tmp_path):
+    profile, text = proposed(drive.topics(), tmp_path)
     assert profile.task.body.length_m == pytest.approx(length_m)
     assert said in text
 
@@ -92,49 +91,42 @@ class Passing(Turning):
 
 def test_conditions_by_a_guessed_outline_are_uncertain(tmp_path, capsys):
     """A robot .33 m wide passes .16 m clear of poles: to a guess of .48 m each was too near."""
-    drive = Passing(12.0, nearest_m=0.325)
-    topics = typed_columns(drive.topics())
-    bag = str(write_topics(topics, tmp_path / "bag", storage="mcap"))
+    _, text = proposed(Passing(12.0, nearest_m=0.325).topics(), tmp_path)
     toml, store = tmp_path / "p.toml", tmp_path / "store"
     held = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
     marked = "SELECT uncertain_conditions FROM recordings"
 
     def uncertain() -> list[str]:
-        assert main(["ingest", bag, "--profile", str(toml), "--store", str(store)]) in (0, 3)
+        assert main(
+            ["ingest", str(tmp_path / "bag"), "--profile", str(toml), "--store", str(store)]
+        ) in (0, 3)
         with Store(store) as opened:
             assert opened.sql(held).fetchall() == [(0,)]
             (named,) = opened.sql(marked).fetchall()[0]
         return named
 
-    assert main(["profile", "new", bag, "--out", str(toml)]) in (0, 3)
     assert {"near_collision", "recovery"} <= {*uncertain()}
     capsys.readouterr()
     main(["coverage", str(store)])
     main(["mix", str(store), "--mixture", "coverage", "--dry-run"])
     said = capsys.readouterr()
     assert (said.out + said.err).count("outline is a guess") == 2
-    text = toml.read_text()
     toml.write_text(text.replace('outline = "default"', "#"))  # measured: it is of that size
     assert uncertain() == []
 
 
-def test_its_own_parts_are_its_body_and_no_obstacles(tmp_path, capsys):
+def test_its_own_parts_are_its_body_and_no_obstacles(tmp_path):
     """A post of its own .21 m behind; a wall at .3 m once."""
-    profile, text = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.3, post_m=0.21))
+    profile, text = proposed(Turning(12.0, nearest_m=0.3, post_m=0.21).topics(), tmp_path)
     body = profile.task.body
     assert body.length_m == pytest.approx(0.42, abs=1e-3)  # the post is part of it
     assert profile.task.range_min_m == pytest.approx(0.225)
     assert "range_min_m = 0.225  # beyond the robot's own parts" in text
 
 
-def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path, capsys):
-    drive = Turning(12.0, post_m=0.21)
-    topics = drive.topics()
-    straight = Drive(12.0).topics()["/amcl_pose"]
-    topics["/amcl_pose"] = straight
-    bag = write_topics(typed_columns(topics), tmp_path / "bag")
-    main(["profile", "new", str(bag), "--json"])
-    profile = parse_profile(json.loads(capsys.readouterr().out)["toml"], where="p")
+def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path):
+    straight = {"/amcl_pose": Drive(12.0).topics()["/amcl_pose"]}
+    profile, _ = proposed(Turning(12.0, post_m=0.21).topics() | straight, tmp_path)
     assert profile.task.range_min_m == pytest.approx(0.02)
     assert profile.task.body.length_m == pytest.approx(0.2625)
 
@@ -154,10 +146,10 @@ class Framed(Turning):
         return found
 
 
-def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsys):
+def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path):
     """At a corner, as one of two is. How it is turned was dropped, with its place."""
     more = {"/tf_static": lidar_at(-0.35, -0.3, -2.356)}
-    profile, text = proposed(tmp_path, capsys, Framed(12.0), **more)
+    profile, text = proposed(Framed(12.0).topics() | more, tmp_path)
     body = profile.task.body
     assert (body.length_m, body.width_m) == pytest.approx((0.7, 0.6), abs=1e-3)
     scan = profile.inputs.scans["scan"]
@@ -167,14 +159,11 @@ def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsy
     assert "upside_down" not in text
 
 
-def test_a_lidar_outside_the_outline_is_turned_by_transforms(tmp_path, capsys):
+def test_a_lidar_outside_the_outline_is_turned_by_transforms(tmp_path):
     """Its base frame is no middle, as that of a car, between its rear wheels."""
-    topics = typed_columns(Framed(12.0).topics())
-    topics["/tf_static"] = (KINDS["/tf_static"], lidar_at(0.9, 0.0, 3.0))
-    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
-    assert main(["profile", "new", str(bag), "--footprint", "1.2x0.6", "--json"]) in (0, 3)
-    text = json.loads(capsys.readouterr().out)["toml"]
-    body = parse_profile(text, where="p").task.body
+    more = {"/tf_static": lidar_at(0.9, 0.0, 3.0)}
+    profile, text = proposed(Framed(12.0).topics() | more, tmp_path, "--footprint", "1.2x0.6")
+    body = profile.task.body
     assert (body.length_m, body.lidar_x_m, body.lidar_yaw_rad) == (1.2, 0.0, pytest.approx(3.0))
     assert "; a guess; base_link has it 0.90 m ahead, outside" in text
 
@@ -183,22 +172,19 @@ def test_a_lidar_upside_down_gives_the_rows_of_an_upright_one(tmp_path, capsys):
     """By its frame. What it sees on the robot's left, it reports on its own right."""
     found, texts = [], []
     for roll, sign in ((0.0, 1), (np.pi, -1)):
-        drive = Framed(12.0, near_scans=60)
-        topics = typed_columns(drive.topics())
-        scan = topics["/scan"][1].fields
+        topics = Framed(12.0, near_scans=60).topics()
+        scan = topics["/scan"].fields
         for angle in ("angle_min", "angle_max", "angle_increment"):
             if angle in scan:
                 scan[angle] = sign * np.asarray(scan[angle])
-        topics["/tf_static"] = (KINDS["/tf_static"], lidar_at(0.1, 0.0, 0.3, roll))
-        bag = write_topics(topics, tmp_path / f"bag{sign}", storage="mcap")
-        toml, store = tmp_path / f"{sign}.toml", tmp_path / f"store{sign}"
-        assert main(["profile", "new", str(bag), "--out", str(toml)]) in (0, 3)
+        topics["/tf_static"] = lidar_at(0.1, 0.0, 0.3, roll)
+        place = tmp_path / str(sign)
+        _, text = proposed(topics, place)
         said = capsys.readouterr()
         assert ("hangs upside down by its frame" in said.out + said.err) == (sign < 0)
-        assert main(["ingest", str(bag), "--profile", str(toml), "--store", str(store)]) in (0, 3)
-        with Store(store) as opened:
+        with ingested.ingested(place / "bag", place / "p.toml", place / "store") as opened:
             found.append(opened.sql("SELECT observation, action FROM transitions").fetchall())
-        texts.append([one for one in toml.read_text().splitlines() if "bag" not in one])
+        texts.append([one for one in text.splitlines() if "bag" not in one])
     assert found[0] == found[1]
     assert len(found[0]) > 20
     assert {one.split("  #")[0] for one in texts[1]} - {
@@ -215,11 +201,9 @@ def test_a_lidar_upside_down_gives_the_rows_of_an_upright_one(tmp_path, capsys):
         ("fleet-turtlebot3/dwa-goal/rosbag2_2025_12_16-15_31_16", (0.191, 0.191), (0, 0)),
     ],
 )
-def test_real_robots(name, size_m, lidar, capsys):
+def test_real_robots(name, size_m, lidar, tmp_path):
     """A Neato is .33 m long, with its lidar behind the middle and turned about; a Burger .14 m."""
-    main(["profile", "new", str(SHARED / name), "--json"])
-    profile = parse_profile(json.loads(capsys.readouterr().out)["toml"], where="p")
-    body = profile.task.body
+    body = ingested.proposed(SHARED / name, tmp_path / "p.toml", codes=(0, 3)).task.body
     assert (body.length_m, body.width_m) == pytest.approx(size_m, abs=0.005)
     assert body.lidar_x_m == pytest.approx(lidar[0], abs=0.005)
     assert abs(body.lidar_yaw_rad) == pytest.approx(lidar[1], abs=0.02)

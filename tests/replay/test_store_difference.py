@@ -2,6 +2,8 @@
 
 import json
 from datetime import datetime
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import pyarrow as pa
@@ -25,13 +27,17 @@ def relabelled(rows: pa.Table, steps: int) -> pa.Table:
     return replaced(rows, {"condition": condition})
 
 
+def differences(first: Path, second: Path) -> dict[str, Any]:
+    with Store(first) as a, Store(second) as b:
+        return diff_stores(a, b)
+
+
 def test_what_came_went_and_was_labelled_anew(tmp_path):
     rows = [recording_transitions(number) for number in range(6)]
     first = write_store(tmp_path / "a", rows[:4])
     again = relabelled(recording_transitions(2, ingest="b"), 20)
     second = write_store(tmp_path / "b", [rows[0], again, *rows[3:]])
-    with Store(first) as a, Store(second) as b:
-        found = diff_stores(a, b)
+    found = differences(first, second)
     changes = {row["source_file"]: row["change"] for row in found["recordings"]}
     assert changes == {
         "logs/1.mcap": "out",
@@ -40,12 +46,7 @@ def test_what_came_went_and_was_labelled_anew(tmp_path):
         "logs/5.mcap": "in",
     }
     episodes = found["episodes"]
-    assert (episodes["in"], episodes["out"], episodes["changed"], episodes["same"]) == (
-        24,
-        12,
-        0,
-        36,
-    )
+    assert [episodes[name] for name in ("in", "out", "changed", "same")] == [24, 12, 0, 36]
     before = rows[2]["condition"].to_pylist()[:20]
     moved = {(row["from"], row["to"]): row["rows"] for row in found["labels"]["changes"]}
     assert moved == {(n, "wheel_slip"): before.count(n) for n in set(before) - {"wheel_slip"}}
@@ -64,8 +65,7 @@ def test_what_came_went_and_was_labelled_anew(tmp_path):
 def test_rows_ingested_again_as_they_were_are_no_difference(tmp_path):
     first = write_store(tmp_path / "a", [recording_transitions(1)])
     second = write_store(tmp_path / "b", [recording_transitions(1, ingest="b")])
-    with Store(first) as a, Store(second) as b:
-        found = diff_stores(a, b)
+    found = differences(first, second)
     assert not found["different"]
     assert found["labels"]["rows_compared"] == len(recording_transitions(1))
     assert all(line["difference"] == 0 for line in found["shares"])
@@ -77,8 +77,7 @@ def test_rows_that_changed_make_their_episode_another(tmp_path):
     reward[3] += 1
     again = replaced(again, {"reward": reward})
     first, second = (write_store(tmp_path / n, [t]) for n, t in (("a", rows), ("b", again)))
-    with Store(first) as a, Store(second) as b:
-        found = diff_stores(a, b)
+    found = differences(first, second)
     assert [row["change"] for row in found["episodes"]["changes"]] == ["changed"]
     assert found["recordings"][0]["episodes_changed"] == 1
 
@@ -87,26 +86,14 @@ def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, capsys):
     writer = StoreWriter(tmp_path / "store")
     for number in (1, 2):
         newest = writer.write(*one(number))
-    assert (
-        main(["coverage", "diff", f"{tmp_path}/store@{newest - 1}", f"{tmp_path}/store", "--json"])
-        == 0
-    )
+    store = f"{tmp_path}/store"
+    before = f"{store}@{newest - 1}"
+    assert main(["coverage", "diff", before, store, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [row["change"] for row in found["recordings"]] == ["in"]
     assert (found["a"]["version"], found["b"]["version"]) == (newest - 1, newest)
-    assert main(["coverage", "diff", f"{tmp_path}/store", f"{tmp_path}/store", "--exit-code"]) == 0
-    assert (
-        main(
-            [
-                "coverage",
-                "diff",
-                f"{tmp_path}/store@{newest - 1}",
-                f"{tmp_path}/store",
-                "--exit-code",
-            ]
-        )
-        == 1
-    )
+    assert main(["coverage", "diff", store, store, "--exit-code"]) == 0
+    assert main(["coverage", "diff", before, store, "--exit-code"]) == 1
     with Store(tmp_path / "store", version=parse_version("2999-01-01T00:00Z")) as store:
         assert store.version == newest
     with pytest.raises(StoreError, match="the first is from"):
@@ -144,7 +131,6 @@ def test_the_manifest_of_an_empty_store_is_no_task(tmp_path):
     write_deltalake(str(empty / "recordings"), manifest(rows).slice(0, 0), description=FORMAT)
     write_deltalake(str(empty / "transitions"), rows.slice(0, 0), description=FORMAT)
     full = write_store(tmp_path / "b", [rows])
-    with Store(empty) as a, Store(full) as b:
-        found = diff_stores(a, b)
+    found = differences(empty, full)
     assert found["a"]["rows"] == 0
     assert found["episodes"]["in"] == 12
