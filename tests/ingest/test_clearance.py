@@ -96,20 +96,3 @@ def test_the_last_angle_says_what_the_increment_says() -> None:
     expected = REDUCE.apply(fields | {"angle_min": first, "angle_increment": step})
     for name in (SECTORS, BEAMS, BLIND, UNAIMED):
         assert np.allclose(np.asarray(found[name]), np.asarray(expected[name])), name
-
-
-@pytest.mark.parametrize("last", ["angle_increment", "angle_max"])
-def test_a_lidar_upside_down_sees_at_negated_angles(last: str) -> None:
-    """Points that an upright one has on its left, it reports on its right."""
-    named = {"ranges_m": "ranges", "angle_min_rad": "angle_min", f"{last}_rad": last}
-    upright = msgspec.structs.replace(SCAN, fields=named)
-    hanging = msgspec.structs.replace(upright, upside_down=True)
-    fields = scans([120, 60, 9, 1, 0], [-3.1, 0.1, 0.0, -3.1, 0.0], seed=3)
-    fields["angle_max"] = np.asarray(fields["angle_min"]) + np.float32(3.0)
-    negated = {name: -np.asarray(fields[name]) for name in ("angle_min", last)}
-    expected = scan_reduction(TASK, upright).apply(fields)
-    found = scan_reduction(TASK, hanging).apply(fields | negated)
-    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
-        assert np.array_equal(np.asarray(found[name]), np.asarray(expected[name])), name
-    swapped = scan_reduction(TASK, upright).apply(fields | negated)
-    assert not np.array_equal(np.asarray(swapped[SECTORS]), np.asarray(expected[SECTORS]))

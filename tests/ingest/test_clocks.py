@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
-from support.paths import SHARED
 
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
@@ -84,17 +83,3 @@ def test_messages_logged_out_of_order_are_counted(tmp_path, capsys):
     assert main(["info", str(write_mcap(tmp_path / "a.mcap")), "--clocks", "--json"]) == 0
     topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
     assert topics["/odom"]["clock"]["log_backsteps"] == 1
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-@pytest.mark.parametrize(
-    ("bag", "offset_s"),
-    [("turtlebot3-sim-humble", 1_701_217_691.8), ("turtlebot3-sim-sparse-cmd", 1_670_256_022.8)],
-)
-def test_simulation_time_of_others_recordings(bag, offset_s, capsys):
-    assert main(["info", str(SHARED / bag), "--clocks", "--json"]) == 0
-    topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
-    for name in ("/odom", "/imu", "/joint_states"):
-        clock = topics[name]["clock"]
-        assert clock["offset_ns"] * 1e-9 == pytest.approx(offset_s, abs=0.1)
-        assert (clock["jumps"], clock["backsteps"], clock["zero_stamps"]) == (0, 0, 0)

@@ -1,7 +1,6 @@
 """Several recordings are committed at once: none is lost, and one that fails costs itself alone."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -12,16 +11,13 @@ import pyarrow as pa
 import pytest
 from deltalake import DeltaTable
 from deltalake.transaction import AddAction
-from support.driven_robot import Drive, write_bag
 from support.long import one_in
 from support.paths import ROOT
 from support.stores import manifest, one, recording_transitions, shown
 
 from restock.errors import RecordingError, StoreError
 from restock.ingest import pipeline
-from restock.ingest.batch import IngestJob, ingest_all
 from restock.ingest.pipeline import GROUP_S, CommitGroup, IngestResult, OnRepeat, Prepared
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 
@@ -141,16 +137,6 @@ def test_the_same_drive_twice_in_a_group_is_found(store, group, tmp_path, repeat
         assert second.repeats is not None
         assert second.repeats.recording_id == f"{2:016x}"
     assert len(shown(tmp_path / "s")) == (2 if repeated == "refuse" else 3)
-
-
-def test_a_recording_given_twice_is_unchanged_the_second_time(tmp_path):
-    for number in (1, 2):
-        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), tmp_path / f"bag{number}")
-    shutil.copytree(tmp_path / "bag2", tmp_path / "bag3")
-    job = IngestJob(load_profile("warehouse_amr"), tmp_path / "s")
-    paths = [tmp_path / f"bag{number}" for number in (1, 2, 3)]
-    statuses = [result.status for _, result in ingest_all(paths, job)]
-    assert statuses == ["written", "written", "unchanged"]
 
 
 KILLED = """

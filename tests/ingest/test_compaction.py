@@ -31,7 +31,7 @@ def compacted_by_delta(path: Path) -> None:
 def test_ingest_goes_on_after_another_tool_compacted_the_files(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     for recording in (1, 2, 3):
-        version = writer.write(*one(recording))
+        writer.write(*one(recording))
     before = writer.rows(f"{2:016x}", f"{2:016x}-a")
     compacted_by_delta(tmp_path / "s")
     assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(before)
@@ -43,13 +43,6 @@ def test_ingest_goes_on_after_another_tool_compacted_the_files(tmp_path):
         for (recording, ingest), seed in expected.items()
     }
     assert len(writer.live()) == 4
-    with Store(tmp_path / "s") as store:
-        assert store.version > version
-        after = store.sql("FROM transitions WHERE recording_id LIKE '%3'").to_arrow_table()
-    written = one(3)[1].rename_columns({"condition": "primary_condition"})
-    written = written.drop_columns("logged_ns")  # null: the view works it out
-    for name, values in written.to_pydict().items():
-        assert after.sort_by("transition_id")[name].to_pylist() == values, name
 
 
 COMMON = (
@@ -201,22 +194,14 @@ def test_the_ends_of_episodes_outlive_compaction(tmp_path):
         assert list(store.episode_ends([f"{2:016x}"])) == []
 
 
-@pytest.mark.parametrize("way", one_in(3, ["files", "deltalake", "polars"]))
-def test_without_restock_each_row_is_read_once(writer, tmp_path, way):
+def test_without_restock_each_row_is_read_once(writer, tmp_path):
     """As docs/libraries.md says."""
     writer.write(*one(2, "b"))
     compact(writer)
     place = str(tmp_path / "s" / TRANSITIONS)
     count = sum(shown(tmp_path / "s").values())
-    if way == "deltalake":
-        pytest.importorskip("pandas")
-        rows = len(DeltaTable(place).to_pandas())
-    elif way == "polars":
-        rows = len(pytest.importorskip("polars").scan_delta(place).collect())
-    else:
-        rows = len(duckdb.read_parquet(DeltaTable(place).file_uris()))
-        assert len(duckdb.read_parquet(f"{place}/**/*.parquet")) > 2 * count
-    assert rows == count
+    assert len(duckdb.read_parquet(DeltaTable(place).file_uris())) == count
+    assert len(duckdb.read_parquet(f"{place}/**/*.parquet")) > 2 * count
 
 
 def parquet(path: Path) -> list[Path]:
@@ -285,29 +270,4 @@ def test_one_ingest_after_the_other_leaves_few_manifests(tmp_path, monkeypatch):
         assert reader.manifest(f"{recording + 1:016x}") is None
     assert written == [2, 4, 2, 8]
     assert [len(file.ingests) for file in reader.files(RECORDINGS)] == [8]
-    same_as_scanned(tmp_path / "s")
-
-
-@pytest.mark.long
-def test_manifests_are_written_again_a_bounded_number_of_times(tmp_path, monkeypatch):
-    """However many there are: files of enough of them are left alone."""
-    monkeypatch.setattr(writer_module, "FULL_MANIFESTS", 4)
-    written: list[int] = []
-    merge = writer_module.merge
-
-    def counted(*args, **given):
-        made = merge(*args, **given)
-        written.append(made.rows)
-        return made
-
-    monkeypatch.setattr(writer_module, "merge", counted)
-    writer = StoreWriter(tmp_path / "s")
-    for recording in range(1, 13, 2):
-        writer.write_all([one(recording), one(recording + 1)])
-        fold(writer)
-    assert written == [2, 4, 2, 4, 2, 4]
-    assert sorted(len(file.ingests) for file in writer.files(RECORDINGS)) == [4, 4, 4]
-    writer.write_all([one(n, "b") for n in (1, 2)])  # leaves a file of two dead manifests
-    fold(writer)
-    assert sorted(len(file.ingests) for file in writer.files(RECORDINGS)) == [4, 4, 4]
     same_as_scanned(tmp_path / "s")

@@ -136,13 +136,6 @@ def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
     assert fallbacks_used(profile, topics)["signals.s"] == "null: no message of /x"
 
 
-def test_the_future_is_not_seen():
-    fields = {"v": np.arange(6.0)}
-    whole = column(signal("s", "v"), fields)
-    cut = column(signal("s", "v"), {"v": np.arange(3.0)}, [0.0, 1.0, 2.0])
-    assert whole[:15] == cut[:15]
-
-
 @pytest.mark.parametrize(
     ("table", "said"),
     [
@@ -170,13 +163,6 @@ def test_a_value_that_is_no_number_names_the_key():
         steps_with(signal("s", "a"), {"a": np.zeros((1, 3))}, [0.0])
 
 
-def check(profile: Path, capsys: pytest.CaptureFixture[str]) -> dict:
-    code = main(["profile", "check", str(profile), str(SAMPLE), "--json"])
-    said = json.loads(capsys.readouterr().out)
-    assert code == (2 if said["problems"] else 0)
-    return said
-
-
 def test_check_says_what_the_topic_offers_instead(tmp_path, capsys):
     profile = tmp_path / "p.toml"
     joints = {"topic": "/joint_states", "kind": "sensor_msgs/msg/JointState"}
@@ -189,7 +175,8 @@ def test_check_says_what_the_topic_offers_instead(tmp_path, capsys):
             signal("e", "data", topic="/bumpr", kind="std_msgs/msg/Bool"),
         )
     )
-    said = check(profile, capsys)
+    assert main(["profile", "check", str(profile), str(SAMPLE), "--json"]) == 2
+    said = json.loads(capsys.readouterr().out)
     assert said["outcome"] is None
     assert [problem.split(":")[0] for problem in said["problems"]] == [
         "/bumper holds std_msgs/msg/Bool, not std_msgs/msg/Float64 (signals.d)",
@@ -316,7 +303,7 @@ def test_a_vector_has_one_length_and_others_are_null_and_counted():
     assert any("2 of 4 messages do not have the length 2" in note for note in steps.notes)
 
 
-def test_a_vectors_length_is_part_of_what_a_column_means(tmp_path: Path):
+def test_a_vectors_length_is_part_of_what_a_column_means():
     with pytest.raises(ConfigError, match="the length of a vector needs a list"):
         parse_profile(with_signals(signal("s", "v[0]", "length = 2")), where="p")
     two, three, none = (

@@ -122,7 +122,7 @@ def test_a_damaged_manifest_is_named_and_dropped(writer, tmp_path, how):
     assert shown(tmp_path / "s") == expected((1, "b", 0), (2, "a", 0))
 
 
-def test_damaged_rows_are_ingested_with_force(tmp_path):
+def test_damaged_rows_are_ingested_with_force(tmp_path, capsys):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))
     file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
@@ -130,6 +130,8 @@ def test_damaged_rows_are_ingested_with_force(tmp_path):
     with pytest.raises(StoreError, match=f"{file} cannot be read") as said:
         writer.rows(f"{1:016x}", f"{1:016x}-a")
     assert "--force" in str(said.value)
+    assert main(["sql", str(tmp_path / "s"), "SELECT sum(reward) FROM transitions"]) == 2
+    assert "--force" in capsys.readouterr().err
     writer.write(*one(1, "b"))
     assert shown(tmp_path / "s") == expected((1, "b", 0))
 
@@ -266,29 +268,8 @@ def test_a_first_ingest_killed_between_its_tables_goes_on(tmp_path):
     assert shown(tmp_path / "s") == expected((1, "a", 0))
 
 
-@pytest.mark.parametrize("how", ["cut", "missing"])
-@pytest.mark.parametrize("is_joined", [False, True])
-def test_verbs_name_a_damaged_file_and_the_remedy(tmp_path, capsys, how, is_joined):
-    place = tmp_path / "s"
-    writer = StoreWriter(place)
-    writer.write_all([one(1), one(2)])
-    if is_joined:
-        compact(writer)
-    file = active(place, TRANSITIONS)[0]
-    damage(place, file, how)
-    for command in (
-        ["sql", str(place), "SELECT sum(reward) FROM transitions"],
-        ["audit", str(place)],
-        ["mix", str(place), "--dry-run"],
-    ):
-        assert main(command) == 2
-        said = capsys.readouterr().err
-        assert f"its file {file} " in said
-        assert ("--drop-damaged" if is_joined else "--force") in said
-        assert "its SQL does not run" not in said
-
-
-def test_damage_without_a_file_name_has_a_remedy_too(writer, tmp_path):
+@pytest.mark.usefixtures("writer")
+def test_damage_without_a_file_name_has_a_remedy_too(tmp_path):
     damage(tmp_path / "s", active(tmp_path / "s", TRANSITIONS)[0], "a page")
     with Store(tmp_path / "s") as store:
         for text in ("SELECT nothing FROM transitions", "FROM read_csv('no.csv')"):

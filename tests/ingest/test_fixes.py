@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.driven_robot import columns, write_topics
-from support.paths import ROOT
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -195,22 +194,3 @@ def test_it_is_not_done_live(bag, tmp_path):
     main(["profile", "new", str(bag), "--out", str(tmp_path / "gps.toml")])
     with pytest.raises(ConfigError, match="satellite fixes"):
         LiveObserver(load_profile(tmp_path / "gps.toml"))
-
-
-HUSKY = ROOT.parent / "shared" / "bags" / "ros1" / "husky_robot_localization.bag"
-
-
-@pytest.mark.skipif(not HUSKY.exists(), reason="recordings of others are not there")
-def test_a_husky_drives_as_far_by_fixes_as_by_wheels():
-    from restock.ingest.containers.open_recording import open_recording
-    from restock.ingest.propose.pose_choice import fixes_in
-    from restock.ingest.propose.roles import KINDS
-
-    with open_recording(HUSKY) as recording:
-        (name,) = [n for n, t in recording.topics.items() if t.type == FIX]
-        fixes = fixes_in(recording, name, next(k.fields for k in KINDS["pose"] if k.type == FIX))
-    at = fixes.poses(max_std_m=100.0)
-    known = np.isfinite(at.x_m)
-    assert known.mean() > 0.9
-    reach = np.hypot(np.ptp(at.x_m[known]), np.ptp(at.y_m[known]))
-    assert 5 < reach < 2000

@@ -135,15 +135,6 @@ def test_only_static_transforms_hold_across_a_clock_jump():
     assert found.translation_m[0, 0] == 8.0
 
 
-def test_the_future_is_not_seen():
-    """Another pose later on changes nothing before it."""
-    moving: list[Line] = [(t, "map", "base_link", t, 0, 0, 0) for t in np.arange(0, 5, 0.1)]
-    times = at(*np.arange(0, 3, 0.07))
-    whole = tree_of(Frames(), moving, []).place("base_link", times)
-    cut = tree_of(Frames(), [line for line in moving if line[0] < 3], []).place("base_link", times)
-    assert np.array_equal(whole.translation_m, cut.translation_m)
-
-
 def test_a_transform_ahead_counts_from_its_reception():
     """As localisation stamps map -> odom; it says nothing about the recording's clocks either."""
     moving: list[Line] = [(t, "map", "base_link", t, 0, 0, 0) for t in np.arange(0, 5, 0.5)]

@@ -131,22 +131,6 @@ def test_what_is_no_recording_leaves_the_store_as_it_was(bag, tmp_path, run):
     assert {path: path.stat().st_mtime_ns for path in store.rglob("*")} == before
 
 
-def test_a_truncated_file_is_refused_unless_salvaged(tmp_path, run):
-    folder = write_bag(Drive(), tmp_path / "bag", storage="mcap")
-    (whole,) = folder.glob("*.mcap")
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
-    code, _, err = run(cut, "--store", tmp_path / "s")
-    assert code == 2
-    assert "cut.mcap" in err
-    assert not (tmp_path / "s").exists()
-    code, said, _ = run(cut, "--store", tmp_path / "s", "--salvage")
-    assert code == 3
-    (one,) = said["recordings"]
-    assert one["losses"]
-    assert 10 < one["transitions"] < 29
-
-
 def test_the_wrong_profile_says_what_is_missing(bag, tmp_path, run):
     text = WAREHOUSE
     other = tmp_path / "other.toml"

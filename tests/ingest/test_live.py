@@ -140,14 +140,6 @@ def odometry(stamp_ns: int, speed_mps: float) -> SimpleNamespace:
     return stamped(stamp_ns, twist=SimpleNamespace(twist=twist))
 
 
-def test_silence_is_a_problem_and_not_an_observation():
-    observer = LiveObserver(PROFILE)
-    known = observer.observe(10**9)
-    assert "nothing received yet on" in known.problem
-    assert "/scan" in known.problem
-    assert not known.observation.any()
-
-
 def test_a_message_off_the_clock_is_left_out_and_counted():
     observer = LiveObserver(PROFILE)
     for index in range(5):

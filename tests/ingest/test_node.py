@@ -113,15 +113,6 @@ def test_it_commands_only_when_active(policy: Path) -> None:
     assert not any(topic != COMMAND and heard for topic, heard in graph.heard.items())
 
 
-def test_it_can_be_configured_again_after_a_cleanup(policy: Path) -> None:
-    graph, node = started(policy)
-    assert node.trigger_cleanup() is Returned.SUCCESS
-    assert not graph.timers
-    assert node.trigger_configure() is Returned.SUCCESS
-    assert node.trigger_activate() is Returned.SUCCESS
-    assert len(graph.timers) == 4
-
-
 def test_a_kept_message_is_asked_for_while_a_publisher_keeps_it(policy: Path) -> None:
     """The stub fails where a plain publisher is asked: there rclpy and the publisher warn."""
     keeps, goal = QoS(1, durability=Durability.TRANSIENT_LOCAL), "geometry_msgs/msg/PoseStamped"

@@ -34,18 +34,13 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.commands import (
-    CommandHold,
     Commands,
-    command_hold,
-    limit_of,
-    settled_speeds,
 )
 from restock.ingest.propose.proposal_lines import actions_of
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import RobotProposal
 from restock.ingest.steps.align import NS
-from restock.ingest.steps.frames import PoseSeries
-from restock.ingest.task.task import Body, Task, nearest_action
+from restock.ingest.task.task import Body, Task
 from restock.replay.store.store import Store
 from restock.train.twin.physics.simulation import blocks_of
 from restock.train.twin.survey.poses import candidate_poses
@@ -552,67 +547,12 @@ def reported(speeds: Any, turns: Any = 0.0) -> Commands:
     return Commands().fastest(speeds, np.broadcast_to(turns, speeds.shape))
 
 
-@pytest.mark.parametrize(
-    ("commands", "speeds"),
-    [
-        (reported([0.0, 0.2, 0.5]), []),
-        (reported([*[0.5] * 400, *[-0.2] * 200, -0.5]), [-0.2]),  # an outlier is no speed
-        (reported([*[0.5] * 400, -3.0]), [-0.5]),
-        (reported([*[0.5] * 9, *[-0.5] * 9]).limited(0.3, None), [-0.3]),  # what it reached
-    ],
-)
-def test_a_robot_backs_up_as_fast_as_usual(commands, speeds):
-    assert reverse(actions_of(commands, RobotProposal())) == [(speed, 0.0) for speed in speeds]
-
-
-@pytest.mark.parametrize("slowest", [0.0, 0.3, 0.6, 1.0])
-@pytest.mark.parametrize("fastest", [0.3, 0.7, 1.0])
-def test_reverse_at_many_speeds_is_near_an_action(slowest, fastest):
-    back = np.linspace(min(slowest, fastest), fastest, 200)
-    speeds = np.concatenate([np.ones(300), -back])
-    actions = actions_of(reported(speeds), RobotProposal())
-    task = Task(body=Body(0.6, 0.5), actions=tuple(actions))
-    assert nearest_action(task, speeds, 0 * speeds)[1].max() <= 0.25
-
-
 def test_a_car_backs_up_and_turns_as_fast_as_its_logs():
     car = RobotProposal(values={"drive": "ackermann", "wheelbase_m": 0.4, "max_steering_rad": 0.5})
     backs = reverse(actions_of(reported([*[1.0] * 50, *[-0.8] * 50], 0.5), car))
     assert {speed for speed, _ in backs} == {-0.8}
     assert sorted(np.sign(turn) for _, turn in backs) == [-1, 0, 1]
     assert reverse(actions_of(reported([1.0, 0.5], 0.5), car)) == []
-
-
-def held(until_s: float, commands: list[tuple[float, float]]) -> CommandHold:
-    """Return what is read of commands (time, speed) to a robot that goes .5 m/s, then stands."""
-    at = np.arange(0, 30, 0.05)
-    still = np.zeros(len(at))
-    poses = PoseSeries((at * NS).astype(np.int64), 0.5 * np.minimum(at, until_s), still, still)
-    times, speeds = (np.array(column) for column in zip(*commands, strict=True))
-    return command_hold(times, speeds, np.zeros(len(times)), poses)
-
-
-def test_a_driver_that_times_out_is_seen():
-    moving = [(0.1 * i, 0.5) for i in range(101)]
-    assert held(10.6, moving).age_s == pytest.approx(0.6, abs=0.5)
-    stopped = [*moving, (10.1, 0.0)]
-    assert held(10.2, stopped).stops_hold
-    assert not held(25.0, stopped).stops_hold  # somebody else drives it
-
-
-@pytest.mark.parametrize("way", [1, -1])
-@pytest.mark.parametrize(("most", "limit"), [(0.3, 0.3), (0.2, 0.2), (0.45, None), (1.0, None)])
-def test_a_base_that_cuts_off_shows_its_limit(way, most, limit):
-    """It follows after .3 s, as fast as it can: 3 s fast, 2 s slowly."""
-    at_s, ticks_s = np.arange(0, 20, 0.05), np.arange(0, 20, 0.1)
-    followed = np.maximum(np.searchsorted(ticks_s, at_s - 0.3, "right") - 1, 0)
-
-    def limit_seen(told: Any) -> float | None:
-        driven = np.clip(told[followed], -most, most)
-        return limit_of(settled_speeds(ticks_s, told, at_s, driven, 0.5), 0.5)
-
-    assert limit_seen(way * np.where(ticks_s % 5 < 3, 0.5, 0.1)) == limit
-    assert limit_seen(np.where(ticks_s % 1.6 < 0.8, 0.5, -0.5)) is None  # before it could follow
 
 
 def test_every_proposed_period_is_one_that_the_twin_can_drive() -> None:

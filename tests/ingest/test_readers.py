@@ -7,7 +7,6 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
@@ -17,7 +16,6 @@ from support.bag_samples import (
     TOPICS,
     assert_same_columns,
     compress_files,
-    messages,
     write_bag,
     write_mcap,
 )
@@ -28,7 +26,7 @@ from restock.cli.data.info import describe_recording
 from restock.errors import ExitCode, RecordingError
 from restock.ingest.containers.open_recording import open_recording, recordings_in
 from restock.ingest.containers.recording import Recording
-from restock.ingest.decoding.columns import Ragged, TopicColumns
+from restock.ingest.decoding.columns import TopicColumns
 
 
 def everything(recording: Recording) -> dict[str, TopicColumns]:
@@ -154,49 +152,6 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
         assert_same_columns(expected, by_topic, publish=False)
         for topic, account in other.accounts.items():
             assert account.expected == account.read == account.decoded == 20, topic
-
-
-def test_columns_hold_what_was_written(bag: Path) -> None:
-    with open_recording(bag) as recording:
-        columns = recording.read(
-            {
-                "/odom": ["header.stamp", "twist.twist.linear.x", "pose.covariance"],
-                "/scan": ["ranges", "header.frame_id"],
-                "/joint_states": ["name[]", "velocity"],
-                "/plan": ["poses[].pose.position.x", "poses[].header.frame_id"],
-                "/bumper": ["data"],
-                "/diagnostics": ["status[].level", "status[].values[].value"],
-            }
-        )
-    written: dict[str, list[tuple[int, object]]] = {topic: [] for topic in TOPICS}
-    for topic, log, message in messages():
-        written[topic].append((log, message))
-    for rows in written.values():
-        rows.sort(key=lambda row: row[0])
-
-    odom = columns["/odom"]
-    assert odom.log_time_ns.tolist() == [log for log, _ in written["/odom"]]
-    assert (np.diff(odom.log_time_ns) >= 0).all()
-    assert odom.fields["header.stamp"].dtype == np.int64
-    assert set(odom.fields["header.stamp"]) == {START_NS + n * 50_000_000 for n in range(20)}
-    speed = [message.twist.twist.linear.x for _, message in written["/odom"]]
-    assert odom.fields["twist.twist.linear.x"].tolist() == speed
-    assert odom.fields["pose.covariance"].shape == (20, 36)
-
-    ranges = columns["/scan"].fields["ranges"]
-    assert isinstance(ranges, Ragged)
-    for row, (_, message) in enumerate(written["/scan"]):
-        assert np.array_equal(ranges[row], message.ranges)
-    assert set(columns["/scan"].fields["header.frame_id"]) == {"lidar"}
-    assert columns["/joint_states"].fields["name[]"][3].tolist() == ["left", "right wheel"]
-    x = columns["/plan"].fields["poses[].pose.position.x"]
-    assert x.lengths.tolist() == [len(message.poses) for _, message in written["/plan"]]
-    assert columns["/bumper"].fields["data"].dtype == np.bool_
-    levels = columns["/diagnostics"].fields["status[].values[].value"]
-    for row, (_, message) in enumerate(written["/diagnostics"]):
-        assert [list(item) for item in (levels[row][n] for n in range(len(levels[row])))] == [
-            [pair.value for pair in status.values] for status in message.status
-        ]
 
 
 def test_the_id_is_of_the_content(bag: Path, mcap: Path, tmp_path: Path) -> None:

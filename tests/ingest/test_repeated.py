@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from support.paths import ROOT, SHARED
+from support.paths import ROOT
 from support.stores import manifest, recording_transitions
 
 from restock.cli import main
-from restock.ingest.store.summary import SKETCH_HASHES, Sketch, looks_alike, row_hashes, sharing
+from restock.ingest.store.summary import SKETCH_HASHES, row_hashes
 from restock.ingest.store.writer import StoreWriter
 
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
-NEATO = SHARED / "fleet-neato"
 
 
 def ingested(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
@@ -42,20 +41,6 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def third(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the whole that the part is of."""
     return first(tmp_path_factory, "third", 1 / 3)
-
-
-def test_sketches_that_share_hashes_are_found_together():
-    rng = np.random.default_rng(0)
-    mine = np.unique(rng.integers(2**63, size=900, dtype=np.uint64))
-    parts = [mine[n : n + 40] for n in range(0, 400, 40)]
-    strange = rng.integers(2**63, size=(3, 40), dtype=np.uint64)
-    mixed = [np.concatenate([part[:n], other]) for n, other in enumerate(strange) for part in parts]
-    sketches = [Sketch("", "", np.sort(one)) for one in [*parts, *mixed, *strange, mine[:0]]]
-    found = sharing(mine, sketches)
-    assert found == sketches[: len(parts)]
-    assert [one for one in found if looks_alike(mine, one)] == found
-    assert not any(looks_alike(mine, one) for one in sketches[len(parts) :])
-    assert sharing(mine, []) == sharing(mine[:0], sketches) == []
 
 
 def test_the_whole_after_a_part_is_said(part, third, tmp_path, capsys):
@@ -105,35 +90,6 @@ def test_what_people_corrected_stays(part, third, tmp_path, capsys):
     (note,) = (note for note in whole["notes"] if "It stays" in note)
     assert "people corrected 1 label of it" in note
     assert f"`restock store remove {store} {first['recording_id']}`" in note
-
-
-@pytest.mark.long
-def test_a_part_after_the_whole_is_refused_where_asked(part, third, tmp_path, capsys):
-    store = tmp_path / "store"
-    whole = ingested(capsys, third, "--salvage", "--store", store)
-    refuse = ["ingest", str(part), "--salvage", "--store", str(store), "--repeated", "refuse"]
-    assert main(refuse) == 2
-    error = capsys.readouterr().err
-    assert whole["recording_id"] in error
-    assert "--repeated keep" in error
-    assert len(StoreWriter(store).live()) == 1
-    # Ingesting the very recording again replaces its own rows: that is no repeat.
-    again = ingested(
-        capsys, third, "--salvage", "--store", store, "--force", "--repeated", "refuse"
-    )
-    assert again["status"] == "written"
-    assert again["repeats"] is None
-
-
-@pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
-def test_a_drive_that_was_replayed_and_recorded_again(tmp_path, capsys):
-    profile, store = tmp_path / "neato.toml", tmp_path / "store"
-    (original,) = (NEATO / "2022-original").iterdir()
-    assert main(["profile", "new", str(original), "--out", str(profile)]) == 0
-    first = ingested(capsys, original, "--profile", profile, "--store", store)
-    replayed = ingested(capsys, NEATO / "2023-replayed", "--profile", profile, "--store", store)
-    assert replayed["repeats"]["recording_id"] == first["recording_id"]
-    assert replayed["repeats"]["share"] > 0.95
 
 
 def test_other_drives_are_not_repeats(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> 
         assert sum(one[lost.reason] for one in reasons) == lost.messages
 
 
-def test_damage_between_chunks_costs_no_more_than_the_chunk_in_it(bag: Path) -> None:
+def test_damage_between_chunks_costs_one_chunk_at_most(bag: Path) -> None:
     whole = bag.read_bytes()
     second = whole.index(b"op=\x05", whole.index(b"op=\x05") + 1)
     content = bytearray(whole)

@@ -66,16 +66,3 @@ def test_the_nearest_point_is_the_nearest_and_the_rest_remains(plan, x, y, yaw):
     assert view.offset_m[0] <= nearest + 1e-6
     total = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     assert -1e-6 <= view.remaining_m[0] <= total + 1e-6
-
-
-@given(plans, coordinate, coordinate, st.floats(-4, 4), coordinate, coordinate, st.floats(-4, 4))
-def test_moving_the_whole_world_changes_nothing(plan, x, y, yaw, dx, dy, turn):
-    cos, sin = np.cos(turn), np.sin(turn)
-    rotate = np.array([[cos, -sin], [sin, cos]])
-    moved = np.asarray(plan, float) @ rotate.T + [dx, dy]
-    position = rotate @ [x, y] + [dx, dy]
-    here, there = seen(plan, x, y, yaw), seen(moved, *position, yaw + turn)
-    # Where two points of the plan are equally near, rounding picks one: compare the distance.
-    assert there.offset_m[0] == pytest.approx(here.offset_m[0], abs=1e-6)
-    if abs(there.remaining_m[0] - here.remaining_m[0]) < 1e-6:
-        assert there.look_ahead_m[0] == pytest.approx(here.look_ahead_m[0], abs=1e-5)

@@ -128,24 +128,3 @@ def test_a_path_that_a_type_does_not_have(kind, path, problem_text):
     with pytest.raises(PathProblem) as problem:
         SignalPath.read(path).check(leaves(kind))
     assert problem_text in str(problem.value)
-
-
-@pytest.mark.parametrize(
-    ("kind", "path", "wanted", "kinds"),
-    [
-        ("sensor_msgs/msg/BatteryState", "voltage", ["voltage"], ["float32"]),
-        ("sensor_msgs/msg/LaserScan", "ranges[::4]", ["ranges"], ["float32"]),
-        ("nav_msgs/msg/Odometry", "pose.covariance[35]", ["pose.covariance"], ["float64"]),
-        ("sensor_msgs/msg/JointState", "velocity[left]", ["velocity", "name"], ["float64"]),
-        (
-            "diagnostic_msgs/msg/DiagnosticArray",
-            "status[name=a].values[key=b].value",
-            ["status[].values[].value", "status[].name", "status[].values[].key"],
-            ["string"],
-        ),
-    ],
-)
-def test_what_a_path_reads(kind, path, wanted, kinds):
-    read = SignalPath.read(path)
-    assert read.check(leaves(kind)) == kinds
-    assert read.wanted() == wanted

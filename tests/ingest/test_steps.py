@@ -60,20 +60,6 @@ def test_nothing_of_a_step_comes_from_later_messages():
             np.testing.assert_array_equal(column, whole.signals[name][: tick + 1], name)
 
 
-def test_a_stale_input_makes_the_tick_unusable_by_name():
-    topics = Drive().topics()
-    quiet = (topics["/scan"].log_time_ns - START_NS) * 1e-9
-    topics["/scan"] = without(topics["/scan"], (quiet < 2) | (quiet > 3.5))
-    steps = steps_of(PROFILE, topics)
-    stale = [index for index, problem in enumerate(steps.problem) if problem == "scan: stale"]
-    at_s = (steps.signals["stamp_ns"][stale] - START_NS) * 1e-9
-    assert at_s.min() > 1.9 + 0.5  # the last scan before, and its maximum age
-    assert at_s.max() < 3.5
-    assert len(stale) == 6
-    assert not steps.follows[stale[0]]
-    assert not steps.follows[stale[-1] + 1]
-
-
 def test_what_was_never_received_is_said_so():
     topics = Drive().topics()
     late = (topics["/imu"].log_time_ns - START_NS) * 1e-9
@@ -185,31 +171,10 @@ def test_an_unknown_proposal_leaves_the_tick_usable():
     assert set(steps.problem) == {""}
 
 
-def test_a_plan_for_another_goal_is_not_followed():
-    drive = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 9.0)])
-    topics = drive.topics()
-    topics["/plan"] = without(topics["/plan"], np.array([True, False]))  # no plan for the second
-    steps = steps_of(PROFILE, topics)
-    assert steps.route_problem[9] == ""
-    assert set(steps.route_problem[10:]) == {"plan: for another goal"}
-    assert set(steps.problem) == {""}
-    assert steps.routing.goal[10] == -1
-
-
 def test_the_same_goal_again_is_no_new_goal():
     drive = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 1.0), (4.0, 11.0, 1.005)])
     steps = steps_of(PROFILE, drive.topics())
     assert set(steps.routing.goal) == {0}
-
-
-def test_a_bump_between_two_ticks_is_not_missed():
-    topics = Drive().topics()
-    time = np.arange(0, 6, 0.02)
-    pressed = np.zeros(len(time), np.bool_)
-    pressed[103] = True  # at 2.06 s for 20 ms
-    topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
-    bumped = steps_of(PROFILE, topics).signals["bumped"]
-    assert np.flatnonzero(bumped).tolist() == [11]  # the tick at 2.205 s
 
 
 def test_a_handover_is_on_the_tick_it_takes_force():

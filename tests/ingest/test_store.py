@@ -3,9 +3,7 @@
 import multiprocessing
 import os
 import shutil
-import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
@@ -88,37 +86,6 @@ def test_writers_at_the_same_time_lose_and_double_nothing(place):
     for ingest, count in found.items():
         recording, name = ingest.split("-")
         assert count == len(one(int(recording, 16), name)[1])
-
-
-def _write_for_ever(place: Path | str) -> None:
-    for turn in range(1000):
-        StoreWriter(place).write(*one(1, f"{turn}", seed=turn))
-
-
-@pytest.mark.parametrize(
-    ("place", "after_s"),
-    one_in(3, [("folder", 0.13), ("folder", 0.05), ("folder", 0.21), ("s3", 0.2)]),
-    indirect=["place"],
-)
-def test_a_killed_writer_leaves_the_last_whole_commit(place, after_s):
-    StoreWriter(place).write(*one(1, "first"))
-    on_disk = isinstance(place, Path)
-    context = multiprocessing.get_context("fork" if on_disk else "spawn")
-    process = context.Process(target=_write_for_ever, args=(place,))
-    process.start()
-    while not on_disk and "-first" in next(iter(shown(place))):  # until it is at work
-        assert process.is_alive()
-        time.sleep(0.01)
-    time.sleep(after_s)
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    ((ingest, count),) = shown(place).items()
-    name = ingest.split("-")[1]
-    assert on_disk or name != "first"
-    assert count == len(one(1, name, seed=0 if name == "first" else int(name))[1])
-    StoreWriter(place).write(*one(1, "last"))
-    assert list(shown(place)) == ["0000000000000001-last"]
 
 
 def test_a_reader_between_two_commits_sees_the_recording(tmp_path, monkeypatch):
@@ -249,25 +216,14 @@ def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkey
     assert len(shown(tmp_path / "s")) == 1
 
 
-class _Overtaken(StoreWriter):
-    """A writer between whose two commits another one writes."""
-
-    def __init__(self, path: Path, meanwhile: Callable[[], object]) -> None:
-        super().__init__(path)
-        self.meanwhile = meanwhile
-
-    def commit(self, name, added, instead_of):
-        if name == TRANSITIONS:
-            self.meanwhile()
-        return super().commit(name, added, instead_of)
-
-
-def test_a_writer_overtaken_by_another_loses_nothing(tmp_path):
+def test_a_writer_overtaken_by_another_loses_nothing(tmp_path, before_commit):
     path = tmp_path / "s"
-    _Overtaken(path, lambda: StoreWriter(path).write(*one(1, "b"))).write(*one(1, "a"))
-    assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
+    StoreWriter(path).write(*one(2))
+    before_commit(lambda: StoreWriter(path).write(*one(1, "b")), TRANSITIONS)
+    StoreWriter(path).write(*one(1, "a"))
+    assert list(shown(path)) == ["0000000000000001-a", "0000000000000002-a"]
     manifests = DeltaTable(str(path / RECORDINGS)).file_uris()
-    assert [Path(uri).stem for uri in manifests] == ["0000000000000001-a"]
+    assert {Path(uri).stem for uri in manifests} == set(shown(path))
 
 
 def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
@@ -374,7 +330,7 @@ def test_a_version_of_a_store_on_s3_is_no_secret():
     assert str(Location.of("s3://bucket/a@2026-11-01T08:00Z")) == "s3://bucket/a"
 
 
-def test_a_writer_opens_a_table_again_only_after_commits_of_others(tmp_path, monkeypatch):
+def test_a_writer_opens_a_table_again_only_for_others_commits(tmp_path, monkeypatch):
     writer, opened = StoreWriter(tmp_path / "s"), []
     open_table = Location.open_table
     monkeypatch.setattr(

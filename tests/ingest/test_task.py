@@ -146,13 +146,6 @@ def test_the_nearest_action_and_how_far_it_is():
     assert residual == pytest.approx([0, 0.1, 1.0, np.hypot(0.1, 0.3), 0.25, 0])
 
 
-@given(st.integers(0, 4))
-def test_every_action_is_its_own_nearest(index):
-    speed, yaw = TASK.actions[index]
-    action, residual = nearest_action(TASK, np.array([speed]), np.array([yaw]))
-    assert (action[0], residual[0]) == (index, 0)
-
-
 @pytest.mark.parametrize(
     ("values", "progress", "actions", "expected"),
     [

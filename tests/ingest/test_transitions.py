@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
-from support.driven_robot import SPEED_MPS, START_NS, Drive, columns, without
+from support.driven_robot import SPEED_MPS, START_NS, Drive, columns, ragged, without
 
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile
@@ -78,8 +78,6 @@ def test_progress_is_along_the_plan_when_acting():
     """A new, longer plan to the same goal is no loss of progress."""
     topics = Drive().topics()
     x, y = (topics["/plan"].fields[f"poses[].pose.position.{axis}"] for axis in "xy")
-    from support.driven_robot import ragged
-
     detour_x = [np.array([1.0, 2.0]), np.array([1.0, 2.0]), np.array([11.0, 11.0])]
     detour_y = [np.array([1.0, 1.0]), np.array([1.0, 9.0]), np.array([1.0, 1.0])]
     assert len(x) == len(y) == 1

@@ -114,7 +114,7 @@ def test_only_failures_that_may_pass_are_tried_again(error, again, bag, tmp_path
     assert seen.after(STILL_S) == ["bag"]
 
 
-def test_a_folder_that_disappears_is_said_once_and_forgets_nothing(bag, tmp_path):
+def test_a_folder_that_disappears_is_named_once_and_known_again(bag, tmp_path):
     folder = tmp_path / "in"
     shutil.copytree(bag, folder / "bag")
     seen = Seen(folder)
