@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from restock.report.run.card import write_card as write_card
     from restock.report.run.comparison import gate_page as gate_page
     from restock.report.run.comparison import gate_section as gate_section
-    from restock.report.run.comparison import outcome_sections as outcome_sections
+    from restock.report.run.comparison import outcome_section as outcome_section
     from restock.report.run.comparison import study_page as study_page
     from restock.report.run.twin_gap import gap_page as gap_page
 else:

@@ -81,7 +81,7 @@ def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
 
 def _show(comparison: Comparison, names: tuple[str, str]) -> None:
     """Print what differs, the checks that failed, the verdict and the outcomes."""
-    from restock.report import gate_section, outcome_sections
+    from restock.report import gate_section, outcome_section
 
     found = plain(comparison.as_json())
     # Too few episodes show nothing of the same runs.
@@ -90,7 +90,7 @@ def _show(comparison: Comparison, names: tuple[str, str]) -> None:
     print_sections([gate_section({**found, "checks": failed}, *names)], folded=True)
     say(comparison.sentence)
     if comparison.rows:
-        print_sections(outcome_sections(found, *names))
+        print_sections([outcome_section(found, *names)])
     for reason in dict.fromkeys(row["no_interval"] for row in comparison.rows):
         if reason is not None:
             say(f"no interval: {reason}")

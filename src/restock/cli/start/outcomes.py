@@ -10,11 +10,11 @@ from restock.errors import counted
 from restock.stats import interval_text
 
 Document = Mapping[str, Any]  # what a verb prints with --json; empty if it has not run
-ESTIMATORS = (
-    ("logged", "as the logs were driven"),
-    ("fqe", "the policy, by a fitted model (fqe)"),
-    ("pdwis", "by importance weights (pdwis)"),
-)
+ESTIMATORS = {
+    "logged": "as the logs were driven",
+    "fqe": "the policy, by a fitted model (fqe)",
+    "pdwis": "by importance weights (pdwis)",
+}
 
 
 def info(document: Document) -> list[str]:
@@ -200,25 +200,19 @@ def driven_on_ways(document: Document) -> list[str]:
 
 def on_logs(document: Document) -> list[str]:
     """Compare the policy's worth by held-out logs with what the logs' drivers achieved."""
-    rows = [row for row in document["results"] if row["condition"] == "all"]
-    lines = []
-    for measure in dict.fromkeys(row["measure"] for row in rows):
-        own = {row["estimator"]: row for row in rows if row["measure"] == measure}
-        known = [f"{said} {_estimate(own[name])}" for name, said in ESTIMATORS if name in own]
-        episodes = counted(next(iter(own.values()))["episodes"], "held-out episode")
-        lines.append(f"{measure} of {episodes}: {', '.join(known)}")
-        why = next((row["refused"] for row in own.values() if row["refused"]), None)
-        if why:
-            lines.append(
-                f"refused: {why}. So it is not known whether the policy is better than the logs' "
-                "drivers: a fitted model alone is no evidence"
-            )
+    shown: dict[str, list[str]] = {}
+    for row in document["results"]:
+        if row["condition"] == "all":
+            measure = f"{row['measure']} of {counted(row['episodes'], 'held-out episode')}"
+            words = ESTIMATORS.get(row["estimator"], row["estimator"])
+            shown.setdefault(measure, []).append(f"{words} {_estimate(row)}")
+    lines = [f"{measure}: {', '.join(of)}" for measure, of in shown.items()]
     return lines + list(document["notes"])
 
 
 def _estimate(row: Mapping[str, Any]) -> str:
     if row["value"] is None:
-        return "refused"
+        return f"refused: {row['refused']}"
     text = interval_text(row["value"], row["low"], row["high"])
     return text if row["low"] is not None else f"{text} (no interval)"
 

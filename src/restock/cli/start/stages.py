@@ -83,17 +83,17 @@ class Settings:
         return counts or str(self.episodes)
 
     @property
-    def with_definitions(self) -> list[str]:
+    def definition_options(self) -> list[str]:
         """Return the options that define message types which a recording does not define."""
         return [] if self.definitions is None else ["--definitions", self.definitions]
 
     @property
-    def reading(self) -> list[str]:
+    def read_options(self) -> list[str]:
         """Return the options by which recordings are read."""
-        return self.with_definitions + ["--salvage"] * self.salvage
+        return self.definition_options + ["--salvage"] * self.salvage
 
     @property
-    def read(self) -> tuple[Path, ...]:
+    def files_read(self) -> tuple[Path, ...]:
         """Return the user's files that every stage reads which reads a recording."""
         from restock.ingest.decoding.definitions import choose_definitions
 
@@ -117,8 +117,8 @@ def info(to: Settings) -> Stage:
     return Stage(
         "info",
         "What is in these recordings?",
-        ["info", *to.logs, *to.reading],
-        reads=to.read,
+        ["info", *to.logs, *to.read_options],
+        reads=to.files_read,
         expected=(0, 3),  # 3: damaged, and read as far as it is intact
         outcome=outcomes.info,
     )
@@ -131,8 +131,8 @@ def propose(
     return Stage(
         "propose",
         "How do its topics become observation, action and reward?",
-        ["profile", "new", *recordings, "--out", str(to.profile), *flags, *to.reading],
-        reads=(*to.read, *own_file(urdf)),
+        ["profile", "new", *recordings, "--out", str(to.profile), *flags, *to.read_options],
+        reads=(*to.files_read, *own_file(urdf)),
         writes=(Path(str(to.profile)),),
         expected=(0, 3),
         outcome=outcomes.propose,
@@ -143,7 +143,7 @@ def check(to: Settings, recording: str) -> Stage:
     return Stage(
         "check",
         "Does the profile fit?",
-        ["profile", "check", str(to.profile), recording, *to.reading],
+        ["profile", "check", str(to.profile), recording, *to.read_options],
         reads=own_file(to.profile),
         expected=(0, 3),  # 3: data was lost, which ingest says of all recordings
         outcome=outcomes.check,
@@ -156,8 +156,8 @@ def ingest(to: Settings) -> Stage:
     return Stage(
         "ingest",
         "Recordings to labelled transitions",
-        ["ingest", *to.logs, "--store", str(to.store), *profile, *to.reading, *tags],
-        reads=(*to.read, *own_file(to.profile)),
+        ["ingest", *to.logs, "--store", str(to.store), *profile, *to.read_options, *tags],
+        reads=(*to.files_read, *own_file(to.profile)),
         writes=(to.store,),
         expected=(0, 3),
         outcome=outcomes.ingest,
@@ -189,7 +189,7 @@ def floor(to: Settings) -> Stage:
     """Make the twin's floor from the user's map, else from scans, else from the path driven."""
     given = () if to.map is None else ("--map", str(to.map))
     picture = to.floor.with_suffix(".png")
-    words = ("twin", "layout", "--from", str(to.store), *given, *to.with_definitions)
+    words = ("twin", "layout", "--from", str(to.store), *given, *to.definition_options)
     return Stage(
         "floor",
         "The floor, as the recordings show it",

@@ -17,7 +17,6 @@ from restock.stats import interval_text
 from restock.train.twin.missions import MISSIONS
 
 Rows = list[dict[str, Any]]
-MAX_ROWS = 24  # rows of a table that need not be folded
 BROAD = 4  # columns: with more, a phone shows rows as lists
 
 

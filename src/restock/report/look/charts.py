@@ -119,13 +119,6 @@ def _svg(spec: dict[str, Any]) -> str:
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>d{number}-", svg)
 
 
-def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
-    """Return a colour scale over the names that occur, known ones in their own colour."""
-    spare = POLICY_SPARES if colours is POLICY_COLOURS else SPARE_COLOURS
-    all_of_them = palette(names, colours, spare)
-    return alt.Scale(domain=list(names), range=[all_of_them[name] for name in names])
-
-
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
     """Place a legend above the chart, in as many columns as fit beside its axis labels."""
     longest = max((len(name) for name in names), default=1) * LETTER_PX
@@ -144,9 +137,10 @@ def coloured(
     labels_px: int = 60,
 ) -> alt.Color:
     """Return a colour for each name of a column, in the order of `names`, with a legend."""
+    found = palette(names, colours, POLICY_SPARES if colours is POLICY_COLOURS else SPARE_COLOURS)
     return alt.Color(
         f"{field}:N",
-        scale=scale(names, colours),
+        scale=alt.Scale(domain=list(names), range=[found[name] for name in names]),
         legend=legend(names, width, labels_px),
     )
 

@@ -19,7 +19,7 @@ from restock.replay.sampling.rules import RULES
 from restock.report.look import write
 from restock.report.look.blocks import Rows, Section, Table, cell, estimate, shown, words
 from restock.report.run.facts import Facts, evaluation_bias, gather
-from restock.report.run.fed import AGES, FED, POLICIES, PRACTICE
+from restock.report.run.page import AGES, FED, POLICIES, PRACTICE
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"

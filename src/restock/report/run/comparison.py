@@ -24,10 +24,6 @@ from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 MAX_SETTINGS = 4  # differing settings that are named in a line
 FREE_KINDS = ("free", "software")
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
-_VERDICTS = {
-    "inconclusive": "Gate refused: inconclusive",
-    "incomparable": "Gate refused: not comparable",
-}
 _INTERVALS = (
     "Intervals are 95 %, over seeds and episodes; with fewer than three seeds or ten episodes, "
     "only values are shown."
@@ -55,18 +51,14 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
     )
 
 
-def outcome_sections(
-    found: dict[str, Any], first: str, second: str, prefix: str = ""
-) -> list[Section | None]:
+def outcome_section(found: dict[str, Any], first: str, second: str, prefix: str = "") -> Section:
     """Return the outcomes, or why there are none."""
-    title, treatment = f"{second} against {first}", _treatment(found)
-    if found["verdict"] != "comparable":
-        text = f"{_VERDICTS[found['verdict']]}: {found['why']}."
-        return [Section(f"{prefix}outcomes", title, intro=treatment, callout=text)]
+    name, title, treatment = f"{prefix}outcomes", f"{second} against {first}", _treatment(found)
     rows = found["outcomes"]
-    if not rows:
-        text = "No condition was driven by both."
-        return [Section(f"{prefix}outcomes", title, intro=treatment, callout=text)]
+    if found["verdict"] != "comparable" or not rows:
+        refused = f"Gate refused: {found['verdict']}: {found['why']}."
+        why = "No condition was driven by both." if found["verdict"] == "comparable" else refused
+        return Section(name, title, intro=treatment, callout=why)
     reasons = list(dict.fromkeys(row["no_interval"] for row in rows if row["no_interval"]))
     table = [
         {
@@ -91,23 +83,21 @@ def outcome_sections(
     if any(row["difference"] is not None for row in rows):
         caption = f"Right of the line {second} is better."
         figures = [Figure(charts.differences(rows), "Difference in success", caption)]
-    return [
-        Section(
-            f"{prefix}outcomes",
-            title,
-            intro=f"{treatment} Both drove the same episodes, from {found['outcomes_from']}."
-            f" {_INTERVALS}" + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
-            figures=figures,
-            tables=[
-                Table(
-                    table,
-                    caption="P(higher return): the probability that the return of"
-                    f" {second} on an episode is higher, ties counting half, over all pairs of"
-                    " runs; 0.5 means no difference.",
-                )
-            ],
-        )
-    ]
+    return Section(
+        name,
+        title,
+        intro=f"{treatment} Both drove the same episodes, from {found['outcomes_from']}."
+        f" {_INTERVALS}" + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
+        figures=figures,
+        tables=[
+            Table(
+                table,
+                caption="P(higher return): the probability that the return of"
+                f" {second} on an episode is higher, ties counting half, over all pairs of"
+                " runs; 0.5 means no difference.",
+            )
+        ],
+    )
 
 
 def _treatment(found: dict[str, Any]) -> str:
@@ -241,9 +231,8 @@ def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
         _arms(study["arms"], arms, _costs(study["cost"])),
         curves_section(study["curves"], arms),
         *(
-            section
+            outcome_section(one, one["baseline"], one["arm"], f"c{number}-")
             for number, one in enumerate(comparisons)
-            for section in outcome_sections(one, one["baseline"], one["arm"], f"c{number}-")
         ),
     ]
     total = len(comparisons)

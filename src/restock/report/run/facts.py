@@ -34,7 +34,7 @@ CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined."
 MAX_DOTS = 1500
 _TABLES = (  # of a run, which run.sql reads
-    *("strata", "conditions", "actions", "ages", "policies", "practice"),
+    *("strata", "conditions", "ages", "policies", "practice"),
     *("evaluations", "probe", "progress"),
 )
 
@@ -48,7 +48,6 @@ class Facts:
     # Results of `run.sql`, by the names of its statements.
     sampled: Rows
     conditions: Rows
-    actions: Rows
     ages: Rows
     policies: Rows
     practice: Rows

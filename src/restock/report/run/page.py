@@ -9,13 +9,28 @@ from markupsafe import Markup
 
 from restock.errors import RestockError, counted, policy_words
 from restock.files import read_json
+from restock.replay.plan.exclusions import DAY_NS
 from restock.report.look import charts, floor_map
-from restock.report.look.blocks import Figure, Rows, Section, Table, pretty, words
-from restock.report.run.facts import CELL_M, NO_GOAL, Facts
-from restock.report.run.fed import actions_section, practice_section, sampled
+from restock.report.look.blocks import Figure, Rows, Section, Table, pretty, shown, words
+from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
 from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
 from restock.train.run.kept_evaluations import cell_name, measured_row
+
+# Columns of tables and their titles, on the page and on the replay card.
+FED = {
+    "stratum": "stratum",
+    **{f"{name}_share": name for name in ("natural", "wanted", "drawn")},
+    **{"logs_share": "from logs", "fresh_share": "fresh", "short_share": "short"},
+    "reason": "why short",
+}
+AGES = {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")}
+POLICIES = {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"}
+PRACTICE = {
+    **{"arm": "missions", "natural_share": "natural", "first_share": "wanted at first"},
+    **{"last_share": "wanted at last", "given_share": "given", "episodes": "ended"},
+}
+SHARE_COLOURS = {"natural": "#cbd5e1", "wanted": "#94a3b8", "drawn": "#0f766e"}
 
 
 def page(facts: Facts) -> dict[str, Any]:
@@ -30,7 +45,6 @@ def page(facts: Facts) -> dict[str, Any]:
             films_section(facts),
             sampled(facts),
             practice_section(facts),
-            actions_section(facts),
             learning(facts),
             floor_section(facts),
             run_section(facts),
@@ -44,10 +58,10 @@ def success(facts: Facts) -> Section | None:
     """Show each policy's success by kind of episode: on drawn missions, and on logged routes."""
     if not facts.cells:
         return None
-    shown = _evaluated(facts.cells)
+    cells = _evaluated(facts.cells)
     tables = [
         _measures(
-            [row for row in shown if row["perturbation"] == name and row["policy"] != "random"],
+            [row for row in cells if row["perturbation"] == name and row["policy"] != "random"],
             "Success, return and safety side by side" + ("" if name == "clean" else f": {name}"),
             "Intervals are 95 % over episodes. People include forklifts; the distance is "
             "the true one from the edge of the body. Time lost to the planner is over the missions "
@@ -56,7 +70,7 @@ def success(facts: Facts) -> Section | None:
             else "",
             folded=name != "clean",
         )
-        for name in dict.fromkeys(row["perturbation"] for row in shown)
+        for name in dict.fromkeys(row["perturbation"] for row in cells)
     ]
     if facts.ways:
         caption = (
@@ -73,7 +87,7 @@ def success(facts: Facts) -> Section | None:
         "a perturbation (clean) and under each one. Lines are 95 % Wilson intervals. "
         f"{facts.evaluation}" + "".join(f" {one.text}." for one in facts.clones),
         callout="" if facts.no_goal else ". ".join(losses(facts)),
-        figures=[] if facts.no_goal else [Figure(charts.success(shown))],
+        figures=[] if facts.no_goal else [Figure(charts.success(cells))],
         tables=tables,
     )
 
@@ -98,11 +112,63 @@ def _evaluated(cells: Rows) -> Rows:
 
 
 def _measures(rows: Rows, title: str, caption: str, *, folded: bool = False) -> Table:
-    shown = [
+    measured = [
         {"kind of episode": row["condition"], "policy": row["policy"], **measured_row(row)}
         for row in rows
     ]
-    return Table(shown, title, caption, folded)
+    return Table(measured, title, caption, folded)
+
+
+def sampled(facts: Facts) -> Section:
+    """Show what the critic was fed: the section that matters most."""
+    rows: Rows = [
+        {"stratum": words(row["stratum"]), "kind": kind, "share": row[f"{kind}_share"]}
+        for row in facts.fed
+        for kind in SHARE_COLOURS
+    ]
+    figures = [Figure(charts.shares(rows, "stratum", SHARE_COLOURS))] if rows else []
+    return Section(
+        "fed",
+        "What was the critic fed?",
+        intro="The replay mix is the training distribution. A quota is a stratum's share of the "
+        "batch, whether its rows are logged or fresh. Natural: the share under uniform draws from "
+        "the same sources. Wanted: the quota. Drawn: the share of all rows fed in the whole run.",
+        callout=evaluation_bias(facts),
+        figures=figures,
+        tables=[
+            Table(shown(facts.fed, FED)),
+            Table(
+                shown(facts.ages, AGES),
+                title="How old the sampled rows were",
+                caption="Upper ends of log2 buckets: days before training began for logs"
+                f"{_newest(facts)}, environment steps since they were collected for fresh rows.",
+            ),
+            Table(shown(facts.policies, POLICIES), title="Who drove the sampled rows"),
+        ],
+    )
+
+
+def _newest(facts: Facts) -> str:
+    """Return the age of the panel's newest row: what is only as old is not stale."""
+    began_ns = facts.config.get("created_ns")
+    if facts.panel is None or began_ns is None:
+        return ""
+    days = (began_ns - facts.panel.header.newest_ns) / DAY_NS
+    return f" (the panel's newest row was {days:,.1f} days old then)"
+
+
+def practice_section(facts: Facts) -> Section | None:
+    """Return the section on practice; None if the run has no record of it."""
+    if not facts.practice:
+        return None
+    return Section(
+        "practice",
+        "What did it practise?",
+        intro=f"Missions in the twin, by the rule “{facts.practice[0]['rule']}”. Shares are of "
+        "missions that ended while the agent explored; its success is lower there than in "
+        "evaluations.",
+        tables=[Table(shown(facts.practice, PRACTICE | {"success": "success, exploring"}))],
+    )
 
 
 def learning(facts: Facts) -> Section:

@@ -38,32 +38,6 @@ FROM drawn
 GROUP BY source, condition
 ORDER BY source DESC, drawn_share DESC;
 
--- name: actions
--- The actions that the policy wanted in the last quarter of the updates more than twice as often as the logs have them,
--- by condition; of conditions with logged rows and at least 20 audited fresh ones.
-WITH shares AS (
-    SELECT condition, any_value(name) AS name,
-           sum(drawn_rows) FILTER (source = 'logs')
-               / sum(sum(drawn_rows) FILTER (source = 'logs')) OVER cell AS logged_share,
-           sum(drawn_rows) FILTER (source = 'fresh')
-               / sum(sum(drawn_rows) FILTER (source = 'fresh')) OVER cell AS drawn_share,
-           sum(wanted_rows) / nullif(sum(sum(wanted_rows)) OVER cell, 0) AS wanted_share,
-           sum(sum(wanted_rows)) OVER cell AS audited_rows
-    FROM (
-        SELECT *, CASE WHEN source = 'fresh' AND gradient_steps > 0.75 * max(gradient_steps) OVER ()
-                       THEN greedy_rows END AS wanted_rows
-        FROM actions
-    )
-    WHERE condition <> 'unlabelled'
-    GROUP BY condition, action
-    WINDOW cell AS (PARTITION BY condition)
-)
-SELECT condition, name, wanted_share, logged_share, drawn_share, CAST(audited_rows AS BIGINT) AS audited_rows
-FROM shares
-WHERE audited_rows >= 20 AND wanted_share > 2 * logged_share
-ORDER BY wanted_share - logged_share DESC, condition, name
-LIMIT 12;
-
 -- name: ages
 -- Quantiles of the ages, as the upper ends of their log2 buckets: days for logs, environment steps for fresh rows.
 WITH buckets AS (
