@@ -1,7 +1,7 @@
 """Several drives of one kind of robot: which are of a kind, and one profile for all of them."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,12 +15,16 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose import drives as drives_module
 from restock.ingest.propose.drives import (
+    Lidar,
+    RobotTraits,
     drives_by_kind,
     propose_for_drives,
+    robot_kinds,
     robot_traits,
 )
 from restock.ingest.propose.propose import Proposal, tried
 
+TWIST = "geometry_msgs/msg/Twist"
 WHEELS = "".join(
     f'<link name="{side}"><collision><geometry><cylinder radius="0.05" length="0.02"/></geometry>'
     f'</collision></link><joint name="{side}_joint" type="continuous"><parent link="base"/>'
@@ -91,6 +95,41 @@ def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
     rows = [one["transitions"] for one in json.loads(capsys.readouterr().out)["recordings"]]
     assert all(rows)
     assert sum(rows) == said["transitions"]
+
+
+def traits(**reported) -> RobotTraits:
+    empty = RobotTraits("", "", None, "", "", frozenset(), frozenset())
+    return replace(empty, **reported)
+
+
+LIDAR = Lidar("laser", 360, 12.0, simulated=False)
+
+
+def test_what_disagrees_is_another_kind():
+    robots = [
+        traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR),
+        traits(command=TWIST, lidar=replace(LIDAR, beams=351)),  # it turns at its own pace
+        traits(command=TWIST, lidar=replace(LIDAR, beams=720)),
+        traits(command=TWIST, lidar=replace(LIDAR, simulated=True)),
+        traits(command="ackermann_msgs/msg/AckermannDrive", lidar=LIDAR),
+        traits(command=TWIST, frames="odom -> base_footprint", lidar=LIDAR),
+    ]
+    assert robot_kinds(robots) == [[0], [1], [2], [3], [4], [5]]
+    # Without the one of other frames nothing contradicts: the two of the same lidar are of a kind.
+    assert robot_kinds(robots[:5]) == [[0, 1], [2], [3], [4]]
+
+
+def test_the_usual_names_alone_tell_of_no_kind():
+    usual = {"command": TWIST, "frames": "odom -> base_link"}
+    inputs = frozenset({("/cmd_vel", TWIST)})
+    topics = inputs | {("/status", "mine/msg/Status")}
+    robots = [
+        traits(**usual, lidar=LIDAR, inputs=inputs),
+        traits(**usual, inputs=inputs, topics=inputs),
+        traits(**usual, inputs=inputs, topics=topics | {("/a", "A"), ("/b", "B")}),
+        traits(**usual, inputs=inputs, topics=topics | {("/a", "A")}),
+    ]
+    assert robot_kinds(robots) == [[0], [1], [2, 3]]
 
 
 def test_what_was_read_and_what_not_is_told(tmp_path, capsys, monkeypatch):

@@ -11,7 +11,7 @@ from support.paths import ROOT
 from support.stores import manifest, recording_transitions
 
 from restock.cli import main
-from restock.ingest.store.summary import SKETCH_HASHES, row_hashes
+from restock.ingest.store.summary import SKETCH_HASHES, Sketch, looks_alike, row_hashes, sharing
 from restock.ingest.store.writer import StoreWriter
 
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
@@ -41,6 +41,20 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def third(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the whole that the part is of."""
     return first(tmp_path_factory, "third", 1 / 3)
+
+
+def test_sketches_that_share_hashes_are_found_together():
+    rng = np.random.default_rng(0)
+    mine = np.unique(rng.integers(2**63, size=900, dtype=np.uint64))
+    parts = [mine[n : n + 40] for n in range(0, 400, 40)]
+    strange = rng.integers(2**63, size=(3, 40), dtype=np.uint64)
+    mixed = [np.concatenate([part[:n], other]) for n, other in enumerate(strange) for part in parts]
+    sketches = [Sketch("", "", np.sort(one)) for one in [*parts, *mixed, *strange, mine[:0]]]
+    found = sharing(mine, sketches)
+    assert found == sketches[: len(parts)]
+    assert [one for one in found if looks_alike(mine, one)] == found
+    assert not any(looks_alike(mine, one) for one in sketches[len(parts) :])
+    assert sharing(mine, []) == sharing(mine[:0], sketches) == []
 
 
 def test_the_whole_after_a_part_is_said(part, third, tmp_path, capsys):
