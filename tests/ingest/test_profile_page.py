@@ -1,21 +1,26 @@
-"""docs/profile.md: what it shows on sample_logs/ is what comes out."""
+"""docs/profile.md: what it shows on sample_logs/ comes out, and its keys are all there are."""
 
 import json
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
 from support.pages import Block, blocks
 from support.paths import ROOT
 
 from restock.cli import main
+from restock.ingest.profile.tables import Clock, Episodes, Frames, Input, Motion, Zone
+from restock.ingest.task.task import Body, Rewards, Task
 
 PATH = ROOT / "docs" / "profile.md"
 PAGE = PATH.read_text(encoding="utf-8")
 FIRST_LINE = PAGE[: PAGE.index("\n## The same on sample_logs/\n")].count("\n")
 BLOCKS = [block for block in blocks(PATH) if block.line > FIRST_LINE]
 FILES = {block.marks["file"]: block.text for block in BLOCKS if "file" in block.marks}
+TABLES_WITHIN = {"body", "rewards"}
 
 
 def assert_prints_as_shown(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,3 +66,46 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     main(["ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store", "--json"])
     recordings = json.loads(capsys.readouterr().out)["recordings"]
     assert {one["status"] for one in recordings} == {"unchanged"}
+
+
+def documented() -> dict[str, dict[str, str]]:
+    """heading -> key -> its default, as the page has them."""
+    found: dict[str, dict[str, str]] = {}
+    heading = ""
+    for line in PAGE.partition("## Keys of a profile")[2].splitlines():
+        if line.startswith("#"):
+            heading = line.lstrip("# ")
+        elif line.startswith("| `"):
+            keys, *_, default = (cell.strip() for cell in line.strip("|").split(" | "))
+            names = re.findall(r"`([^`]+)`", keys)
+            defaults = re.findall(r"`([^`]+)`", default.strip(" |"))
+            rows = found.setdefault(heading, {})
+            rows |= dict(zip(names, defaults or [""] * len(names), strict=True))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "heading", "prefix"),
+    [
+        (Input, "`[inputs.NAME]`", ""),
+        (Task, "`[task]`", ""),
+        (Body, "`[task.body]`", ""),
+        (Rewards, "`[task.rewards]`", ""),
+        (Clock, "`[clock]`", ""),
+        (Episodes, "`[episodes]`", ""),
+        (Frames, "`[frames]`, `[motion]` and `[[zone]]`", "frames."),
+        (Motion, "`[frames]`, `[motion]` and `[[zone]]`", "motion."),
+        (Zone, "`[frames]`, `[motion]` and `[[zone]]`", "zone."),
+    ],
+)
+def test_the_page_has_every_key_and_its_default(kind, heading, prefix):
+    rows = documented()[heading]
+    fields = {field.encode_name: field.default for field in msgspec.structs.fields(kind)}
+    keys = {key.removeprefix(prefix) for key in rows if key.startswith(prefix)}
+    assert keys == fields.keys() - TABLES_WITHIN
+    for key in keys:
+        said, default = rows[prefix + key], fields[key]
+        if default in (msgspec.NODEFAULT, msgspec.UNSET, None):
+            assert said == "", key
+        else:
+            assert tomllib.loads(f"value = {said}")["value"] == default, key

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from support.panels import planned
 from support.stores import CONDITIONS, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.build import build_panel
 from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
 from restock.replay.store.store import Store
@@ -50,16 +51,6 @@ def planted(failed: Callable[[int], bool], near: list[bool] = NEAR) -> pa.Table:
     )
 
 
-def store_of(rows: pa.Table, path: Path) -> Path:
-    return write_store(path, [rows])
-
-
-def planned(store: Path, mixture: str) -> PanelPlan:
-    requested = parse_mixture(mixture)
-    with Store(store) as opened, open_source(opened, requested) as source:
-        return plan_panel(source.connection, requested, source.conditions)
-
-
 def success_in(plan: PanelPlan, stratum: str, rows: pa.Table) -> float:
     """Of the episodes in a stratum of the panel, those that reached the goal."""
     (code,) = [place for place, line in enumerate(plan.strata) if line.name == stratum]
@@ -75,7 +66,7 @@ BY_EXPOSURE = BY_OUTCOME + "\nkind = 'exposure'"
 
 def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
     rows = planted(lambda number: NEAR[number])
-    store = store_of(rows, tmp_path / "store")
+    store = write_store(tmp_path / "store", [rows])
     outcome, exposure = planned(store, BY_OUTCOME), planned(store, BY_EXPOSURE)
     names = {line.name: line.episodes for line in exposure.strata}
     assert names == {"nominal": 40, "closing_traffic": 20, "plan_blocked": 0, "slippery_floor": 0}
@@ -87,7 +78,7 @@ def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
 
 def test_no_advice_is_to_add_what_is_there(tmp_path):
     rows = planted(lambda number: NEAR[number])
-    store = store_of(replaced(rows, {"exposures": [[]] * len(rows)}), tmp_path / "store")
+    store = write_store(tmp_path / "store", [replaced(rows, {"exposures": [[]] * len(rows)})])
     with pytest.raises(MixtureError, match="belong to no stratum") as refused:
         planned(store, "[each_condition]\nkind = 'exposure'")
     assert "each_condition" not in str(refused.value)
@@ -95,7 +86,7 @@ def test_no_advice_is_to_add_what_is_there(tmp_path):
 
 def test_an_exposure_beside_a_condition_goes_by_priority(tmp_path):
     """Of steps: a condition goes first, as its priority number is lower."""
-    store = store_of(planted(lambda number: False), tmp_path / "store")
+    store = write_store(tmp_path / "store", [planted(lambda number: False)])
     text = "[evaluation_split]\nby = 'none'\n[correction]\npost = 'none'\n" + "".join(
         f"[[strata]]\nname = '{name}'\n"
         for name in ("nominal", "near_collision", "closing_traffic")
@@ -108,7 +99,7 @@ def test_an_exposure_beside_a_condition_goes_by_priority(tmp_path):
 
 
 def test_a_panel_of_exposures_is_packed_and_knows_its_conditions(tmp_path):
-    store = store_of(planted(lambda number: NEAR[number]), tmp_path / "store")
+    store = write_store(tmp_path / "store", [planted(lambda number: NEAR[number])])
     with Store(store) as opened:
         panel = build_panel(opened, parse_mixture(BY_EXPOSURE), tmp_path / "panel")
     assert {"closing_traffic", "nominal"} <= {line.name for line in panel.header.strata}
@@ -123,7 +114,7 @@ def test_a_table_in_memory_names_its_exposures(tmp_path):
 
 
 def test_a_store_without_exposures_has_none_to_ask_for(tmp_path):
-    store = store_of(planted(lambda number: False), tmp_path / "store")
+    store = write_store(tmp_path / "store", [planted(lambda number: False)])
     with Store(store) as opened, pytest.raises(ConfigError, match="the store has none") as caught:
         plan_panel(opened.connection, parse_mixture(BY_EXPOSURE), CONDITIONS)
     assert "ingest" in str(caught.value.remedy)
@@ -138,7 +129,7 @@ def audited(store: Path) -> tuple[str, list[dict[str, object]]]:
 
 
 def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, capsys):
-    store = store_of(planted(lambda number: NEAR[number]), tmp_path / "store")
+    store = write_store(tmp_path / "store", [planted(lambda number: NEAR[number])])
     status, sample = audited(store)
     assert status == "warn"
     assert sample == [
@@ -167,5 +158,5 @@ def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, capsys):
     ],
 )
 def test_the_audit_passes_conditions_that_choose_no_failures(tmp_path, failed, near):
-    store = store_of(planted(failed, near), tmp_path / "store")
+    store = write_store(tmp_path / "store", [planted(failed, near)])
     assert audited(store) == ("pass", [])

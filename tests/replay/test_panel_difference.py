@@ -41,10 +41,12 @@ def test_two_tasks_and_two_kinds_of_places_are_refused(tmp_path, capsys):
     second = write_store(tmp_path / "second", [recording_transitions(1, task=other)], task=other)
     panel_of(first, EVERY, tmp_path / "a")
     panel_of(second, EVERY, tmp_path / "b")
-    assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
-    message = capsys.readouterr().err
-    assert TASK.hash in message
-    assert other.hash in message
+    for one, two in ((tmp_path / "a", tmp_path / "b"), (first, second)):
+        assert main(["coverage", "diff", str(one), str(two)]) == 2
+        message = capsys.readouterr().err
+        assert TASK.hash in message
+        assert other.hash in message
+    assert "--profile" in message  # of stores: their recordings can be ingested again
     assert main(["coverage", "diff", str(tmp_path / "a"), str(first)]) == 2
     assert "is a panel" in capsys.readouterr().err
     assert main(["coverage", "diff", str(first), str(tmp_path / "none")]) == 2

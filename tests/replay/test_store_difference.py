@@ -5,11 +5,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pyarrow as pa
 import pytest
 from deltalake import write_deltalake
-from support.stores import TASK, manifest, one, recording_transitions, write_store
+from support.stores import manifest, one, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ArgumentError, StoreError
@@ -104,17 +103,6 @@ def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, capsys):
         assert store.version == newest
     with pytest.raises(ArgumentError, match="version must be an int or datetime, got 'newest'"):
         Store(tmp_path / "store", version="newest")  # type: ignore[arg-type]
-
-
-def test_stores_of_two_tasks_are_refused_with_both_names(tmp_path, capsys):
-    other = msgspec.structs.replace(TASK, actions=TASK.actions[:3])
-    first = write_store(tmp_path / "a", [recording_transitions(1)])
-    second = write_store(tmp_path / "b", [recording_transitions(1, task=other)], task=other)
-    assert main(["coverage", "diff", str(first), str(second)]) == 2
-    message = capsys.readouterr().err
-    assert TASK.hash in message
-    assert other.hash in message
-    assert "--profile" in message
 
 
 def test_a_version_is_split_unless_a_folder_is_called_so(tmp_path):

@@ -54,10 +54,12 @@ def moment(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).isoformat()
 
 
-def planned(transitions: pa.Table, text: str) -> PanelPlan:
-    """Return a mixture worked out over a table."""
-    with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
-        return plan_panel(source.connection, parse_mixture(text), source.conditions)
+def planned(source: pa.Table | Path, text: str) -> PanelPlan:
+    """Return a mixture worked out over a table or a store's folder."""
+    mixture = parse_mixture(text)
+    given: Any = {} if isinstance(source, Path) else {"task": TASK, "conditions": CONDITIONS}
+    with open_source(source, mixture, **given) as opened:
+        return plan_panel(opened.connection, mixture, opened.conditions)
 
 
 def panel_of(source: pa.Table | Path, mixture: Mixture | str, out: Path, **given: Any) -> Panel:
