@@ -223,9 +223,10 @@ def tell(to: Settings, evaluated: Document, console: Console) -> None:
         driven = "The time was up before anything was driven: give more --seconds."
     show("Before and after fine-tuning", [what, driven, *SAMPLE_OF_ONE])
     print_table(before_and_after(evaluated))
-    if fed := fed_shares(Run.open(to.run)):
-        show("What the critic was fed, in % of all rows (`FROM fed` of the run)", shortfalls(fed))
-        print_table(fed_table(fed))
+    fed = fed_shares(Run.open(to.run))
+    what = "Shares of all rows, in % (`FROM fed` of the run)."
+    show("What the critic was fed", [what, *shortfalls(fed)])
+    print_table(fed_table(fed))
     films = sorted((to.run / FOLDER).glob("*-rescue.webp"))
     show("Failing before, arriving after: films, also in the report", [str(path) for path in films])
     show("One rare event, from its message to an update", rare_event(to))

@@ -345,12 +345,7 @@ def _arms(arms: Rows, order: list[str], costs: dict[str, str]) -> Section | None
         {
             "arm": row["arm"],
             "runs": "" if row["runs"] is None else str(row["runs"]),
-            **{
-                title: ""
-                if (row.get(name) or [None])[0] is None
-                else interval_text(*row[name], form)
-                for name, (title, form) in SAFETY.items()
-            },
+            **{title: _text(row.get(name), form) for name, (title, form) in SAFETY.items()},
             "training of a run": costs.get(row["arm"], ""),
         }
         for row in arms
@@ -365,6 +360,12 @@ def _arms(arms: Rows, order: list[str], costs: dict[str, str]) -> Section | None
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
         tables=[Table(rows)],
     )
+
+
+def _text(value: tuple[float | None, ...] | None, form: str) -> str:
+    """Format [mean, low, high]; nothing without a mean."""
+    mean, low, high = value or (None, None, None)
+    return "" if mean is None else interval_text(mean, low, high, form)
 
 
 _GATE_KINDS = {NOT_WORSE: "good", NOT_SHOWN: "open", WORSE: "bad"}
