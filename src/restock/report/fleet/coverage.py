@@ -269,7 +269,7 @@ def _map(store: Store) -> Section | None:
     rare = moved(_rows(store, "rare", most=MAX_DOTS))
     drawing, legend = floor_map.draw(size_m, [], visited, cell_m, rare)
     caption = (
-        f"Logged steps in cells of {cell_m:g} m, darker where there are more (logarithmic); dots"
+        f"Logged steps in cells of {cell_m:g} m, stronger where there are more (logarithmic); dots"
         f" are rare conditions; the bar is {floor_map.BAR_M} m. Poses are in the map frame, from"
         f" ({x0:.1f}, {y0:.1f}) m."
     )

@@ -31,7 +31,7 @@ def draw(
     Args:
         size_m: extent of the floor along x and y.
         racks: x0, y0, x1, y1 of each.
-        cells: x_m, y_m of their south-west corners, and rows: darker with more of them.
+        cells: x_m, y_m of their south-west corners, and rows: stronger with more of them.
         cell_m: side of a cell.
         logged: x_m, y_m and condition of the dots.
         failures: end_x_m, end_y_m and condition of the crosses, which lie above the racks: a robot

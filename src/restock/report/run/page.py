@@ -295,8 +295,8 @@ def floor_section(facts: Facts) -> Section | None:
     )
     first = f", the first of {facts.floors} with logs" if facts.floors > 1 else ""
     notes = [
-        f"{sum(row['rows'] for row in facts.visited):,} logged steps, darker where there are more "
-        f"(logarithmic); dots are rare conditions in the logs, crosses the agent's "
+        f"{sum(row['rows'] for row in facts.visited):,} logged steps, stronger where there are "
+        "more (logarithmic); dots are rare conditions in the logs, crosses the agent's "
         f"{counted(len(failures), 'failed clean episode')}; the bar is {floor_map.BAR_M} m. Drawn "
         f"on the run's floor, {layout.name}{first}."
     ]
