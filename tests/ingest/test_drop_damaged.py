@@ -130,8 +130,13 @@ def test_damaged_rows_are_ingested_with_force(tmp_path, capsys):
     with pytest.raises(StoreError, match=f"{file} cannot be read") as said:
         writer.rows(f"{1:016x}", f"{1:016x}-a")
     assert "--force" in str(said.value)
-    assert main(["sql", str(tmp_path / "s"), "SELECT sum(reward) FROM transitions"]) == 2
-    assert "--force" in capsys.readouterr().err
+    store = str(tmp_path / "s")
+    query = ["sql", store, "SELECT sum(reward) FROM transitions"]
+    for command in (query, ["audit", store], ["mix", store, "--dry-run"]):
+        assert main(command) == 2
+        told = capsys.readouterr().err
+        assert f"its file {file} cannot be read" in told
+        assert "--force" in told
     writer.write(*one(1, "b"))
     assert shown(tmp_path / "s") == expected((1, "b", 0))
 
