@@ -17,8 +17,8 @@ from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.tables import Clock
-from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, ClockReport, align
-from restock.ingest.steps.clocks import STAMP, odd, topic_clock
+from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, align
+from restock.ingest.steps.clocks import STAMP
 
 FASTEST_S, SLOWEST_S = 0.08, 0.5  # control periods that are proposed
 EVENTS_S = 0.2  # the control period if commands are not steady
@@ -35,7 +35,6 @@ class Gaps:
     count: int = 0  # of commands
     period_s: float | None = None  # the median gap
     driving_s: float = 0.0  # the longest gap that is no pause
-    longest_s: float = 0.0
     mean_s: float = 0.0
     hold_s: float | None = None  # how long the robot was seen to go on with a command
     sensor_s: float = 0.0  # between two messages of what is seldomer, pose or wheels
@@ -47,8 +46,8 @@ class Gaps:
             return cls(len(columns))
         period = float(np.median(gaps))
         driving = gaps[gaps <= PAUSE * max(period, 0.02)]
-        longest, mean = float(gaps.max()), float(gaps.mean())
-        return cls(len(columns), period, float(driving.max(initial=period)), longest, mean)
+        mean = float(gaps.mean())
+        return cls(len(columns), period, float(driving.max(initial=period)), mean)
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,6 @@ class ClockChoice:
     command_age_s: float
     pace: float = 1.0  # seconds of the alignment clock in one of log time
     every_s: float | None = None  # between two commands, mostly; on the alignment clock
-    ahead_s: float | None = None  # log time of the alignment clock
     comments: tuple[str, ...] = ()
 
     @classmethod
@@ -129,25 +127,19 @@ def choose_clock(
     wanted = {name: [STAMP] if name in with_stamp else [] for name in used}
     if clock is not None and clock.skipped is None and CLOCK_FIELD in recording.leaves(CLOCK_TOPIC):
         wanted[CLOCK_TOPIC] = [CLOCK_FIELD]
-    columns = recording.read(wanted)
-    seen = [topic_clock(name, columns[name]) for name in sorted(with_stamp - latched)]
-    comments = [f"{one.topic}: {what}" for one in seen if (what := odd(one.as_row()))]
-    choice, why_not = _by_stamp(columns, latched, gaps)
+    choice, why_not = _by_stamp(recording.read(wanted), latched, gaps)
     if why_not:
-        return by_log_time(replace(choice, comments=tuple(comments)), gaps, why_not)
-    if choice.pace != 1.0:
-        comments += [
-            f"Header stamps run at {choice.pace:.2%} of log time: periods, gaps and ages are in",
-            "the robot's own time.",
-        ]
-    ahead = [one.offset_ns * 1e-9 for one in seen if one.offset_ns is not None]
-    return replace(choice, comments=tuple(comments), ahead_s=min(ahead, default=None))
+        return by_log_time(gaps, why_not)
+    if choice.pace == 1.0:
+        return choice
+    why = f"Header stamps run at {choice.pace:.2%} of log time: all times are the robot's own."
+    return replace(choice, comments=(why,))
 
 
-def by_log_time(stamped: ClockChoice, gaps: Gaps, why: str) -> ClockChoice:
-    """Choose log time because header stamps do not work, with what was seen of them."""
-    comments = (*stamped.comments, f"Log time, as header stamps do not work: {why}.")
-    return replace(ClockChoice.of(gaps, "log_time"), comments=comments)
+def by_log_time(gaps: Gaps, why: str) -> ClockChoice:
+    """Choose log time because header stamps do not work."""
+    why = f"Log time, as header stamps do not work: {why}."
+    return replace(ClockChoice.of(gaps, "log_time"), comments=(why,))
 
 
 def _by_stamp(
@@ -166,14 +158,9 @@ def _by_stamp(
         before, choice = choice, ClockChoice.of(gaps, STAMP, pace)
         if before.period_s == choice.period_s:
             break
-    return choice, _left_out(columns, report)
-
-
-def _left_out(columns: dict[str, TopicColumns], report: ClockReport) -> str:
-    """Say what alignment leaves out, if that is much of a topic."""
     lost = [
         f"{count:,} of {len(columns[topic]):,} of {topic} are off the clock"
         for topic, count in report.off_clock.items()
         if count > MAX_OFF_CLOCK * len(columns[topic])
     ]
-    return ", ".join(lost)
+    return choice, ", ".join(lost)

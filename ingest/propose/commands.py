@@ -32,22 +32,41 @@ from restock.ingest.task.task import wrap_angle
 
 PASSED_WITHIN_S = 0.5
 MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5  # changes that one topic took over from another
-_STEERED = "wheelbase_m"
 Fit = tuple[TopicInfo, Kind]
 
 
 @dataclass(frozen=True)
-class CommandChoice:
-    """The sources of the command that drives, as TOML; and who drives where no source says."""
+class CommandSource:
+    """A topic whose commands the one that drives repeats, and the policy that it is of."""
 
-    lines: list[str] = field(default_factory=list)
-    policy: str = "unknown"
-    why: str = "the driver, if no topic says so"
+    policy: str
+    fit: Fit
+    passed_on: int  # changes of the driving command
+    max_age_s: float
 
     def toml(self, wheelbase_m: float) -> list[str]:
-        """Write the tables; a source that steers does so about the command's wheelbase."""
-        steered = f"wheelbase_m = {round(wheelbase_m, 4):g}  # as of the command"
-        return [steered if line == _STEERED else line for line in self.lines]
+        """Write its table; a source that steers does so about the command's wheelbase."""
+        topic, kind = self.fit
+        fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
+        steers = "steering_rad" in kind.fields
+        return [
+            f"[command_sources.{json.dumps(self.policy)}]  # the behaviour policy of its commands",
+            f"topic = {json.dumps(topic.name)}  # {self.passed_on:,} of its changes drive",
+            f'type = "{topic.type}"',
+            f"fields = {{ {fields} }}",
+            *([f"wheelbase_m = {round(wheelbase_m, 4):g}"] if steers else []),
+            f"max_age_s = {self.max_age_s:g}",
+            "",
+        ]
+
+
+@dataclass(frozen=True)
+class CommandChoice:
+    """The sources of the command that drives, and who drives where none of them does."""
+
+    sources: list[CommandSource] = field(default_factory=list)
+    policy: str = "unknown"
+    why: str = "the driver, if no topic says so"
 
 
 @dataclass(frozen=True)
@@ -86,15 +105,16 @@ def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[F
             break
         first = max(later, key=first.passed_on)
     chosen = [first.fit, *(fit for fit in fitting if fit is not first.fit)]
-    sources: dict[str, _Source] = {}
     inputs = [one for one in reported if one is not first and _feeds(one, first, MIN_SHARE)]
+    sources: dict[str, CommandSource] = {}
     for one in sorted(inputs, key=lambda one: -one.passed_on(first)):
-        sources.setdefault(_policy(one.fit[0].name), one)
-    lines = [line for name, one in sources.items() for line in _lines(name, one, first)]
+        policy = _policy(one.fit[0].name)
+        source = CommandSource(policy, one.fit, one.passed_on(first), _age_s(one))
+        sources.setdefault(policy, source)
     named = _policy(first.fit[0].name)
     if not sources and named in ("teleop", "navigation"):
-        return chosen, CommandChoice(lines, named, f"by the name of {first.fit[0].name}")
-    return chosen, CommandChoice(lines)
+        return chosen, CommandChoice(policy=named, why=f"by the name of {first.fit[0].name}")
+    return chosen, CommandChoice([*sources.values()])
 
 
 def _read(recording: Recording, fit: Fit) -> _Source:
@@ -127,22 +147,6 @@ def _policy(topic: str) -> str:
         return "navigation"
     parts = [part for part in name.split("/") if part and part not in ("cmd_vel", "input")]
     return parts[-1][:64] if parts else name
-
-
-def _lines(name: str, one: _Source, output: _Source) -> list[str]:
-    topic, kind = one.fit
-    fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
-    return [
-        f"# {one.passed_on(output):,} of {output.changes:,} changes of {output.fit[0].name} "
-        "follow its last message:",
-        f"[command_sources.{json.dumps(name)}]  # the behaviour policy of rows with its command",
-        f"topic = {json.dumps(topic.name)}",
-        f'type = "{topic.type}"',
-        f"fields = {{ {fields} }}",
-        *([_STEERED] if "steering_rad" in kind.fields else []),
-        f"max_age_s = {_age_s(one):g}",
-        "",
-    ]
 
 
 MIN_GAP_S = 0.4  # shorter ones say little
@@ -230,22 +234,16 @@ def _last_moving(
 
 
 def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> CommandHold:
-    comments = []
-    age = None
-    if on:
-        age = min(max(on), MAX_S)
+    comments, age_s = [], None
+    if on or stopped:
+        age_s = min(max(on), MAX_S) if on else float(np.median(stopped))
         comments.append(
-            f"the robot drove on to the end of {len(on)} of {len(on) + len(stopped)} gaps of"
-            f" {MIN_GAP_S:g} s and more between commands, the longest of {max(on):.1f} s"
+            f"it drove on to the end of {len(on)} of {len(on) + len(stopped)} gaps between commands"
+            f" of {MIN_GAP_S:g} s and more"
         )
-    if stopped:
-        middle = float(np.median(stopped))
-        age = middle if age is None else age
-        comments.append(f"it stood in {len(stopped)} of them from {middle:.1f} s on (median)")
-    holds = went <= stood
     if stood:
         comments.append(f"it stood through {stood} of {stood + went} gaps after a command to stop")
-    return CommandHold(age, holds, tuple(comments))
+    return CommandHold(age_s, went <= stood, tuple(comments))
 
 
 def settled_speeds(command_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
@@ -304,7 +302,6 @@ class Commands:
     measured: bool = False  # they are odometry, in place of commands
     steered: bool = False  # by the angle of the front wheels, as a car
     wheelbase_m: float = 0.3
-    wheelbase_from: str = "A GUESS: MEASURE IT"
     reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
@@ -364,13 +361,18 @@ def read_commands(
     commands = commands.limited(
         limit_of(settled[0], commands.speed_mps), limit_of(settled[1], commands.yaw_rate_radps)
     )
-    hold = CommandHold()
-    if poses is not None and len(poses) > 1 and not commands.measured:
-        order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
-        seconds = (times[order] - zero) * 1e-9
-        since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
-        hold = command_hold(seconds, speed[order], turn[order], since)
-    return commands, Gaps.of(columns), hold
+    if poses is None or len(poses) < 2 or commands.measured:
+        return commands, Gaps.of(columns), CommandHold()
+    return commands, Gaps.of(columns), command_hold(*_from_first_pose(times, speed, turn, poses))
+
+
+def _from_first_pose(
+    times: Ints, speed: F64, turn: F64, poses: PoseSeries
+) -> tuple[F64, F64, F64, PoseSeries]:
+    """Sort commands by time, and count their time (s) and that of the poses from the first pose."""
+    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+    return (times[order] - zero) * 1e-9, speed[order], turn[order], since
 
 
 def commanded(
@@ -410,7 +412,7 @@ def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[in
     return int((requested[:, [2, 3, 4]] > least).any(axis=1).sum()), len(requested)
 
 
-def leaves_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> bool:
+def leaves_the_floor(recording: Recording, fit: Fit) -> bool:
     """Return whether most commands of a topic are for an arm or a drone."""
     off, requested = off_the_floor(recording, fit)
     return 2 * off > requested
@@ -420,23 +422,22 @@ def settled_at_most(
     recording: Recording, roles: Roles, commands: Commands, times: Ints, speed: F64, turn: F64
 ) -> tuple[F64, F64]:
     """Return what odometry measured once the fastest commands had settled: (K,) m/s, (L,) rad/s."""
-    nothing = np.zeros(0), np.zeros(0)
     if not roles["wheels"] or commands.measured or not len(times):
-        return nothing
+        return np.zeros(0), np.zeros(0)
     topic, kind = roles["wheels"][0]
-    paths = list(kind.fields.values())
-    columns = recording.read({topic.name: paths})[topic.name]
+    columns = recording.read({topic.name: [*kind.fields.values()]})[topic.name]
     order = np.argsort(times, kind="stable")
-    command_s = np.asarray((times[order] - times[order[0]]) * 1e-9, np.float64)
-    at_s = np.asarray((columns.log_time_ns - times[order[0]]) * 1e-9, np.float64)
-    fastest = commands.speed_mps, commands.yaw_rate_radps
-    found = [
-        settled_speeds(
-            command_s, reported[order], at_s, np.asarray(columns.fields[path], np.float64), most
-        )
-        for reported, path, most in zip((speed, turn), paths, fastest, strict=True)
-    ]
-    return found[0], found[1]
+    zero = times[order[0]]
+    command_s, at_s = (times[order] - zero) * 1e-9, (columns.log_time_ns - zero) * 1e-9
+
+    def settled(key: str, values: F64, fastest: float) -> F64:
+        measured = np.asarray(columns.fields[kind.fields[key]], np.float64)
+        return settled_speeds(command_s, values[order], at_s, measured, fastest)
+
+    return (
+        settled("speed_mps", speed, commands.speed_mps),
+        settled("yaw_rate_radps", turn, commands.yaw_rate_radps),
+    )
 
 
 def how_it_turned(
@@ -457,7 +458,4 @@ def how_it_turned(
     if is_motion(topic.type) or poses is None or len(poses) < 2:
         return DriveEvidence(), None
     _, times, speed, turn = commanded(recording, (topic, kind), None)
-    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
-    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
-    seconds = (times[order] - zero) * 1e-9
-    return drive_evidence(seconds, speed[order], turn[order], since), None
+    return drive_evidence(*_from_first_pose(times, speed, turn, poses)), None

@@ -8,7 +8,6 @@ wheels of a drive that the twin does not have, invalid values.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,7 +73,8 @@ def described_robot(
         return DescribedRobot(problem=_no_wheels(description, wheels))
     notes: list[str] = []
     if description.base.split("/")[-1] not in BASE_FRAMES:
-        notes.append(_other_base(description.base))
+        why = f"as it is the root of the other links: none is named {', '.join(BASE_FRAMES)}"
+        notes.append(f"{description.base!r} is taken for the base, {why}")
     radius = float(np.median([wheel.radius_m for wheel in driven]))
     axles = sorted(_axles(driven, radius), reverse=True)
     middle = (axles[0] + axles[-1]) / 2
@@ -84,14 +84,9 @@ def described_robot(
     if len(axles) > 1:
         values["wheelbase_m"] = axles[0] - axles[-1]
     values["axle_x_m"] = middle - middle_x_m
-    masses = {name: _mass(link) for name, link in description.links.items() if name in places}
-    if (mass := sum(masses.values())) > 0:
+    mass = sum(_mass(link) for name, link in description.links.items() if name in places)
+    if mass > 0:
         values["mass_kg"] = mass
-        arms = _arms(description)
-        if arms:
-            notes.append(f"joints that the twin does not move: {', '.join(arms[:6])}")
-    else:
-        notes.append("no link has a mass")
     floor = float(np.median([wheel.place.at_m[2] for wheel in driven])) - radius
     boxes = {
         name: box
@@ -107,20 +102,13 @@ def described_robot(
             values["casters_m"] = casters
     if lidar := _lidar_z(places, scan_frame, floor):
         values["lidar.z_m"] = lidar
-    meshes = _meshes(description, boxes)
-    if meshes:
-        have = "1 link has" if meshes == 1 else f"{meshes} links have"
-        notes.append(f"{have} only meshes, whose size is in other files: left out")
+    meshes = [name for name, link in description.links.items() if link.find(".//mesh") is not None]
+    if meshes := [name for name in meshes if name not in boxes]:
+        notes.append(
+            f"left out are links of only meshes, whose size is in other files: {len(meshes)}"
+        )
     rounded = {key: _rounded(value) for key, value in values.items()}
     return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
-
-
-def _other_base(base: str) -> str:
-    usual = f"{', '.join(BASE_FRAMES[:-1])} or {BASE_FRAMES[-1]}"
-    return (
-        f"{base!r} is taken for the base, as it is the root of the other links: none is named "
-        f"{usual}"
-    )
 
 
 def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
@@ -239,14 +227,6 @@ def _mass(link: ET.Element) -> float:
     return mass if 0 < mass < HEAVIEST_KG else 0.0
 
 
-def _arms(description: Description) -> list[str]:
-    return [
-        joint.name
-        for joint in description.joints
-        if joint.kind in ("revolute", "prismatic") and not _endless(joint)
-    ]
-
-
 def _casters(
     boxes: dict[str, tuple[F64, F64]], rolling: set[str], floor: float, axle_x: float
 ) -> list[list[float]]:
@@ -275,17 +255,8 @@ def _lidar_z(places: dict[str, Place], frame: str, floor: float) -> float | None
     return float(place.at_m[2]) - floor
 
 
-def _meshes(description: Description, boxes: dict[str, tuple[F64, F64]]) -> int:
-    return sum(
-        name not in boxes and link.find(".//mesh") is not None
-        for name, link in description.links.items()
-    )
-
-
 def _no_wheels(description: Description, wheels: list[_Wheel]) -> str:
     """Say in one sentence why it does not roll."""
-    kinds = Counter(joint.kind for joint in description.joints)
-    has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
     if wheels:
         return (
             f"{description.name!r} has {counted(len(wheels), 'wheel')}, but no driven "
@@ -293,8 +264,8 @@ def _no_wheels(description: Description, wheels: list[_Wheel]) -> str:
             "track_m in [robot]"
         )
     return (
-        f"{description.name!r} has no wheels: none of its joints ({has}) turns without end"
-        " about an axis across the robot"
+        f"{description.name!r} has no wheels: no joint of it turns without end about an axis across"
+        " the robot"
     )
 
 

@@ -15,8 +15,9 @@ kinds belongs to neither.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.signal_paths import FRAME_IDS, frame_id_path, plain
 from restock.ingest.profile.tables import is_motion
-from restock.ingest.propose.clock_choice import drivable
+from restock.ingest.propose.clock_choice import ClockChoice, drivable
 from restock.ingest.propose.commands import (
     CommandHold,
     Commands,
@@ -38,9 +39,15 @@ from restock.ingest.propose.commands import (
 )
 from restock.ingest.propose.footprint import RobotText, descriptions
 from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather
-from restock.ingest.propose.proposal_lines import profile_lines
-from restock.ingest.propose.propose import Proposal, RobotKind, propose_from, propose_profile, tried
-from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
+from restock.ingest.propose.propose import (
+    Proposal,
+    RobotKind,
+    propose_from,
+    propose_profile,
+    trial_of,
+    tried,
+)
+from restock.ingest.propose.roles import KINDS, Kind, topics_for
 from restock.ingest.propose.trial import Advice, Trial
 from restock.ingest.steps.clocks import STAMP
 
@@ -126,14 +133,26 @@ def propose_for_drives(
     goal = seen.goal.tried(sum(trial.transitions for trial in usual), dropped)
     proposal = propose_from(replace(seen, goal=goal), name, goal_decided=True)
     trials = [tried(one.recording, proposal.toml) for one in evidence]
+    advice = [*proposal.advice, *_left_out(drives, evidence, trials)]
+    transitions = sum(trial.transitions for trial in trials)
+    lines = [
+        f"# For {counted(len(drives.kinds[0]), 'drive')} of one kind of robot: {transitions:,}"
+        " transitions.",
+        *(
+            f"#   {_name(drive.recording.path)}: {trial.transitions:,}"
+            + (f"  ({trial.problem})" if trial.problem else "")
+            for drive, trial in zip(evidence, trials, strict=True)
+        ),
+        *(f"# {one.text}" for one in advice[len(proposal.advice) :]),
+    ]
     return replace(
         proposal,
         problems=[*proposal.problems, *_in_another(proposal.missing, evidence)],
-        toml="\n".join([*_lines(evidence, trials, drives), proposal.toml]),
-        advice=[*proposal.advice, *_without_rows(evidence, trials), *_left_out(drives.others)],
+        toml="\n".join([*lines, proposal.toml]),
+        advice=advice,
         kinds=drives.robots,
         ticks=sum(trial.ticks for trial in trials),
-        transitions=sum(trial.transitions for trial in trials),
+        transitions=transitions,
     )
 
 
@@ -149,8 +168,7 @@ def _best(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
 
 
 def _trials(seen: Evidence, drives: Sequence[Evidence]) -> list[Trial]:
-    toml = "\n".join(profile_lines(seen, "robot", []))
-    return [tried(one.recording, toml) for one in drives]
+    return [trial_of(seen, one.recording) for one in drives]
 
 
 def _bytes(path: Path) -> int:
@@ -160,9 +178,10 @@ def _bytes(path: Path) -> int:
 
 def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     """Return the evidence of one drive, with what belongs to the robot from all of them."""
-    driven = [one for one in drives if one.commands.topic == base.commands.topic]
-    described = max(drives, key=lambda one: len(one.robot.values))
-    clocks = [one.clock for one in driven]
+    driven = [base, *(one for one in drives if one.commands.topic == base.commands.topic)]
+    described = max((base, *drives), key=lambda one: len(one.robot.values))
+    if base.commands.steered and not described.robot.described:  # of one wheelbase
+        described = base
     # A measured outline before a guess, then one whose lidar is placed; of guesses the smallest: it
     # had the nearest return.
     outlined = min(
@@ -173,15 +192,14 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
             one.footprint.length_m,
         ),
     )
-    described = base if len(base.robot.values) >= len(described.robot.values) else described
     return replace(
         base,
-        commands=_commands(base.commands, driven),
-        hold=_hold([one.hold for one in driven]),
+        commands=_commands(base.commands, driven[1:]),
+        hold=_hold([one.hold for one in driven[1:]]),
         clock=replace(
             base.clock,
-            command_age_s=max([base.clock.command_age_s, *(c.command_age_s for c in clocks)]),
-            max_gap_s=max([base.clock.max_gap_s, *(c.max_gap_s for c in clocks)]),
+            command_age_s=max(one.clock.command_age_s for one in driven),
+            max_gap_s=max(one.clock.max_gap_s for one in driven),
         ),
         paces_s={
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
@@ -190,9 +208,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         footprint=outlined.footprint,
         footprint_notes=outlined.footprint_notes,
         outline=outlined.outline,
-        robot=(described if described.robot.described else base).robot  # of one wheelbase
-        if base.commands.steered
-        else described.robot,
+        robot=described.robot,
     )
 
 
@@ -236,22 +252,16 @@ def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
     periods = [one.clock.period_s for one in usable]
     if max(periods) > SAME_PACE * min(periods):
         middle = drivable(float(np.median(periods)))
-        rate = f"a tick every period: the drives' commands are {min(periods):g} to"
-        comments = (f"{rate} {max(periods):g} s apart.",)
-        usable = [
-            replace(
-                one,
-                clock=replace(
-                    replace(one.clock, period_s=middle).at_a_rate(),
-                    comments=(*one.clock.comments, *comments),
-                ),
-            )
-            for one in usable
-        ]
+        why = f"a tick every period, as the drives' are {min(periods):g} to {max(periods):g} s"
+        usable = [replace(one, clock=_at_rate(one.clock, middle, why)) for one in usable]
     bases: dict[tuple[str, str, bool], Evidence] = {}
     for one in usable:
         bases.setdefault((one.clock.alignment, one.clock.steps, one.poses_from_frames), one)
     return list(bases.values())[:MAX_BASES]
+
+
+def _at_rate(clock: ClockChoice, period_s: float, why: str) -> ClockChoice:
+    return replace(replace(clock, period_s=period_s).at_a_rate(), comments=(*clock.comments, why))
 
 
 def _on_map(one: Evidence) -> bool:
@@ -262,23 +272,7 @@ def _fullness(one: Evidence) -> tuple[int, int, float]:
     """Count the deciding inputs that it has and all its inputs, with how long it drove."""
     located = bool(one.roles["pose"]) or one.poses_from_frames
     deciding = sum((bool(one.roles["command"]), located, bool(one.roles["wheels"])))
-    return deciding, sum(map(bool, one.roles.values())), one.driven_s
-
-
-def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives) -> list[str]:
-    """Say as comments what comes of each drive, and which were not read."""
-    rows = f"by what they say: {sum(trial.transitions for trial in trials):,} transitions."
-    of, unread = len(drives.kinds[0]), drives.unread
-    number = f"the {len(evidence)} largest of {of:,} drives" if unread else counted(of, "drive")
-    lines = [f"# For {number} of one kind of robot, {rows}"]
-    for drive, trial in zip(evidence, trials, strict=True):
-        why = f"  ({trial.problem})" if trial.problem else ""
-        lines.append(f"#   {_name(drive.recording.path)}: {trial.transitions:,}{why}")
-    if unread:
-        lines.append(f"# NOT READ, of that kind: {names_of(unread)}")
-    return lines + [
-        f"# NOT OF THAT KIND: {_name(path)}: {reported}" for path, reported in drives.others
-    ]
+    return deciding, sum(map(bool, one.roles.values())), one.recorded_s
 
 
 def names_of(paths: Sequence[Path]) -> str:
@@ -294,35 +288,33 @@ def _name(path: Path) -> str:
 
 def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
     """Say which other drive has what the profile's own drive lacks."""
-    found = []
-    for role, lacks in (("pose", "command"), ("command", "pose")):
-        for one in drives if role in missing else ():
-            if (topics := one.roles[role]) and not one.roles[lacks]:
-                said = f"{_name(one.recording.path)} has a {role} ({topics[0][0].name})"
-                found.append(f"{said} and no {lacks}: one recording must hold both")
-    return found
-
-
-def _without_rows(drives: Sequence[Evidence], trials: Sequence[Trial]) -> list[Advice]:
-    none = [
-        drive.recording.path
-        for drive, trial in zip(drives, trials, strict=True)
-        if not trial.transitions
+    return [
+        f"{_name(one.recording.path)} has a {role} ({one.roles[role][0][0].name}) and no {lacks}:"
+        " one recording must hold both"
+        for role, lacks in (("pose", "command"), ("command", "pose"))
+        for one in drives
+        if role in missing and one.roles[role] and not one.roles[lacks]
     ]
-    if not none or len(none) == len(trials):  # of none at all the problems tell
-        return []
-    text = f"{len(none):,} of {len(trials):,} recordings give no transition: {names_of(none)}"
-    return [Advice("name", f"{text}; the first lines of the profile say why")]
 
 
-def _left_out(others: Sequence[tuple[Path, RobotTraits]]) -> list[Advice]:
-    if not others:
-        return []
-    names = names_of([path for path, _ in others])
-    text = (
-        f"another kind of robot, by its contents, in {counted(len(others), 'recording')}: {names}"
-    )
-    return [Advice("name", f"{text}; propose another profile for that")]
+def _left_out(
+    drives: Drives, evidence: Sequence[Evidence], trials: Sequence[Trial]
+) -> Iterator[Advice]:
+    """Yield which recordings were not read, give no rows, or are of another kind of robot."""
+    if drives.unread:
+        yield Advice("name", f"not read, of that kind: {names_of(drives.unread)}")
+    idle = [
+        one.recording.path for one, t in zip(evidence, trials, strict=True) if not t.transitions
+    ]
+    if idle and len(idle) < len(trials):  # of none at all the problems tell
+        yield Advice(
+            "name",
+            f"{len(idle):,} of {len(trials):,} recordings give no transition: {names_of(idle)}",
+        )
+    if drives.others:
+        others = names_of([path for path, _ in drives.others])
+        kinds = "; ".join(dict.fromkeys(str(traits) for _, traits in drives.others))
+        yield Advice("name", f"not of that kind: {others}: {kinds}; propose another profile for it")
 
 
 SCANS = 40  # of a recording that are looked at
@@ -342,16 +334,10 @@ class Lidar:
     simulated: bool  # by their stamps
 
     def agrees(self, other: Lidar) -> bool:
-        most = max(self.beams, other.beams, 1)
-        longest = max(self.range_max_m, other.range_max_m)
         return (
-            self.frame == other.frame
-            and abs(self.beams - other.beams) <= BEAMS * most
-            and (
-                self.range_max_m == other.range_max_m
-                or abs(self.range_max_m - other.range_max_m) <= RANGE * longest
-            )
-            and self.simulated == other.simulated
+            (self.frame, self.simulated) == (other.frame, other.simulated)
+            and abs(self.beams - other.beams) <= BEAMS * max(self.beams, other.beams)
+            and math.isclose(self.range_max_m, other.range_max_m, rel_tol=RANGE)
         )
 
     def __str__(self) -> str:
@@ -374,11 +360,8 @@ class RobotTraits:
 
     def fits(self, other: RobotTraits) -> bool:
         """Return whether both may be one kind of robot, and something shows that they are."""
-        for mine, its in (
-            (self.command, other.command),
-            (self.frames, other.frames),
-            (self.description, other.description),
-        ):
+        for name in ("command", "frames", "description"):
+            mine, its = getattr(self, name), getattr(other, name)
             if mine and its and mine != its:
                 return False
         if self.lidar and other.lidar and not self.lidar.agrees(other.lidar):
@@ -403,10 +386,7 @@ class RobotTraits:
 
 def robot_traits(recording: Recording) -> RobotTraits:
     """Read the traits of a recording's robot, from a few of its scans and poses."""
-    topics = usable_topics(recording)
-    roles = {
-        role: topics_for(recording, topics, KINDS[role]) for role in ("command", "pose", "wheels")
-    }
+    roles = {role: topics_for(recording, KINDS[role]) for role in ("command", "pose", "wheels")}
     command = roles["command"][0][0].type if roles["command"] else ""
     odometry = next((t for fits in roles.values() for t, _ in fits if is_motion(t.type)), None)
     frames = ""
@@ -420,7 +400,7 @@ def robot_traits(recording: Recording) -> RobotTraits:
     return RobotTraits(
         command,
         frames,
-        _lidar(recording, topics_for(recording, topics, KINDS["scan"])[:1]),
+        _lidar(recording, topics_for(recording, KINDS["scan"])[:1]),
         hashlib.blake2b(text.text.encode(), digest_size=8).hexdigest() if text.text else "",
         "" if isinstance(described, str) else described.name,
         frozenset((t.name, t.type) for fits in roles.values() for t, _ in fits),

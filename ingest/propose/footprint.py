@@ -35,7 +35,7 @@ from restock.ingest.profile.description import (
 from restock.ingest.profile.signal_paths import frame_id_path, plain
 from restock.ingest.profile.tables import Clock, Frames, Input
 from restock.ingest.propose.pose_choice import named_frames, transform_topics
-from restock.ingest.propose.roles import Kind, shared, sort_own_first
+from restock.ingest.propose.roles import Kind, own_first, shared
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Edges, PoseSeries, Tree, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
@@ -47,10 +47,6 @@ SIZES_M = (0.02, 30.0)  # of a robot that this can be
 
 MIN_ASIDE_M = 0.05  # of the middle
 DESCRIBED = "as described"  # the source of a lidar's place
-UPSIDE_DOWN = (
-    "the lidar hangs upside down by its frame, so its scans are turned over; if its driver does "
-    "that already, left and right are now swapped: remove upside_down"
-)
 
 
 @dataclass(frozen=True)
@@ -123,7 +119,8 @@ def descriptions(recording: Recording) -> Iterator[RobotText]:
     Of several robots in the recording, those of the one to propose for, then those of none in
     particular.
     """
-    for name, topic in sort_own_first(recording, recording.topics.items()):
+    for name in own_first(recording, recording.topics):
+        topic = recording.topics[name]
         if topic.skipped or not topic.expected or topic.type != "std_msgs/msg/String":
             continue
         if name.split("/")[-1] != "robot_description":
@@ -242,16 +239,10 @@ class ScannedOutline:
         )
         if (length, width) == (guess.length_m, guess.width_m):
             return None
-        parts = (
-            f", its own parts at up to {self.own_range_m:.2f} m aside" if len(self.own_m) else ""
-        )
-        return Footprint(
-            length,
-            width,
-            f"A GUESS from the lidar, which saw nothing nearer than {self.nearest_m:.2f} m{parts}:"
-            " MEASURE IT",
-            measured=False,
-        )
+        source = f"A GUESS from the lidar, which saw nothing nearer than {self.nearest_m:.2f} m"
+        if len(self.own_m):
+            source += f", its own parts at up to {self.own_range_m:.2f} m aside"
+        return Footprint(length, width, f"{source}: MEASURE IT", measured=False)
 
 
 def scanned_outline(
@@ -331,23 +322,6 @@ _TURN = 2 * math.pi
 
 
 @dataclass(frozen=True)
-class View:
-    """The beams of a scan's last message, as seen from above, in the lidar's own frame."""
-
-    low_rad: float
-    high_rad: float
-    beams: int
-
-    def turned(self, yaw_rad: float) -> View:
-        """Return the view of a lidar that is turned so, in the robot's frame."""
-        if not yaw_rad:
-            return self
-        low, high = self.low_rad + yaw_rad, self.high_rad + yaw_rad
-        back = _TURN * round((low + high) / 2 / _TURN)  # the middle of it within half a turn
-        return View(low - back, high - back, self.beams)
-
-
-@dataclass(frozen=True)
 class SeenScans:
     """The frame and angles of a topic's scans."""
 
@@ -363,19 +337,28 @@ class SeenScans:
         at_m = x_m + cos * ahead - sin * left, y_m + sin * ahead + cos * left
         return *at_m, math.remainder(yaw_rad + turn, _TURN) if turn else yaw_rad
 
-    def view(self, *, upside_down: bool = False) -> View | None:
-        """Return what the last scan covers; None if it does not say, or not sanely."""
+    def view(
+        self, yaw_rad: float = 0.0, *, upside_down: bool = False
+    ) -> tuple[float, float, int] | None:
+        """Return the lowest and highest angle and the beams of the last scan, seen from above.
+
+        They are in a frame in which the lidar is turned by `yaw_rad`. None if the scan does not say
+        them, or not sanely.
+        """
         if self.angles is None:
             return None
         sign = -1 if upside_down else 1
         first, last, step = (sign * one + 0.0 for one in self.angles)  # no "-0.0" in a file
-        if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
+        if not np.isfinite([first, last, step]).all() or abs(step) <= 1e-4:
             return None
-        count = round((last - first) / step) + 1
+        beams = round((last - first) / step) + 1
         low, high = min(first, last), max(first, last)
-        if count < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
+        if beams < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
             return None
-        return View(low, min(high, low + _TURN), count)
+        high = min(high, low + _TURN)
+        if yaw_rad:  # the middle of it within half a turn
+            yaw_rad -= _TURN * round(((low + high) / 2 + yaw_rad) / _TURN)
+        return low + yaw_rad, high + yaw_rad, beams
 
 
 def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
@@ -509,32 +492,23 @@ def _place(
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
-    """Write the nearest and the farthest range of use, as keys of [task]."""
-    low, high, why = _range_m(recording, topic, outline)
-    return [
-        f"range_min_m = {low:g}{why}",
-        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
-    ]
+    """Write the nearest and the farthest range of use, at most 4 m, as keys of [task].
 
-
-def _range_m(
-    recording: Recording, topic: str, outline: ScannedOutline | None
-) -> tuple[float, float, str]:
-    """Return the nearest and the farthest range of use, at most 4 m, and a comment.
-
-    The comment says why the lidar's own limits are not used. Of a lidar that gives 0 where nothing
-    comes back, 0 is no range; nor is one of its own parts.
+    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of the robot's own
+    parts.
     """
-    if not set(_LIMITS) <= set(recording.leaves(topic)):
-        return 0.05, 4.0, ""
-    columns = recording.read({topic: _LIMITS})[topic].fields
-    low, high = (float(np.median(np.asarray(columns[path]))) for path in _LIMITS)
-    if not 0 <= low < high < np.inf:
-        return 0.05, 4.0, ""
-    own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
-    why = ""
-    if low < MIN_RANGE_M:
-        low, why = MIN_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
-    if own_m > low:
-        low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
-    return round(low, 3), min(round(high, 3), 4.0), why
+    low, high, why = 0.05, 4.0, ""
+    if set(_LIMITS) <= set(recording.leaves(topic)):
+        columns = recording.read({topic: _LIMITS})[topic].fields
+        stated = [float(np.median(np.asarray(columns[path]))) for path in _LIMITS]
+        if 0 <= stated[0] < stated[1] < np.inf:
+            low, high = stated
+            own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
+            if low < MIN_RANGE_M:
+                low, why = MIN_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
+            if own_m > low:
+                low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
+    return [
+        f"range_min_m = {round(low, 3):g}{why}",
+        f"range_max_m = {min(round(high, 3), 4.0):g}  # lidar ranges beyond it count as free",
+    ]

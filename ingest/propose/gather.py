@@ -14,7 +14,7 @@ from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.signal_paths import conventions_of, plain
 from restock.ingest.profile.tables import HINDSIGHT, Input, is_motion
 from restock.ingest.propose.candidates import Candidate, candidates
-from restock.ingest.propose.clock_choice import PAUSE, ClockChoice, Gaps, choose_clock
+from restock.ingest.propose.clock_choice import ClockChoice, Gaps, choose_clock
 from restock.ingest.propose.commands import (
     CommandChoice,
     CommandHold,
@@ -43,12 +43,7 @@ from restock.ingest.propose.pose_choice import (
     transform_edges,
     transform_frames,
 )
-from restock.ingest.propose.robot_choice import (
-    DriveEvidence,
-    RobotProposal,
-    propose_robot,
-    read_urdf,
-)
+from restock.ingest.propose.robot_choice import RobotProposal, propose_robot, read_urdf
 from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
@@ -60,9 +55,7 @@ from restock.ingest.propose.roles import (
     Roles,
     other_robots_topics,
     own_bumpers,
-    sort_own_first,
     topics_for,
-    usable_topics,
 )
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import PoseSeries
@@ -81,11 +74,6 @@ class GoalChoice:
     why: str = ""  # there is none
     hindsight_wanted: bool = False  # also if most of the drive has none
 
-    @classmethod
-    def of(cls, *, logged: bool, hindsight_wanted: bool = False) -> GoalChoice:
-        """Take goals in hindsight if goals and plans were not recorded."""
-        return cls("logged" if logged else "hindsight", hindsight_wanted=hindsight_wanted)
-
     def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
         """Return the choice after a trial.
 
@@ -96,16 +84,13 @@ class GoalChoice:
         enough = self.hindsight_wanted and transitions >= MIN_ROWS
         if self.source != "hindsight" or without <= transitions or enough:
             return self
-        return GoalChoice(
-            None, f"in hindsight, {without:,} ticks have no goal and {transitions:,} have one"
-        )
+        why = f"in hindsight, {without:,} ticks have no goal and {transitions:,} have one"
+        return GoalChoice(None, why)
 
     def task_lines(self, length_m: float) -> list[str]:
         """Write the goal's keys of [task], for a robot of this length."""
         if self.source is None:
-            why = f"; {self.why}" if self.why else ""
-            progress = "progress is forward displacement"
-            return [f'goal = "none"  # no goal and plan seen{why}: {progress}']
+            return [f'goal = "none"  # {self.why or "no goal and plan"}: progress is forward']
         lines = ['goal = "route"']
         if self.source == "hindsight":
             radius_m = min(max(length_m / 3, RADIUS_M[0]), RADIUS_M[1])
@@ -120,11 +105,8 @@ class GoalChoice:
         """Write the [goal] of the profile, if it needs one."""
         if self.source != "hindsight":
             return []
-        return [
-            "[goal]  # no goal and plan seen",
-            'source = "hindsight"  # where a drive stopped, turned back or passed often',
-            "",
-        ]
+        why = "where a drive stopped, turned back or passed often"
+        return ["[goal]  # no goal and plan seen", f'source = "hindsight"  # {why}', ""]
 
 
 # Input -> the field without which a topic is of no use for it.
@@ -134,7 +116,7 @@ MILLIMETRES_UP_TO_M = 1e4  # in float32
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence of a recording on its robot."""
+    """What a recording shows of its robot, and what is chosen by that."""
 
     recording: Recording
     roles: Roles
@@ -144,12 +126,9 @@ class Evidence:
     commands: Commands
     chosen: CommandChoice
     hold: CommandHold
-    turned: DriveEvidence  # whether it steers as a car, if nothing describes it
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
-    driven_s: float
-    recorded_s: float  # that its sensors were recorded: rates are of it
     footprint: Footprint
     footprint_notes: list[str]
     outline: ScannedOutline | None  # if it has enough scans
@@ -158,6 +137,12 @@ class Evidence:
     robot: RobotProposal
     unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
     origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
+
+    @property
+    def recorded_s(self) -> float:
+        """Return how long the recording is."""
+        span = self.recording.span_ns
+        return (span[1] - span[0]) * 1e-9 if span else 0.0
 
 
 @dataclass(frozen=True)
@@ -177,24 +162,15 @@ def gather(recording: Recording, given: Given) -> Evidence:
     Raises:
         ConfigError: the URDF cannot be used; says why.
     """
-    topics, others = usable_topics(recording), other_robots_topics(recording)
-
-    def fitting(kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
-        found = topics_for(recording, topics, kinds)
-        return [fit for _, fit in sort_own_first(recording, [(fit[0].name, fit) for fit in found])]
-
-    roles = {role: fitting(kinds) for role, kinds in KINDS.items()}
+    roles = {role: topics_for(recording, kinds) for role, kinds in KINDS.items()}
     if not roles["bumper"]:
-        own = own_bumpers(recording, topics)
-        roles["bumper"] = [
-            fit for _, fit in sort_own_first(recording, [(one[0].name, one) for one in own])
-        ]
+        roles["bumper"] = own_bumpers(recording)
     unmeasured: dict[str, str] = {}
     for role, key in MEASURED.items():
         roles[role], unmeasured[role] = _measured(recording, roles[role], key)
     chosen = CommandChoice()
     if not roles["command"] and given.odometry_as_command:
-        roles["command"] = fitting(ODOMETRY_AS_COMMAND)
+        roles["command"] = topics_for(recording, ODOMETRY_AS_COMMAND)
     else:
         if len(roles["command"]) > 1:  # an arm on the robot may have its own
             roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
@@ -243,48 +219,48 @@ def gather(recording: Recording, given: Given) -> Evidence:
     robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
-    if wheelbase_m is not None and robot.described:
-        commands = replace(commands, wheelbase_from="of [robot]")
-    paces = _paces(recording, roles)
-    recorded_s = _recorded_s(recording, roles)
-    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces, roles, poses))
+    paces_s = _paces(recording, roles)
+    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces_s, roles, poses))
     motion = None
     if not roles["wheels"] and poses is not None:
         motion = choose_motion(recording, poses, poses_from)
-    best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
-    return Evidence(
+    best = [(role, *fits[0]) for role, fits in roles.items() if fits]
+    clock = choose_clock(
         recording,
-        roles,
-        frames,
-        framed,
-        motion,
-        commands,
-        chosen,
-        hold,
-        turned,
-        paces,
-        choose_clock(
-            recording,
-            list(dict.fromkeys(topic.name for _, topic, _ in best)),
-            frozenset(topic.name for role, topic, _ in best if role in LATCHED),
-            gaps,
-            stamped=_stamped(recording, roles, commands),
-        ),
+        list(dict.fromkeys(topic.name for _, topic, _ in best)),
+        frozenset(topic.name for role, topic, _ in best if role in LATCHED),
         gaps,
-        _driven_s(recording, gaps),
-        recorded_s,
-        footprint,
-        notes,
-        outline,
-        GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=given.hindsight_goals),
-        candidates(
-            recording,
-            without={topic.name for role, topic, _ in best if role in SPENT} | NODE_TOPICS | others,
-            used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
+        stamped=_stamped(recording, roles, commands),
+    )
+    signals = candidates(
+        recording,
+        without={topic.name for role, topic, _ in best if role in SPENT}
+        | NODE_TOPICS
+        | other_robots_topics(recording),
+        used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
+    )
+    return Evidence(
+        recording=recording,
+        roles=roles,
+        frames=frames,
+        poses_from_frames=framed,
+        motion=motion,
+        commands=commands,
+        chosen=chosen,
+        hold=hold,
+        paces_s=paces_s,
+        clock=clock,
+        gaps=gaps,
+        footprint=footprint,
+        footprint_notes=notes,
+        outline=outline,
+        goal=GoalChoice(
+            "logged" if roles["goal"] else "hindsight", hindsight_wanted=given.hindsight_goals
         ),
-        robot,
-        unmeasured,
-        None if poses is None else _origin_m(poses),
+        signals=signals,
+        robot=robot,
+        unmeasured=unmeasured,
+        origin_m=None if poses is None else _origin_m(poses),
     )
 
 
@@ -371,28 +347,3 @@ def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:
     ]
     sensing = [t for t in sensors if t.name != commands.topic or commands.measured]
     return bool(sensing) and all(STAMP in recording.leaves(t.name) for t in sensing)
-
-
-def _recorded_s(recording: Recording, roles: Roles) -> float:
-    """Return for how long the busiest input has messages, as recordings may pause."""
-    span = recording.span_ns
-    whole = (span[1] - span[0]) * 1e-9 if span else 0.0
-    filling = [fitting[0][0] for fitting in roles.values() if fitting]
-    if not filling:
-        return whole
-    busiest = max(filling, key=lambda topic: topic.expected).name
-    gaps = recording.read({busiest: []})[busiest].gaps_s()
-    if len(gaps) < 2:
-        return whole
-    recorded = float(gaps[gaps <= PAUSE * max(float(np.median(gaps)), 0.02)].sum())
-    return recorded if recorded > whole / 10 else whole
-
-
-def _driven_s(recording: Recording, gaps: Gaps) -> float:
-    """Return how long the robot drove, as recordings may pause between drives."""
-    span = recording.span_ns
-    whole = (span[1] - span[0]) * 1e-9 if span else 0.0
-    if gaps.period_s is None:
-        return whole
-    driven = gaps.period_s * gaps.count
-    return min(driven, whole) if driven > whole / 10 else whole

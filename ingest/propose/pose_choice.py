@@ -30,11 +30,10 @@ FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 @dataclass(frozen=True)
 class FrameGuess:
-    """Two frames that transforms join, and all that there are."""
+    """A fixed frame and the robot's, which transforms join."""
 
     fixed: str
     base: str
-    chain: str
     localised: bool  # it leads to a map
     topic: str = Frames().topic
     static_topic: str = Frames().static_topic
@@ -47,12 +46,9 @@ class FrameGuess:
     def lines(self, *, used: bool) -> list[str]:
         """Write the `[frames]` of a profile, commented out if it is not `used`."""
         mark = "" if used else "# "
-        why = f"instead of inputs.pose, from {self.topic}"
-        if used:
-            why = f"poses from {self.topic} and {self.static_topic}"
         topics = [f'topic = "{self.topic}"', f'static_topic = "{self.static_topic}"']
         lines = [
-            f"[frames]  # {why}: {self.chain}",
+            f"[frames]  # poses from {self.topic}, " + ("" if used else "instead of inputs.pose"),
             f'fixed = "{self.fixed}"',
             f'base = "{self.base}"',
             "max_age_s = 0.5",
@@ -107,26 +103,14 @@ def transform_frames(recording: Recording, edges: Edges) -> FrameGuess | None:
     for fixed in named_frames(FIXED_FRAMES, frames):
         for base in named_frames(BASE_FRAMES, frames):
             if fixed in upward(base, edges.parents):
-                chain = " -> ".join(_chain(base, fixed, edges))
                 localised = fixed.split("/")[-1] == "map"
-                return FrameGuess(fixed, base, chain, localised, *transform_topics(recording))
+                return FrameGuess(fixed, base, localised, *transform_topics(recording))
     return None
 
 
 def named_frames(words: tuple[str, ...], frames: set[str]) -> list[str]:
     """Return the frames of these names, with a robot's prefix or without; best first."""
     return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
-
-
-def _chain(base: str, fixed: str, edges: Edges) -> list[str]:
-    """Return the frames from the fixed one down to the base."""
-    way = [base]
-    while way[-1] != fixed:
-        ups = [up for up in edges.parents[way[-1]] if fixed in upward(up, edges.parents)]
-        if not ups or ups[0] in way:
-            break
-        way.append(ups[0])
-    return way[::-1]
 
 
 SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # how far a speed may scatter
@@ -140,18 +124,12 @@ class MotionChoice:
     """The `[motion]` that is proposed, or why there can be none."""
 
     window_s: float
-    period_s: float  # between two poses, mostly
-    comments: tuple[str, ...] = ()
+    why: str = ""
     problem: str = ""
 
     def lines(self) -> list[str]:
-        return [
-            "[motion]  # no usable odometry: speeds are the slope of the last poses; slip cannot"
-            " be detected",
-            *(f"# {comment}" for comment in self.comments),
-            f"window_s = {self.window_s:g}",
-            "",
-        ]
+        why = "no usable odometry: speeds are the slope of the last poses, and show no slip"
+        return [f"[motion]  # {why}", f"window_s = {self.window_s:g}  # {self.why}", ""]
 
 
 def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> MotionChoice:
@@ -167,7 +145,7 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
             " record nav_msgs/msg/Odometry, or a pose at least every"
             f" {MAX_S / MIN_POSES:.1f} s"
         )
-        return MotionChoice(0.0, period, problem=problem)
+        return MotionChoice(0.0, problem=problem)
     poses = _changes(poses)  # a transform that is held says nothing of noise
     period = max(period, float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
     noise_m = float(np.hypot(_scatter(poses.x_m), _scatter(poses.y_m)) / np.sqrt(2))
@@ -175,14 +153,8 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
     window = float(np.ceil(max(MIN_S, least) * 10) / 10)
     while window < MAX_S and not _small(noise_m, noise_rad, period, window):
         window = round(window + 0.1, 1)
-    speed, turn = (_slope_scatter(noise, period, window) for noise in (noise_m, noise_rad))
-    comments = (
-        f"{source} comes every {period:.3g} s and scatters by {noise_m * 1e3:.1f} mm and"
-        f" {noise_rad * 1e3:.1f} mrad:",
-        f"over {window:g} s that is {speed:.3f} m/s and {turn:.3f} rad/s; speeds are {window / 2:g}"
-        " s late.",
-    )
-    return MotionChoice(window, period, comments)
+    scatter = f"{noise_m * 1e3:.1f} mm and {noise_rad * 1e3:.1f} mrad"
+    return MotionChoice(window, f"{source} scatters by {scatter}, every {period:.3g} s")
 
 
 def pose_series(
@@ -230,9 +202,8 @@ def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> li
     origin, usual = fixes.origin_deg(), _usual_std_m(fixes)
     how = "without a stated accuracy" if usual is None else f"of {usual:.2g} m, mostly"
     return [
-        f"# Metres east and north of the origin; fixes {how}. Yaw is the direction of the last",
-        "# track_m driven (backing up reverses it), or by an IMU that knows north:",
-        "# [inputs.heading], with orientation of sensor_msgs/msg/Imu.",
+        f"# Fixes {how}. Yaw is the direction of the last track_m driven (backing up reverses it),",
+        "# or by an IMU that knows north: [inputs.heading], orientation of sensor_msgs/msg/Imu.",
         *([f"origin_deg = [{origin[0]:.7f}, {origin[1]:.7f}]  # the first fix"] if origin else []),
         f"max_std_m = {MAX_STD_M:g}  # fixes with a larger standard deviation are not used",
         f"track_m = {max(TRACK_M, round(3 * (usual or 0.0), 1)):g}",

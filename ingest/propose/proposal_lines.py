@@ -5,27 +5,19 @@ from __future__ import annotations
 import json
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
 
 from restock.errors import visible
-from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import TAKEOVER
-from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.profile.tables import CLOUD, FALLBACKS, SCAN_OF_CLOUD, Input
 from restock.ingest.propose.candidates import camera_lines
 from restock.ingest.propose.clock_choice import ClockChoice
 from restock.ingest.propose.commands import Commands
-from restock.ingest.propose.footprint import (
-    DESCRIBED,
-    GUESS,
-    TIGHT_PER_WIDTH,
-    Footprint,
-    range_lines,
-)
+from restock.ingest.propose.footprint import DESCRIBED, GUESS, TIGHT_PER_WIDTH, range_lines
 from restock.ingest.propose.gather import Evidence
 from restock.ingest.propose.pose_choice import fix_lines, fix_noise_lines
 from restock.ingest.propose.robot_choice import RobotProposal
@@ -34,84 +26,74 @@ from restock.ingest.propose.roles import (
     LATCHED,
     REQUIRED,
     Kind,
-    Roles,
     clouds_alone,
     robots_in,
+    unread_bumpers,
     usable_topics,
 )
-from restock.ingest.propose.trial import Trial
-from restock.ingest.steps.needs import field_paths
+from restock.ingest.propose.trial import Advice, Trial
+from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Noise, Rewards, Task
 
-
-def _takeover_lines(recording: Recording, lines: Sequence[str]) -> list[str]:
-    """Write the button of whoever takes over, if it was recorded and nothing has its name yet."""
-    topic = recording.topics.get(TAKEOVER)
-    named = any(line.startswith('[command_sources."operator"]') for line in lines)
-    if named or topic is None or topic.type != "std_msgs/msg/Bool" or not topic.expected:
-        return []
-    return [
-        "[command_sources.operator]  # who drives while it is true",
-        f'topic = "{TAKEOVER}"',
-        f'type = "{topic.type}"',
-        'fields = { pressed = "data" }',
-        "",
-    ]
-
-
-# The fields of what nothing fills, for a person to name.
+# The fields of a required input that nothing fills, for a person to name.
 BY_HAND = {"command": ("speed_mps", "yaw_rate_radps"), "pose": ("x_m", "y_m", "yaw_rad")}
 
 
-def in_one_recording(robots: Sequence[str]) -> str:
-    """Say whose profile it is, if a recording is of several robots."""
-    others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
-    return (
-        f"of the robot {robots[0]}, one of {len(robots)} in the recording: `restock profile new "
-        f"--robot NAME` proposes a profile of another name for {others}; ingest with it into "
-        "another store, because a store keeps one set of rows per recording"
-    )
-
-
 def profile_lines(
-    seen: Evidence, name: str, problems: list[str], trial: Trial | None = None
+    seen: Evidence,
+    name: str,
+    problems: Sequence[str] = (),
+    trial: Trial | None = None,
+    advice: Sequence[Advice] = (),
 ) -> list[str]:
-    """Write the TOML of a profile, with what a `trial` of it made of the recording."""
+    """Write the TOML of a profile.
+
+    Args:
+        seen: what the profile rests on.
+        name: of the profile.
+        problems: why it cannot be used, for its first lines.
+        trial: what it made of the recording.
+        advice: comments; each is written at the table of its key.
+    """
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
-    robots = robots_in(recording)
-    of_one_robot = f"It is {in_one_recording(robots)}." if robots else ""
+    conditions, exposures = _conditions(seen)
     lines = [
         f"# Proposed from {recording.path.name}: check the comments, then run",
         f"# restock profile check THIS_FILE {recording.path.name}",
         *(f"# NOT USABLE YET: {problem}" for problem in problems),
-        *(f"# {line}" for line in textwrap.wrap(of_one_robot, 98)),
         *_trial_lines(trial),
         "#",
         *_topic_lines(seen),
+        *_notes(advice, "name", "origin_m", "conditions"),
         f'name = "{name}"',
-        f"conditions = {json.dumps(_conditions(seen))}",
-        *_unknown_lines(seen),
-        *_slip_lines(seen),
-        f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever the outcome",
+        f"conditions = {json.dumps(conditions)}",
+        f"exposures = {json.dumps(exposures)}  # situations, whatever the outcome",
         f'behaviour_policy = "{seen.chosen.policy}"  # {seen.chosen.why}',
-        *_origin_lines(seen),
+        *([f"origin_m = {list(seen.origin_m)}"] if seen.origin_m is not None else []),
         "",
-        *task_lines(seen, trial),
+        *task_lines(seen, advice),
         *seen.goal.table_lines(),
-        *_robot_lines(seen),
+        *_notes(advice, "robot"),
+        *seen.robot.limited(*seen.commands.reached).lines(
+            outline_guessed=not seen.footprint.measured
+        ),
         *_noise_lines(seen, trial),
         *_clock_lines(seen.clock),
     ]
-    for role, fitting in seen.roles.items():
+    for role, fits in seen.roles.items():
+        lines += _notes(advice, f"inputs.{role}")
         if role == "pose" and seen.poses_from_frames:
             lines += ["# [inputs.pose]  # from transforms, by [frames]", ""]
+        elif fits:
+            lines += [*_input_lines(role, fits, seen), ""]
         else:
-            lines += _input_lines(role, fitting, seen, trial)
-    lines += seen.chosen.toml(seen.commands.wheelbase_m)
-    lines += _takeover_lines(recording, lines)
+            lines += [*_unfilled_lines(role, seen), ""]
+    for source in seen.chosen.sources:
+        lines += source.toml(seen.commands.wheelbase_m)
+    lines += _takeover_lines(seen)
     if seen.frames is not None:
         lines += seen.frames.lines(used=seen.poses_from_frames)
     if seen.motion is not None and not seen.motion.problem:
@@ -125,58 +107,138 @@ def profile_lines(
     for signal in seen.signals:
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
     lines += camera_lines(usable_topics(recording).values(), seconds)
-    # Names are of a stranger: a line break in one starts no key.
+    # Topics are named by strangers: a line break in a name must not start a key.
     return [visible(line) for line in lines]
 
 
-def _origin_lines(seen: Evidence) -> list[str]:
-    if seen.origin_m is None:
-        return []
-    x, y = seen.origin_m
-    return [f"origin_m = [{x}, {y}]  # of all positions: poses are far from 0 (UTM?)"]
+def advice_of(seen: Evidence) -> Iterator[Advice]:
+    """Yield what a person should check in a proposal, each by the key that it concerns."""
+    roles, commands, footprint = seen.roles, seen.commands, seen.footprint
+    if robots := robots_in(seen.recording):
+        others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
+        yield Advice(
+            "name",
+            f"of the robot {robots[0]}, one of {len(robots)} in the recording: `restock profile new"
+            f" --robot NAME` proposes a profile of another name for {others}; ingest with it into"
+            " another store, because a store keeps one set of rows per recording",
+        )
+    for role, why in seen.unmeasured.items():
+        if why:
+            yield Advice(f"inputs.{role}", why)
+    yield from _command_advice(seen)
+    if seen.robot.guessed_steering and not commands.steered:
+        yield Advice("robot.drive", seen.robot.drive_why)
+    if seen.origin_m is not None:
+        yield Advice(
+            "origin_m",
+            "poses are far from 0 (UTM coordinates?): positions, zones and floors are from this",
+        )
+    if _odometry_alone(seen):
+        yield Advice(
+            "conditions",
+            f"no wheel_slip: poses and wheel speeds are both of {roles['wheels'][0][0].name}, and"
+            " there is no IMU, so slip cannot be detected",
+        )
+    if not roles["bumper"]:
+        yield from (Advice("inputs.bumper", line) for line in unread_bumpers(seen.recording))
+    if not roles["scan"]:
+        known = shipped()
+        names = ", ".join(unseen([known[name] for name in _conditions(seen)[0]]))
+        yield Advice("conditions", f"no lidar: {names} are unknown (neither true nor false)")
+        if clouds := clouds_alone(seen.recording):
+            yield Advice("inputs.scan", clouds)
+        return
+    if not footprint.measured:
+        yield Advice("task.body", f"{footprint.source}, or give --footprint LENGTHxWIDTH")
+    if footprint.lidar_unplaced:
+        yield Advice(
+            "task.body.lidar_yaw_rad",
+            "A GUESS: that the lidar's zero points straight ahead, as no transform places its"
+            f" frame, {footprint.lidar_unplaced}. If it does not, distances ahead are those of"
+            " another side: look at a scan and set lidar_yaw_rad (1.5708: its zero points left)",
+        )
+    if footprint.upside_down:
+        yield Advice(
+            "inputs.scan",
+            "the lidar hangs upside down by its frame, so its scans are turned over; if its driver"
+            " does that already, left and right are now swapped: remove upside_down",
+        )
 
 
-def _conditions(seen: Evidence) -> list[str]:
-    """Return the shipped conditions that this robot's signals can show."""
-    slip = ["wheel_slip"] if _shows_slip(seen) else []
-    return ["recovery", "near_collision", *slip, "blocked_aisle"]
+def _command_advice(seen: Evidence) -> Iterator[Advice]:
+    """Yield what a person should check about the commands."""
+    commands = seen.commands
+    if not seen.roles["command"]:
+        return
+    topic, kind = seen.roles["command"][0]
+    if commands.measured:
+        yield Advice(
+            "inputs.command",
+            "no command was recorded: the measured motion is used in place of commands",
+        )
+    elif commands.steered and not seen.robot.described:
+        yield Advice(
+            "inputs.command.wheelbase_m",
+            "a guess, and with it every yaw rate that was commanded: measure it",
+        )
+    elif seen.robot.values.get("drive") == "ackermann" and not commands.steered:
+        yield Advice(
+            "inputs.command",
+            f"the robot steers as a car, and {kind.fields['yaw_rate_radps']} is read as a yaw rate,"
+            " as the message defines it. If it is the angle of the front wheels, write"
+            " steering_rad in place of yaw_rate_radps, and add wheelbase_m",
+        )
+    source = Input(topic.name, topic.type, dict(kind.fields))
+    path = sideways_path(source)
+    if path in seen.recording.leaves(topic.name):
+        fields = seen.recording.read({topic.name: [path]})[topic.name].fields
+        for note in sideways_notes(source, fields):
+            yield Advice("inputs.command", note.removeprefix("command: "))
+    if commands.still:
+        why = f"{topic.name} never asks the robot to move: the actions are a guess"
+        yield Advice("task.actions", why)
 
 
-def _shows_slip(seen: Evidence) -> bool:
-    """Return whether anything beside its wheels shows how the robot moved."""
-    return bool(seen.roles["wheels"]) and seen.motion is None and not _slip_lines(seen)
-
-
-def _slip_lines(seen: Evidence) -> list[str]:
-    """Say why odometry alone shows no slip."""
-    pose, wheels = (seen.roles[role][:1] for role in ("pose", "wheels"))
-    same = pose and wheels and pose[0][0].name == wheels[0][0].name and not seen.poses_from_frames
-    if not same or seen.roles["imu"]:
-        return []
+def _notes(advice: Sequence[Advice], *tables: str) -> list[str]:
+    """Write the advice on these tables and their keys, as comments."""
     return [
-        f"# No wheel_slip: poses and wheel speeds are both of {pose[0][0].name}, and there is no"
-        " IMU: slip cannot be detected."
+        f"# {line}"
+        for one in advice
+        if any(f"{one.key}.".startswith(f"{table}.") for table in tables)
+        for line in textwrap.wrap(one.text, 98)
     ]
 
 
-def _unknown_lines(seen: Evidence) -> list[str]:
-    """Name the conditions that are unknown for a robot without a lidar."""
-    if seen.roles["scan"]:
+def _takeover_lines(seen: Evidence) -> list[str]:
+    """Write the button of whoever takes over, if it was recorded and nothing has its name yet."""
+    topic = seen.recording.topics.get(TAKEOVER)
+    named = any(source.policy == "operator" for source in seen.chosen.sources)
+    if named or topic is None or topic.type != "std_msgs/msg/Bool" or not topic.expected:
         return []
-    known = shipped()
-    names = unseen([known[name] for name in _conditions(seen)])
-    clouds = clouds_alone(seen.recording, seen.roles)
     return [
-        f"# No {'laser scan' if clouds else 'lidar'}: {', '.join(names)} are unknown (null, neither"
-        " true nor false).",
-        *(f"# {line}" for line in textwrap.wrap(clouds, 96)),
+        "[command_sources.operator]  # who drives while it is true",
+        f'topic = "{TAKEOVER}"',
+        f'type = "{topic.type}"',
+        'fields = { pressed = "data" }',
+        "",
     ]
 
 
-def _exposures(seen: Evidence) -> list[str]:
-    """Return the shipped exposures that this robot's signals can show."""
-    slip = ["slippery_floor"] if _shows_slip(seen) else []
-    return slip + (["closing_traffic", "plan_blocked"] if seen.roles["scan"] else [])
+def _conditions(seen: Evidence) -> tuple[list[str], list[str]]:
+    """Return the shipped conditions and exposures that this robot's signals can show."""
+    slip = seen.roles["wheels"] and seen.motion is None and not _odometry_alone(seen)
+    scan = ["closing_traffic", "plan_blocked"] if seen.roles["scan"] else []
+    wheel_slip, slippery = (["wheel_slip"], ["slippery_floor"]) if slip else ([], [])
+    return ["recovery", "near_collision", *wheel_slip, "blocked_aisle"], [*slippery, *scan]
+
+
+def _odometry_alone(seen: Evidence) -> bool:
+    """Return whether poses and wheel speeds are of one topic, and nothing else shows motion."""
+    pose, wheels = (
+        [topic.name for topic, _ in seen.roles[role][:1]] for role in ("pose", "wheels")
+    )
+    same = bool(wheels) and pose == wheels and not seen.poses_from_frames
+    return same and not seen.roles["imu"]
 
 
 def _trial_lines(trial: Trial) -> list[str]:
@@ -209,31 +271,13 @@ def _topic_lines(seen: Evidence) -> list[str]:
     return [*lines, ""]
 
 
-def steered_by(seen: Evidence) -> str:
-    """Say how the Twists of a robot that steers as a car are read; "" of other robots."""
-    steers = seen.robot.values.get("drive") == "ackermann"
-    if not (steers and seen.roles["command"]) or seen.commands.steered or seen.commands.measured:
-        return ""
-    path = seen.roles["command"][0][1].fields["yaw_rate_radps"]
-    return (
-        f"the robot steers as a car, and {path} is read as a yaw rate, as the message defines it."
-        " If it is the angle of the front wheels, write steering_rad in place of yaw_rate_radps,"
-        " and add wheelbase_m"
-    )
-
-
-def _robot_lines(seen: Evidence) -> list[str]:
-    """Write what the twin builds; the actions are within its limits."""
-    robot = seen.robot.limited(*seen.commands.reached)
-    return robot.lines(outline_guessed=not seen.footprint.measured)
-
-
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
     """Write how noisy its poses are, if that is more than a profile's default."""
     fixes = next(iter(seen.roles["pose"]), None)  # its pose's topic
     if fixes is None or not fixes[1].by_fix:
         noise_m = trial.pose_noise_m
-        if noise_m is None or noise_m <= Noise().localiser_m or not _shows_slip(seen):
+        slip = "wheel_slip" in _conditions(seen)[0]
+        if noise_m is None or noise_m <= Noise().localiser_m or not slip:
             return []
         return [
             "[noise]",
@@ -248,16 +292,14 @@ def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
 
 
 def _clock_lines(clock: ClockChoice) -> list[str]:
-    offset = ""
-    if (ahead_s := clock.ahead_s) is not None:
-        where = "ahead of" if ahead_s >= 0 else "behind"
-        offset = f"  # log time is {abs(ahead_s):,.3f} s {where} it"
-    why = "no commands seen" if clock.every_s is None else f"a command every {clock.every_s:.2f} s"
+    """Write which time, and when there is a tick."""
+    every_s = clock.every_s
+    why = "no commands" if every_s is None else f"a command every {every_s:.2f} s, mostly"
     return [
         "[clock]",
         *(f"# {comment}" for comment in clock.comments),
-        f'alignment = "{clock.alignment}"' + offset,
-        f'steps = "{clock.steps}"  # {why}' + ("" if clock.every_s is None else ", mostly"),
+        f'alignment = "{clock.alignment}"',
+        f'steps = "{clock.steps}"  # {why}',
         f"max_gap_s = {clock.max_gap_s:g}  # a longer one ends an episode",
         "",
     ]
@@ -271,95 +313,71 @@ def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
     return float(np.clip(round(4 / rate, 1), 0.2, 10.0))
 
 
-def _input_lines(
-    role: str, fitting: list[tuple[TopicInfo, Kind]], seen: Evidence, trial: Trial
-) -> list[str]:
-    why = seen.unmeasured.get(role, "")
-    if not fitting:
-        reported = [f"# {line}" for line in textwrap.wrap(why, 96)]
-        if role in REQUIRED:
-            fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
-            if role == "pose":
-                fits += ", or transforms that join two frames"
-            named = ", ".join(f'{key} = "FIELD"' for key in BY_HAND[role])
-            return [
-                *reported,
-                f"# MISSING, and required: no topic of {fits}.",
-                "# If one of another type has it (JSON, protobuf, the robot's own), name it here:",
-                f"# [inputs.{role}]",
-                '# topic = "/TOPIC"',
-                '# type = "ITS TYPE"',
-                f"# fields = {{ {named} }}",
-                "# max_age_s = 0.5",
-                "",
-            ]
-        if role == "wheels":
-            by_hand = ["# [motion]", "# window_s = 0.5"] if seen.motion is None else []
-            return [
-                *reported,
-                "# [inputs.wheels]  # no usable odometry; instead: speeds from poses",
-                *by_hand,
-                "",
-            ]
-        fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
-        none = "none of use" if why else "no topic seen"
-        lines = [*reported, f"# [inputs.{role}]  # {none}; instead: {fallback}"]
-        clouds = [one for one in usable_topics(seen.recording).values() if one.type == CLOUD]
-        if role == "scan" and clouds:
-            fields = ", ".join(f'{key} = "{path}"' for key, path in SCAN_OF_CLOUD.items())
-            lines += [
-                f'# topic = "{clouds[0].name}"',
-                f'# type = "{CLOUD}"',
-                f"# fields = {{ {fields} }}",
-                "# height_m = [LOW, HIGH]  # above the lidar: what the robot can run into",
-                "# max_age_s = 0.5",
-            ]
-        return [*lines, ""]
-    topic, kind = fitting[0]
+def _unfilled_lines(role: str, seen: Evidence) -> list[str]:
+    """Write the table of an input that nothing fills, in comments."""
+    if role in REQUIRED:
+        fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
+        transforms = ", nor transforms that join two frames" if role == "pose" else ""
+        named = ", ".join(f'{key} = "FIELD"' for key in BY_HAND[role])
+        return [
+            f"# MISSING, and required: no topic of {fits}{transforms}.",
+            "# If one of another type has it (JSON, protobuf, the robot's own), name it here:",
+            f"# [inputs.{role}]",
+            '# topic = "/TOPIC"',
+            '# type = "ITS TYPE"',
+            f"# fields = {{ {named} }}",
+        ]
+    if role == "wheels":
+        return ["# [inputs.wheels]  # no usable odometry; instead: speeds from poses"]
+    fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
+    lines = [f"# [inputs.{role}]  # nothing usable; instead: {fallback}"]
+    clouds = [one for one in usable_topics(seen.recording).values() if one.type == CLOUD]
+    if role == "scan" and clouds:
+        fields = ", ".join(f'{key} = "{path}"' for key, path in SCAN_OF_CLOUD.items())
+        lines += [
+            f'# topic = "{clouds[0].name}"',
+            f'# type = "{CLOUD}"',
+            f"# fields = {{ {fields} }}",
+            "# height_m = [LOW, HIGH]  # above the lidar: what the robot can run into",
+            "# max_age_s = 0.5",
+        ]
+    return lines
+
+
+def _input_lines(role: str, fits: Sequence[tuple[TopicInfo, Kind]], seen: Evidence) -> list[str]:
+    """Write the table of an input."""
+    (topic, kind), footprint = fits[0], seen.footprint
     rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
-    beside = dict.fromkeys(other.name for other, _ in fitting if other.name != topic.name)
-    others = ", ".join([*beside][:3])
+    others = dict.fromkeys(other.name for other, _ in fits if other.name != topic.name)
+    beside = f"; or {', '.join([*others][:3])}?" if others else ""
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [
-        *(f"# Not used: {line}" for line in textwrap.wrap(why, 86)),
-        *(
-            ["# No command was recorded: the measured motion is used in place of commands."]
-            if role == "command" and seen.commands.measured
-            else []
-        ),
-        *(
-            [
-                "# The navigation stack's proposal, by its name. It is part of the observation,",
-                f"# beside the command that is driven ({seen.commands.topic}). Remove it if it"
-                " comes after that command.",
-            ]
-            if role == "nav_command"
-            else []
-        ),
-        f"[inputs.{role}]  # {rate:.1f} Hz" + (f"; or {others}?" if others else ""),
+        f"[inputs.{role}]  # {rate:.1f} Hz{beside}",
         f"topic = {json.dumps(topic.name)}",
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
     ]
+    if role == "nav_command":
+        lines.append(
+            "# The navigation stack's proposal, by its name. It is part of the observation,"
+            f" beside the command that is driven ({seen.commands.topic}): remove it if it comes"
+            " after that command."
+        )
     if role == "pose" and kind.by_fix:
         lines += fix_lines(seen.recording, topic.name, kind.fields)
-    if role == "command":
-        lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:
+        wheelbase_m = round(seen.commands.wheelbase_m, 4)
+        lines.append(f"wheelbase_m = {wheelbase_m:g}  # yaw rate = speed x tan(steering) / this")
+    if role == "scan" and footprint.lidar_aside:
+        x, y = (round(at, 3) + 0.0 for at in (footprint.lidar_x_m or 0.0, footprint.lidar_y_m))
         lines += [
-            "# Its yaw rate is speed x tan(steering_rad) / wheelbase_m.",
-            f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}"
-            f"  # {seen.commands.wheelbase_from}",
+            f"lidar_at_m = [{x:g}, {y:g}]  # ahead, to the left",
+            f"lidar_yaw_rad = {round(footprint.lidar_yaw_rad or 0.0, 4) + 0.0:g}",
         ]
-    if role == "scan" and seen.footprint.lidar_aside:
-        lines += _lidar_lines(seen.footprint)
-    if role == "scan" and seen.footprint.upside_down:
-        lines.append("upside_down = true  # by its frame; not if its driver turns the scans over")
+    if role == "scan" and footprint.upside_down:
+        lines.append("upside_down = true")
     if kind.at_changes:
-        lines += [
-            "# A message comes when it changes: the last one holds, and there is no max_age_s.",
-            "# Where several bumpers are pressed, the release of one counts as that of all.",
-        ]
+        lines.append("# no max_age_s: a message comes at each change, and the last one holds")
     elif role not in LATCHED:
         pace_s = seen.paces_s.get(topic.name, 0.25)
         age = float(np.clip(round(seen.clock.pace * 4 * pace_s, 2), 0.2, 1.0))
@@ -368,30 +386,18 @@ def _input_lines(
             lines += [f"# {comment}" for comment in seen.hold.comments]
             if seen.hold.stops_hold:
                 lines.append("stop_holds = true  # a command to stop, until the next one")
-        lines += [*trial.comments(f"inputs.{role}.max_age_s"), f"max_age_s = {age:g}"]
-    if role in FALLBACKS:
-        lines.append("optional = true")
-    return [*lines, ""]
-
-
-def _lidar_lines(footprint: Footprint) -> list[str]:
-    """Write the place of a lidar that is beside the middle."""
-    x, y, yaw = footprint.lidar_x_m or 0.0, footprint.lidar_y_m, footprint.lidar_yaw_rad or 0.0
-    return [
-        f"lidar_at_m = [{round(x, 3) + 0.0:g}, {round(y, 3) + 0.0:g}]  # ahead, to the left",
-        f"lidar_yaw_rad = {round(yaw, 4) + 0.0:g}",
-    ]
+        lines.append(f"max_age_s = {age:g}")
+    return [*lines, "optional = true"] if role in FALLBACKS else lines
 
 
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
 ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
 MAX_TIME_LIMIT_STEPS = 1000
-MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 MIN_TIGHT_M = 0.05  # a lidar's noise hides what is less
 
 
-def task_lines(seen: Evidence, trial: Trial) -> list[str]:
-    """Write the [task] table and those in it, with comments at guesses."""
+def task_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
+    """Write the [task] table and those in it."""
     roles, commands = seen.roles, seen.commands
     kind = "speeds" if commands.measured else "commands"
     held_back = [
@@ -405,17 +411,23 @@ def task_lines(seen: Evidence, trial: Trial) -> list[str]:
     actions = actions_of(commands, seen.robot)
     return [
         "[task]",
-        *_bump_lines(seen.recording, roles),
+        "bump_terminates = true  # a protective stop"
+        + ("" if roles["bumper"] else "; no bumper seen: in the twin, any contact is one"),
         *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
         *_time_limit_lines(seen, max(speed for speed, _ in actions)),
-        *_range_lines(seen),
+        *(
+            range_lines(seen.recording, roles["scan"][0][0].name, seen.outline)
+            if roles["scan"]
+            else ["sectors = 0  # no lidar: clearance is not part of the observation"]
+        ),
         *held_back,
+        *_notes(advice, "task.actions"),
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
         *(f"  [{v:.3g}, {w:.3g}]," for v, w in actions),
         "]",
         "",
-        *_body_lines(seen, trial),
+        *_body_lines(seen, advice),
     ]
 
 
@@ -466,81 +478,29 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
     return actions + [(-back, 0.0) for back in commands.reverse_mps]
 
 
-def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
-    """Let a bumper stop the robot, unless it is pressed too often to be one.
-
-    Without a bumper nothing changes in logs. In the twin, which knows every contact, a robot would
-    otherwise push against a wall until its time is up.
-    """
-    if not roles["bumper"]:
-        return ["bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"]
-    topic, kind = roles["bumper"][0]
-    path = kind.fields["pressed"]
-    wanted = field_paths(Input(topic.name, topic.type, kind.fields))
-    columns = recording.read({topic.name: wanted})[topic.name]
-    pressed = pressed_in(columns.fields, path, len(columns))
-    if len(pressed) and pressed.mean() > MOSTLY_FREE and not kind.at_changes:
-        return [
-            f"# {topic.name} is pressed in {pressed.mean():.0%} of its messages: CHECK its meaning",
-            "# bump_terminates = true  # a protective stop; what follows is another episode",
-        ]
-    return ["bump_terminates = true  # a protective stop; what follows is another episode"]
-
-
-def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
+def _body_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
+    """Write the outline, and how near is near for a robot narrower than suits the default."""
     footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
-    placed = footprint.lidar_source != DESCRIBED
     aside = bool(seen.roles["scan"]) and footprint.lidar_aside
-    return [
+    lines = [
         "[task.body]  # the outline, from which clearance is measured",
-        f"# {footprint.source}"
-        + ("" if footprint.measured else ", or give --footprint LENGTHxWIDTH"),
+        *([f"# {footprint.source}"] if footprint.measured or not seen.roles["scan"] else []),
         *(f"# {note}" for note in seen.footprint_notes),
-        *trial.comments("task.body"),
+        *_notes(advice, "task.body"),
         f"length_m = {round(footprint.length_m, 4):g}",
         f"width_m = {round(footprint.width_m, 4):g}",
-        *(
-            [
-                f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
-                + ("; a guess" if x is None else "")
-                + ("" if x is None and not placed else f"; {footprint.lidar_source}")
-            ]
-            if seen.roles["scan"] and not aside
-            else []
-        ),
-        *(["# Clearance is as from the middle: lidar_at_m of the inputs."] if aside else []),
-        *(f"# {line}" for line in textwrap.wrap(lidar_guess(footprint), 96)),
-        *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 and not aside else []),
-        "",
-        *_reward_lines(footprint.width_m),
     ]
-
-
-def lidar_guess(footprint: Footprint) -> str:
-    """Say that the direction of the lidar is a guess; "" where something says which it is."""
-    if not footprint.lidar_unplaced:
-        return ""
-    return (
-        "A GUESS: that the lidar's zero points straight ahead, as no transform places its frame,"
-        f" {footprint.lidar_unplaced}. If it does not, distances ahead are those of another side:"
-        " look at a scan and set lidar_yaw_rad (1.5708: its zero points left)"
-    )
-
-
-def _reward_lines(width_m: float) -> list[str]:
-    """Write how near is near, for a robot narrower than the one that suits the default."""
-    near_m = round(max(TIGHT_PER_WIDTH * width_m, MIN_TIGHT_M), 3)
-    if near_m >= Rewards().tight_clearance_m:
-        return []
-    return [
-        "[task.rewards]",
-        f"tight_clearance_m = {near_m:g}  # nearer than this is a near collision; by its width",
-        "",
-    ]
-
-
-def _range_lines(seen: Evidence) -> list[str]:
-    if not seen.roles["scan"]:
-        return ["sectors = 0  # no lidar: clearance is unknown, and no part of the observation"]
-    return range_lines(seen.recording, seen.roles["scan"][0][0].name, seen.outline)
+    if aside:
+        lines.append("# Clearance is as from the middle: lidar_at_m of the inputs.")
+    elif seen.roles["scan"]:
+        why = "a guess" if x is None else footprint.lidar_source
+        if x is None and footprint.lidar_source != DESCRIBED:
+            why += f"; {footprint.lidar_source}"
+        lines.append(f"lidar_x_m = {round(x or 0.0, 3):g}  # ahead of the middle; {why}")
+    if yaw and abs(yaw) > 1e-3 and not aside:
+        lines.append(f"lidar_yaw_rad = {round(yaw, 4):g}")
+    near_m = round(max(TIGHT_PER_WIDTH * footprint.width_m, MIN_TIGHT_M), 3)
+    if near_m < Rewards().tight_clearance_m:
+        lines += ["", "[task.rewards]", f"tight_clearance_m = {near_m:g}  # by the robot's width"]
+    return [*lines, ""]

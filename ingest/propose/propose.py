@@ -1,9 +1,8 @@
-"""A first profile for an unknown robot: from the topics and types of one of its recordings.
+"""Propose a first profile for an unknown robot, from one of its recordings.
 
 What each topic is for is guessed from its type and name; the clock, the speeds of the actions,
 maximum ages, the lidar's range, the outline and the frames come from the messages. The proposal is
-then tried on the recording, so that it can say what its choices cost. It is TOML with a comment at
-each guess. Possible custom signals are commented out.
+then tried on the recording, so that it can say what its choices cost.
 """
 
 from __future__ import annotations
@@ -16,28 +15,13 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.profile.tables import Input
 from restock.ingest.propose.clock_choice import by_log_time
 from restock.ingest.propose.commands import off_the_floor
-from restock.ingest.propose.footprint import UPSIDE_DOWN
 from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather, without_first
-from restock.ingest.propose.proposal_lines import (
-    in_one_recording,
-    lidar_guess,
-    profile_lines,
-    steered_by,
-)
-from restock.ingest.propose.roles import (
-    REQUIRED,
-    Kind,
-    clouds_alone,
-    robots_in,
-    several_commands,
-    unread_bumpers,
-)
+from restock.ingest.propose.proposal_lines import advice_of, profile_lines
+from restock.ingest.propose.roles import REQUIRED, Kind, several_commands
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
-from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.needs import as_recorded, read_topics
@@ -94,66 +78,34 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     With `goal_decided` its goal is not left out where this recording alone has few in hindsight.
     """
     recording = seen.recording
-    missing = [
-        role
-        for role in REQUIRED
-        if not seen.roles[role] and not (role == "pose" and seen.poses_from_frames)
+    located = bool(seen.roles["pose"]) or seen.poses_from_frames
+    missing = [role for role in REQUIRED if not (located if role == "pose" else seen.roles[role])]
+    problems = [
+        f"no topic for {role}, which every profile needs: {REMEDIES[role]}"
+        + (INSTEAD_OF_COMMANDS if role == "command" and seen.roles["wheels"] else "")
+        for role in missing
     ]
-    problems = []
-    for role in missing:
-        remedy = REMEDIES[role]
-        if role == "command" and seen.roles["wheels"]:
-            remedy += INSTEAD_OF_COMMANDS
-        problems.append(f"no topic for {role}, which every profile needs: {remedy}")
-    located = "pose" not in missing
     if other := no_wheeled_robot(recording, seen.roles["command"], located=located):
         problems = [other]
     elif seen.motion is not None and seen.motion.problem:
         problems.append(seen.motion.problem)
-    text = "\n".join(profile_lines(seen, name, problems))
     trial = Trial()
     if not problems:
-        trial = tried(recording, text)
+        trial = trial_of(seen)
         if trial.problem and BY_LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
-            seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
-            trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
-        seen, trial = _without_odd(seen, name, trial)
-        seen, trial = _by_rate(recording, seen, name, trial)
+            seen = replace(seen, clock=by_log_time(seen.gaps, trial.problem))
+            trial = trial_of(seen)
+        seen, trial = _by_rate(*_without_contradicted(seen, trial))
         goal = seen.goal.tried(trial.transitions, trial.dropped)
         if goal != seen.goal and not goal_decided:
             seen = replace(seen, goal=goal)
-            trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
+            trial = trial_of(seen)
         if trial.problem:
             problems.append(trial.problem)
-        text = "\n".join(profile_lines(seen, name, problems, trial))
-    advice = [*trial.advice]
-    if robots := robots_in(recording):
-        advice.append(Advice("inputs", in_one_recording(robots)))
-    if steered := steered_by(seen):
-        advice.append(Advice("inputs.command", steered))
-    if seen.robot.guessed_steering and not seen.commands.steered:
-        advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
-    advice += _odd_commands(seen)
-    advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
-    if seen.origin_m is not None:
-        why = f"poses are far from 0 (UTM coordinates?): positions are from {list(seen.origin_m)}"
-        advice.append(Advice("origin_m", f"{why}, and so are zones and floors"))
-    if seen.commands.steered and not seen.robot.described:
-        reported = "a guess, and with it every yaw rate that was commanded: measure it"
-        advice.append(Advice("inputs.command.wheelbase_m", reported))
-    if not seen.footprint.measured and seen.roles["scan"]:
-        said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
-        advice.append(Advice("task.body", f"{said}--footprint"))
-    if not seen.roles["bumper"]:
-        advice += [Advice("inputs.bumper", line) for line in unread_bumpers(recording)]
-    if clouds := clouds_alone(recording, seen.roles):
-        advice.append(Advice("inputs.scan", clouds))
-    if reported := lidar_guess(seen.footprint):
-        advice.append(Advice("task.body.lidar_yaw_rad", reported.replace("A GUESS", "a guess")))
-    if seen.footprint.upside_down and seen.roles["scan"]:
-        advice.append(Advice("inputs.scan", UPSIDE_DOWN))
+    advice = [*advice_of(seen), *trial.advice]
     return Proposal(
-        *(text, recording.path, missing, len(seen.signals)),
+        "\n".join(profile_lines(seen, name, problems, trial, advice)),
+        *(recording.path, missing, len(seen.signals)),
         *(trial.ticks, trial.transitions, problems, advice),
         several_commands(recording),
         findings=trial.findings,
@@ -161,39 +113,19 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     )
 
 
-def _odd_commands(seen: Evidence) -> list[Advice]:
-    """Advise on commands that no action has, or that ask for nothing at all."""
-    if not seen.roles["command"]:
-        return []
-    topic, kind = seen.roles["command"][0]
-    reported = Input(topic.name, topic.type, dict(kind.fields))
-    path, found = sideways_path(reported), []
-    if path in seen.recording.leaves(topic.name):
-        fields = seen.recording.read({topic.name: [path]})[topic.name].fields
-        notes = sideways_notes(reported, fields)
-        found = [Advice("inputs.command", note.removeprefix("command: ")) for note in notes]
-    if seen.commands.still:
-        text = f"{topic.name} never asks the robot to move: the actions are a guess"
-        found.append(Advice("task.actions", text))
-    return found
-
-
-def _without_odd(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Trial]:
-    """Leave out odometry and gyros whose speeds are other ones than those of the poses."""
+def _without_contradicted(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
+    """Leave out odometry and gyros whose speeds are not those of the poses."""
     roles = {"wheels": "wheels", "gyro": "imu"}
     while off := [one for one in trial.findings if one.kind in roles]:
         why = f"{off[0].topic} is not used, as {off[0].what}"
         other = without_first(seen, roles[off[0].kind], why)
         if other is None:
             break
-        seen = other
-        trial = tried(seen.recording, "\n".join(profile_lines(seen, name, [])))
+        seen, trial = other, trial_of(other)
     return seen, trial
 
 
-def _by_rate(
-    recording: Recording, seen: Evidence, name: str, trial: Trial
-) -> tuple[Evidence, Trial]:
+def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
     """Use a tick every period instead of one per command, if that pays.
 
     It does if it makes rows of much more time, or if commands come too unevenly for the twin to
@@ -203,28 +135,23 @@ def _by_rate(
     if clock.steps != "command":
         return seen, trial
     goalless = replace(seen, goal=GoalChoice(None))  # pauses may cost the goals of a drive, too
-    rate = replace(seen, clock=clock.at_a_rate())
-    now, other = (
-        tried(recording, "\n".join(profile_lines(one, name, [])))
-        for one in (goalless, replace(goalless, clock=rate.clock))
+    now, other = trial_of(goalless), trial_of(replace(goalless, clock=clock.at_a_rate()))
+    longer = other.seconds > GAIN * now.seconds
+    evener = other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds
+    if other.problem or not (longer or evener):
+        return seen, trial
+    why = (
+        f"one tick per command gives {now.seconds:.0f} s of rows ({now.even_s:.0f} s that the twin"
+        f" can follow), one per period {other.seconds:.0f} s ({other.even_s:.0f} s)."
     )
-    if other.problem:
-        return seen, trial
-    if other.seconds > GAIN * now.seconds:
-        why = (
-            f"one tick per command gives {now.seconds:.0f} s of rows, one per period "
-            f"{other.seconds:.0f} s: commands pause, and hold."
-        )
-    elif other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds:
-        why = (
-            f"with one tick per command the twin can follow {now.even_s:.0f} s, with one per "
-            f"period {other.even_s:.0f} s: commands come unevenly."
-        )
-    else:
-        return seen, trial
-    comments = (*clock.comments, why)
-    rate = replace(rate, clock=replace(rate.clock, comments=comments))
-    return rate, tried(recording, "\n".join(profile_lines(rate, name, [])))
+    rate = replace(clock.at_a_rate(), comments=(*clock.comments, why))
+    seen = replace(seen, clock=rate)
+    return seen, trial_of(seen)
+
+
+def trial_of(seen: Evidence, recording: Recording | None = None) -> Trial:
+    """Try what `seen` proposes on a recording, else on its own."""
+    return tried(recording or seen.recording, "\n".join(profile_lines(seen, "robot")))
 
 
 def tried(recording: Recording, toml: str) -> Trial:

@@ -1,9 +1,7 @@
 """The `[robot]` of a proposed profile, by its description, its scans and how it turned.
 
-A robot with two driven sides turns on the spot; one that steers never does, whatever its commands.
-If nothing describes the robot, its drive shows in turns on the spot, or in commands for such turns
-that it did not follow, though it moved. Without such commands its logs do not show it: a robot that
-only ever drove in wide circles may have two driven sides.
+A robot with two driven sides turns on the spot; one that steers never does. So if nothing describes
+the robot, its drive shows in whether it follows commands to turn on the spot.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.profile.description import MAX_LETTERS
 from restock.ingest.propose.described_robot import described_robot
-from restock.ingest.propose.footprint import RobotText, SeenScans, View, outline
+from restock.ingest.propose.footprint import RobotText, SeenScans, outline
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.task import wrap_angle
@@ -28,51 +26,36 @@ from restock.toml import toml_value
 
 SETTLED_S = 1.0  # a command is no older
 ANSWERED_S = 0.5  # after its end in which a turn still answers it
-SPOT_M = 0.1  # the circle of a turn on the spot, at most: no car is so small
-TURNS_RADPS = 0.15  # less is a slope of noise
-MIN_PIVOT_RAD = 0.5
 STANDS_MPS, MUCH = 0.02, 0.3  # of a command to turn on the spot; of the sharpest turn that is told
+TURNS_RADPS = 0.15  # less is no turn
 MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
-MIN_HALF_RAD = 1.0  # … of which following half is turning on the spot
 MIN_MOVED_M = 0.05  # else it may not have been able to move
 
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """Evidence in a drive that its robot steers as a car, or turns on the spot."""
+    """How a robot answered commands to turn on the spot, as no car can."""
 
     moved_m: float = 0.0  # the size of the place it drove in
-    pivoted_rad: float = 0.0  # in turns on the spot
     requested_rad: float = 0.0  # by commands to turn on the spot
     spells: int = 0  # of such commands
     followed_rad: float = 0.0  # of what they asked for
-
-    @property
-    def pivots(self) -> bool:
-        """Return whether it turns on the spot."""
-        turned = self.pivoted_rad >= max(MIN_PIVOT_RAD, FOLLOWS * self.requested_rad)
-        half = self.requested_rad >= MIN_HALF_RAD and self.followed_rad >= self.requested_rad / 2
-        return turned or half
 
     @property
     def steers(self) -> bool:
         """Return whether it did not turn on the spot when told to, though it can move."""
         reported = self.requested_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
         followed = self.followed_rad >= FOLLOWS * self.requested_rad
-        return reported and self.moved_m >= MIN_MOVED_M and not followed and not self.pivots
+        return reported and self.moved_m >= MIN_MOVED_M and not followed
 
     @property
     def why(self) -> str:
         """Say what it showed, as the rest of a sentence about the robot."""
-        if self.pivots:
-            turned = max(self.pivoted_rad, self.followed_rad)
-            return f"it turned on the spot, by {turned:.1f} rad in all"
         if not self.requested_rad:
-            return "it never turned on the spot, and was never commanded to"
-        rest = f"though it moved by {self.moved_m:.1f} m" if self.steers else "too little to tell"
+            return "it was never commanded to turn on the spot"
         return (
             f"commanded to turn on the spot, by {self.requested_rad:.1f} rad in all, it turned by"
-            f" {max(self.followed_rad, 0.0):.1f}, {rest}"
+            f" {max(self.followed_rad, 0.0):.1f}, and it moved by {self.moved_m:.1f} m"
         )
 
 
@@ -87,23 +70,12 @@ def drive_evidence(
     """
     if len(command_s) < 2 or len(poses) < 3:
         return DriveEvidence()
-    at_s, heading = np.asarray(poses.stamp_ns * 1e-9, np.float64), _heading(poses)
-    turned, ahead, aside = (
-        np.interp(at_s + 0.5, at_s, column) - np.interp(at_s - 0.5, at_s, column)
-        for column in (heading, poses.x_m, poses.y_m)
-    )
-    spot = np.abs(turned) >= TURNS_RADPS
-    spot &= np.hypot(ahead, aside) <= SPOT_M * np.abs(turned)
+    at_s = np.asarray(poses.stamp_ns * 1e-9, np.float64)
+    heading = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
     return DriveEvidence(
         float(np.hypot(np.ptp(poses.x_m), np.ptp(poses.y_m))),
-        float(np.abs(np.diff(heading))[spot[1:]].sum()),
         *_on_the_spot(command_s, command_mps, command_radps, at_s, heading),
     )
-
-
-def _heading(poses: PoseSeries) -> F64:
-    """Return how far each pose is turned from the first, whole turns included (N,)."""
-    return np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
 
 
 def _on_the_spot(
@@ -169,22 +141,16 @@ class RobotProposal:
         values = {k: v for k, v in self.values.items() if k not in _OF_STEERING}
         origin = {key: said for key, said in self.origin.items() if key in values}
         if command_rad is None and not shown.steers:
-            said = (
-                shown.why if shown.pivots else f"A GUESS, as its logs do not show it: {shown.why}"
-            )
-            return replace(self, values=values, origin=origin, drive_why=said)
+            return replace(self, values=values, origin=origin, drive_why=shown.why)
         wheelbase_m = round(WHEELBASE_PART * length_m, 3)
         values |= {"drive": "ackermann", "wheelbase_m": wheelbase_m}
         origin |= {"drive": "logs", "wheelbase_m": "default"}
-        sharpest = USUAL_STEERING_RAD
+        why = f"CONFIRM THAT IT STEERS LIKE A CAR: {shown.why}"
         if command_rad is not None:
             why = "its commands are steering angles"
-            sharpest = max(sharpest, command_rad)
-        else:
-            why = f"CONFIRM THAT IT STEERS LIKE A CAR: {shown.why}"
-        if sharpest != USUAL_STEERING_RAD:
-            values["max_steering_rad"] = round(min(max(sharpest, 0.05), 1.3), 3)
-            origin["max_steering_rad"] = "logs"
+            if command_rad > USUAL_STEERING_RAD:
+                values["max_steering_rad"] = round(min(command_rad, 1.3), 3)
+                origin["max_steering_rad"] = "logs"
         return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
@@ -237,9 +203,8 @@ def read_urdf(path: Path) -> RobotText:
     except UnicodeDecodeError as error:
         raise ConfigError(f"is not a URDF: {error}", where=str(path), remedy=remedy) from error
     found = RobotText(path.name, text, "urdf")
-    description = found.description
     problem: str | None
-    if isinstance(description, str):
+    if isinstance(description := found.description, str):
         problem = description
     else:
         problem = described_robot(description, 0.0).problem
@@ -287,8 +252,8 @@ def propose_robot(
     if unfit and not values:
         return RobotProposal(notes=unfit, rolls=False)
     if scan is not None:
-        view = scan.view(upside_down=upside_down)
-        seen = {} if view is None else _beams(view.turned(lidar_yaw_rad), notes)
+        view = scan.view(lidar_yaw_rad, upside_down=upside_down)
+        seen = {} if view is None else _beams(*view, notes)
         values |= seen
         origin |= dict.fromkeys(seen, "logs")
     return RobotProposal(values, origin, notes)
@@ -309,15 +274,15 @@ def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
     return kept
 
 
-def _beams(view: View, notes: list[str]) -> dict[str, Any]:
+def _beams(low_rad: float, high_rad: float, beams: int, notes: list[str]) -> dict[str, Any]:
     """Return the beams and the field of view of the twin's lidar."""
-    every = -(-view.beams // MAX_BEAMS)
+    every = -(-beams // MAX_BEAMS)
     if every > 1:
-        notes.append(f"the twin has every {every}. of the lidar's {view.beams} beams")
+        notes.append(f"the twin has every {every}. of the lidar's {beams} beams")
     return {
-        "lidar.beams": -(-view.beams // every),
-        "lidar.angle_min_rad": round(view.low_rad, 5),
-        "lidar.angle_max_rad": round(view.high_rad, 5),
+        "lidar.beams": -(-beams // every),
+        "lidar.angle_min_rad": round(low_rad, 5),
+        "lidar.angle_max_rad": round(high_rad, 5),
     }
 
 

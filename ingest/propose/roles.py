@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
@@ -14,8 +13,6 @@ from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
 from restock.ingest.profile.signal_paths import last_part
 from restock.ingest.profile.tables import CLOUD, Input
 from restock.ingest.steps.needs import field_paths
-
-T = TypeVar("T")
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
 _PLACE = {"x_m": "position.x", "y_m": "position.y"}
@@ -71,6 +68,7 @@ _ELSEWHERE = (
     *("people", "dock", "desired", "setpoint", "reference", "camera", "joint", "gripper"),
 )
 
+_ROBOTS_POSE = ("robot_pose", "tracked_pose", "slam", "pose")
 _PATHS = ("plan", "path")
 # A name of a path that does not lead to the goal: what a controller looks at, next to the robot.
 _NEAR_PATHS = ("local_plan", "local_path", "local_traj", "transformed_", "pruned_")
@@ -87,24 +85,30 @@ _MEASURED = (
 CLOUDS = (CLOUD, "sensor_msgs/msg/PointCloud", "foxglove.PointCloud")
 MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
 
-# Best first.
+_TWISTS = (
+    ("geometry_msgs/msg/Twist", _TWIST),
+    ("geometry_msgs/msg/TwistStamped", _under("twist", _TWIST)),
+)
+_STEERED = {"speed_mps": "speed", "steering_rad": "steering_angle"}
+_STEERINGS = (
+    ("ackermann_msgs/msg/AckermannDriveStamped", _under("drive", _STEERED)),
+    ("ackermann_msgs/msg/AckermannDrive", _STEERED),
+)
+_POSES = ("geometry_msgs/msg/PoseStamped", "foxglove.PoseInFrame")
+_ODOMETRY = (("nav_msgs/msg/Odometry", "pose.pose"), ("foxglove.Odometry", "pose"))
+
+
+def _texts(words: tuple[str, ...], never: tuple[str, ...] = ()) -> tuple[Kind, ...]:
+    return (Kind("std_msgs/msg/String", {"text": "data"}, words, must=True, never=never),)
+
+
+# Input -> the kinds of topic that may fill it, best first.
 KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
-        Kind("geometry_msgs/msg/Twist", _TWIST, _DRIVEN, rather=_CHOSEN_FROM),
-        Kind(
-            "geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), _DRIVEN, rather=_CHOSEN_FROM
-        ),
-        Kind(
-            "ackermann_msgs/msg/AckermannDriveStamped",
-            {"speed_mps": "drive.speed", "steering_rad": "drive.steering_angle"},
-            _ACKERMANN,
-            rather=(*_CHOSEN_FROM, "safety"),
-        ),
-        Kind(
-            "ackermann_msgs/msg/AckermannDrive",
-            {"speed_mps": "speed", "steering_rad": "steering_angle"},
-            _ACKERMANN,
-            rather=(*_CHOSEN_FROM, "safety"),
+        *(Kind(name, fields, _DRIVEN, rather=_CHOSEN_FROM) for name, fields in _TWISTS),
+        *(
+            Kind(name, fields, _ACKERMANN, rather=(*_CHOSEN_FROM, "safety"))
+            for name, fields in _STEERINGS
         ),
     ),
     "pose": (
@@ -114,32 +118,19 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             ("amcl", "pose", "local"),
             never=_ELSEWHERE,
         ),
-        Kind(
-            "geometry_msgs/msg/PoseStamped",
-            _under("pose", _POSE),
-            ("robot_pose", "tracked_pose", "slam", "pose"),
-            must=True,
-            never=_ELSEWHERE,
+        *(
+            Kind(name, _under("pose", _POSE), _ROBOTS_POSE, must=True, never=_ELSEWHERE)
+            for name in _POSES
         ),
-        Kind(
-            "foxglove.PoseInFrame",
-            _under("pose", _POSE),
-            ("robot_pose", "tracked_pose", "slam", "pose"),
-            must=True,
-            never=_ELSEWHERE,
-        ),
-        Kind("nav_msgs/msg/Odometry", _under("pose.pose", _POSE), ("filtered", "map", "odom")),
-        Kind("foxglove.Odometry", _under("pose", _POSE), ("filtered", "map", "odom")),
+        *(Kind(name, _under(at, _POSE), ("filtered", "map", "odom")) for name, at in _ODOMETRY),
         # Of motion capture and the like, whatever their names.
-        Kind("geometry_msgs/msg/PoseStamped", _under("pose", _POSE), never=_ELSEWHERE),
-        Kind("foxglove.PoseInFrame", _under("pose", _POSE), never=_ELSEWHERE),
+        *(Kind(name, _under("pose", _POSE), never=_ELSEWHERE) for name in _POSES),
         Kind(
             "geometry_msgs/msg/TransformStamped",
-            {
-                "x_m": "transform.translation.x",
-                "y_m": "transform.translation.y",
-                "orientation": "transform.rotation",
-            },
+            _under(
+                "transform",
+                {"x_m": "translation.x", "y_m": "translation.y", "orientation": "rotation"},
+            ),
             never=_ELSEWHERE,
         ),
         Kind("geometry_msgs/msg/Pose", _POSE, ("pose",), never=_ELSEWHERE),
@@ -177,8 +168,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         Kind(  # all that move_base was sent
             "move_base_msgs/msg/MoveBaseActionGoal", _under("goal.target_pose.pose", _PLACE)
         ),
-        Kind("geometry_msgs/msg/PoseStamped", _under("pose", _PLACE), ("goal",), must=True),
-        Kind("foxglove.PoseInFrame", _under("pose", _PLACE), ("goal",), must=True),
+        *(Kind(name, _under("pose", _PLACE), ("goal",), must=True) for name in _POSES),
     ),
     "plan": (
         Kind("nav_msgs/msg/Path", _under("poses[].pose", _PLACE), _PATHS, never=_NEAR_PATHS),
@@ -203,30 +193,13 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             for package in ("kobuki_ros_interfaces", "kobuki_msgs")
         ),
     ),
-    "nav_command": (
-        Kind("geometry_msgs/msg/Twist", _TWIST, NAVIGATION, must=True, never=BY_HAND),
-        Kind(
-            "geometry_msgs/msg/TwistStamped",
-            _under("twist", _TWIST),
-            NAVIGATION,
-            must=True,
-            never=BY_HAND,
-        ),
+    "nav_command": tuple(
+        Kind(name, fields, NAVIGATION, must=True, never=BY_HAND) for name, fields in _TWISTS
     ),
-    "behaviour_policy": (
-        Kind("std_msgs/msg/String", {"text": "data"}, ("policy", "mode", "behavi"), must=True),
-    ),
-    "true_condition": (
-        Kind(
-            "std_msgs/msg/String",
-            {"text": "data"},
-            ("ground_truth", "true_cond"),
-            must=True,
-            never=("exposure",),
-        ),
-    ),
-    "true_exposure": (Kind("std_msgs/msg/String", {"text": "data"}, ("exposure",), must=True),),
-    "perturbation": (Kind("std_msgs/msg/String", {"text": "data"}, ("perturbation",), must=True),),
+    "behaviour_policy": _texts(("policy", "mode", "behavi")),
+    "true_condition": _texts(("ground_truth", "true_cond"), never=("exposure",)),
+    "true_exposure": _texts(("exposure",)),
+    "perturbation": _texts(("perturbation",)),
 }
 # Where that is asked for: the measured motion in place of commands that were not recorded.
 ODOMETRY_AS_COMMAND = _MEASURED
@@ -343,20 +316,15 @@ def other_robots_topics(recording: Recording) -> set[str]:
     return {name for name in recording.topics if name.startswith(others)}
 
 
-def sort_own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> Iterable[tuple[str, T]]:
-    """Drop what was found at other robots' topics or nodes, and put the unnamed last.
-
-    With one robot, everything stays as found.
-    """
-    robots = [f"{robot}/" for robot in robots_in(recording)]
-    if not robots:
-        return found
-    kept = [one for one in found if not one[0].startswith(tuple(robots[1:]))]
-    return sorted(kept, key=lambda one: not one[0].startswith(robots[0]))
+def own_first(recording: Recording, names: Iterable[str]) -> list[str]:
+    """Drop names in other robots' namespaces, and put those in none last."""
+    robots = tuple(f"{robot}/" for robot in robots_in(recording))
+    kept = [name for name in names if not name.startswith(robots[1:])]
+    return sorted(kept, key=lambda name: not name.startswith(robots[:1]))
 
 
 def shared(recording: Recording, place: str) -> str:
-    """Warn that a topic or node may not be of this robot; "" if it is."""
+    """Warn that a topic may not be of this robot; "" if it is."""
     robots = robots_in(recording)[:1]
     if not robots or place.startswith(f"{robots[0]}/"):
         return ""
@@ -390,10 +358,10 @@ FLAGS = {"bool", "uint8", "int8", "byte", "char"}
 MAX_FLAGS = 8
 
 
-def own_bumpers(recording: Recording, topics: dict[str, TopicInfo]) -> list[tuple[TopicInfo, Kind]]:
+def own_bumpers(recording: Recording) -> list[tuple[TopicInfo, Kind]]:
     """Return bumpers of a robot's own type: named so, and nothing but flags in their messages."""
     found = []
-    for topic in topics.values():
+    for topic in usable_topics(recording).values():
         leaves = [one for one in recording.fields(topic.name) if not one.path.startswith("header.")]
         flags = all(one.kind in FLAGS and not one.dims for one in leaves)
         if "bump" in topic.name.lower() and flags and 0 < len(leaves) <= MAX_FLAGS:
@@ -412,47 +380,45 @@ def unread_bumpers(recording: Recording) -> list[str]:
     ]
 
 
-def topics_for(
-    recording: Recording, topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
-) -> list[tuple[TopicInfo, Kind]]:
-    """Sort the topics that may fill an input, best first: by kind, by name, by messages."""
-    fitting = []
+def topics_for(recording: Recording, kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
+    """Sort the topics that may fill an input, best first.
+
+    The robot's own come before those of no robot, then it is by kind, by name, by messages.
+    """
+    own = tuple(f"{robot}/" for robot in robots_in(recording)[:1])
+    topics, fitting = usable_topics(recording).values(), []
     for rank, kind in enumerate(kinds):
-        for topic in topics.values():
+        for topic in topics:
             name = topic.name.lower()
             named = [place for place, word in enumerate(kind.words) if word in name]
             against = any(word in name for word in kind.never)
-            later = any(word in name for word in kind.rather)
             if not against and (named or not kind.must) and _is_of(recording, topic, kind):
+                others, later = not topic.name.startswith(own), any(w in name for w in kind.rather)
                 place = min(named, default=len(kind.words))
-                fitting.append(((later, rank, place, -topic.expected, topic.name), topic, kind))
+                order = (others, later, rank, place, -topic.expected, topic.name)
+                fitting.append((order, topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
 
 
-def clouds_alone(recording: Recording, roles: Roles) -> str:
+def clouds_alone(recording: Recording) -> str:
     """Say what to do about the point clouds of a robot without a laser scan; "" if it has none."""
     clouds = [one for one in usable_topics(recording).values() if one.type in CLOUDS]
-    if roles["scan"] or not clouds:
+    if not clouds:
         return ""
-    first, *others = sorted(clouds, key=lambda one: one.type != CLOUD)
-    also = f" (or {', '.join(one.name for one in others[:2])})" if others else ""
-    if first.type == CLOUD:
-        return (
-            f"{first.name}{also} is a point cloud, of which a slice can be read as a scan:"
-            " uncomment [inputs.scan], set its height_m to what the robot can run into, and remove"
-            " `sectors = 0` from [task]"
-        )
+    first = min(clouds, key=lambda one: one.type != CLOUD)
+    if first.type != CLOUD:
+        return f"{first.name} cannot be read as a scan: record it as {CLOUD}, or a laser scan"
     return (
-        f"{first.name}{also} is a {first.type}, and clearance is taken from laser scans and"
-        f" {CLOUD} alone: record one of these with the other topics"
+        f"{first.name} is a point cloud, of which a slice can be read as a scan: uncomment"
+        " [inputs.scan], set its height_m to what the robot can run into, and remove"
+        " `sectors = 0` from [task]"
     )
 
 
 def several_commands(recording: Recording) -> list[str]:
     """Return all topics that may drive the robot, best first, if there are several."""
-    topics = usable_topics(recording)
-    fitting = topics_for(recording, topics, KINDS["command"])
-    proposed = {topic.name for topic, _ in topics_for(recording, topics, KINDS["nav_command"])}
+    fitting = topics_for(recording, KINDS["command"])
+    proposed = {topic.name for topic, _ in topics_for(recording, KINDS["nav_command"])}
     named = [
         topic.name
         for topic, kind in fitting

@@ -1,12 +1,8 @@
-"""A profile tried on a recording: what each of its choices costs, and what to try instead.
-
-Every count here is of transitions that the profile, with that one choice changed, makes of the
-recording: nothing is estimated.
-"""
+"""A profile tried on a recording: what it gives, and what to try instead."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -61,10 +57,6 @@ class Trial:
     pose_noise_m: float | None = None  # by how much poses differ from wheels in a control period
     inside_outline: float | None = None  # share of usable ticks with a return inside the robot
 
-    def comments(self, *keys: str) -> list[str]:
-        """Write what it says of these keys of the profile, as comments of its TOML."""
-        return [f"# {each.text}." for each in self.advice if each.key in keys]
-
 
 def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     """Try a profile on the columns of a recording (those `read_topics` reads for it)."""
@@ -79,23 +71,22 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         return Trial(problem=why)
     inside, advice = _outline(profile, topics, steps)
     advice = [*_ages(profile, topics, steps, episodes), *advice]
-    worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     problem = "" if episodes.transitions else f"no transition: {why}"
     stamps = steps.signals["stamp_ns"]
+    stretches = [stamps[one.first : one.last + 1] for one in episodes.episodes]
     return Trial(
-        len(steps),
-        episodes.transitions,
-        sum(int(stamps[one.last] - stamps[one.first]) for one in episodes.episodes) / NS,
-        sum(
-            _even_s(stamps[one.first : one.last + 1], profile.task.control_period_s)
-            for one in episodes.episodes
+        ticks=len(steps),
+        transitions=episodes.transitions,
+        seconds=sum(int(one[-1] - one[0]) for one in stretches) / NS,
+        even_s=sum(_even_s(one, profile.task.control_period_s) for one in stretches),
+        dropped=dict(sorted(episodes.dropped.items(), key=lambda item: -item[1])),
+        advice=advice,
+        problem=problem,
+        findings=steps.findings,
+        pose_noise_m=(
+            _pose_noise_m(steps, profile.task) if all(f.repaired for f in steps.findings) else None
         ),
-        dict(worst),
-        advice,
-        problem,
-        steps.findings,
-        _pose_noise_m(steps, profile.task) if all(f.repaired for f in steps.findings) else None,
-        None if problem else inside,
+        inside_outline=None if problem else inside,
     )
 
 
@@ -137,71 +128,49 @@ def _even_s(stamp_ns: Ints, period_s: float) -> float:
 
 def _ages(
     profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps, episodes: Split
-) -> list[Advice]:
-    """Say how old each input is that is often stale, and what another age gives."""
-    found = []
-    for reason, count in sorted(episodes.dropped.items(), key=lambda item: -item[1]):
-        name, _, what = reason.partition(": ")
-        if what != "stale" or count < MUCH * len(steps):
-            continue
-        source = dict(profile.inputs.items()).get(name)
-        if source is None or source.max_age_s is None:
+) -> Iterator[Advice]:
+    """Yield how old each input is that is often stale, and what it would give if it were held."""
+    for name, source in profile.inputs.items():
+        count = episodes.dropped.get(f"{name}: stale", 0)
+        if source.max_age_s is None or count < MUCH * len(steps):
             continue
         latest = align_inputs(profile, topics).latest(name)
-        ages = latest.age_ns[latest.known] * 1e-9
-        most = float(np.ceil(np.percentile(ages, 95) * 10) / 10) if len(ages) else 0.0
-        tried = [
-            f"{age:g} s makes {number:,}" if age else f"without it (latched) {number:,}"
-            for age in dict.fromkeys((most if most > source.max_age_s else None, None))
-            if (number := _with_age(profile, topics, name, age)) > GAIN * episodes.transitions
-        ]
-        text = (
-            f"{source.max_age_s:g} s drops {count:,} of {len(steps):,} ticks: "
-            f"{source.topic} is up to {ages.max(initial=0.0):.1f} s old; {episodes.transitions:,} "
-            "transitions" + "".join(f", {one}" for one in tried)
+        oldest_s = float(latest.age_ns[latest.known].max(initial=0)) * 1e-9
+        held = msgspec.structs.replace(source, max_age_s=None)
+        inputs = msgspec.structs.replace(profile.inputs, **{name: held})
+        other = split(
+            profile.task, steps_of(msgspec.structs.replace(profile, inputs=inputs), topics)
         )
-        if name == "command" and tried:
-            text += " (correct only if the robot continues with its last command)"
-        found.append(Advice(f"inputs.{name}.max_age_s", text))
-    return found
-
-
-def _with_age(
-    profile: Profile, topics: Mapping[str, TopicColumns], name: str, age_s: float | None
-) -> int:
-    """Count the transitions that another age of an input makes."""
-    source = msgspec.structs.replace(getattr(profile.inputs, name), max_age_s=age_s)
-    inputs = msgspec.structs.replace(profile.inputs, **{name: source})
-    profile = msgspec.structs.replace(profile, inputs=inputs)
-    try:
-        return split(profile.task, steps_of(profile, topics)).transitions
-    except RecordingError:
-        return 0
+        text = (
+            f"{source.max_age_s:g} s drops {count:,} of {len(steps):,} ticks: {source.topic} is up"
+            f" to {oldest_s:.1f} s old; {episodes.transitions:,} transitions"
+        )
+        if other.transitions > GAIN * episodes.transitions:
+            text += f", without it (latched) {other.transitions:,}"
+            if name == "command":
+                text += " (correct only if the robot continues with its last command)"
+        yield Advice(f"inputs.{name}.max_age_s", text)
 
 
 def _outline(
     profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps
 ) -> tuple[float | None, list[Advice]]:
-    """Return at which share of usable ticks the lidar sees something inside the robot's outline.
+    """Return the share of usable ticks at which the lidar sees something inside the robot.
 
     Also advise on that, and on things that almost touch it.
     """
-    scan = profile.inputs.scan
-    if scan is None or scan.topic not in topics:
-        return None, []
+    scan, body = profile.inputs.scan, profile.task.body
     usable = np.array([problem == "" for problem in steps.problem], np.bool_)
+    if scan is None or scan.topic not in topics or not usable.any():
+        return None, []
     clearance = steps.signals["clearance_m"][usable]
     near_m = profile.task.rewards.tight_clearance_m  # as of near_collision and recovery
-    inside, near = int((clearance <= 0).sum()), int((clearance < near_m).sum())
-    often = inside > OFTEN_INSIDE * len(clearance) or near > OFTEN_NEAR * len(clearance)
-    share = inside / len(clearance) if len(clearance) else None
-    if not often:
-        return share, []
-    body = profile.task.body
+    inside, near = float((clearance <= 0).mean()), float((clearance < near_m).mean())
+    if inside <= OFTEN_INSIDE and near <= OFTEN_NEAR:
+        return inside, []
     text = (
-        f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something "
-        f"nearer than {near_m:g} m at {near:,} of {len(clearance):,} ticks, and inside the "
-        f"robot at {inside:,}: these are labelled near_collision and recovery. Measure the "
-        "robot"
+        f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something"
+        f" nearer than {near_m:g} m at {near:.0%} of the ticks, and inside the robot at"
+        f" {inside:.0%}: these are labelled near_collision and recovery. Measure the robot"
     )
-    return share, [Advice("task.body", text)]
+    return inside, [Advice("task.body", text)]

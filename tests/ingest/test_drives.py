@@ -84,7 +84,7 @@ def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
     # Drives whose commands are of another pace share a tick every period.
     assert profile.clock.steps == "rate"
     assert any("bags/another" in each["text"] for each in said["advice"])
-    assert "NOT OF THAT KIND: bags/another: lidar" in file.read_text()
+    assert "# not of that kind: bags/another: lidar" in file.read_text()
     # And it makes rows of all three.
     store = tmp_path / "store"
     bags = [str(tmp_path / "bags" / name) for name in ("slow", "fast", "described")]
@@ -142,8 +142,8 @@ def test_what_was_read_and_what_not_is_told(tmp_path, capsys, monkeypatch):
     a, b, c, other = (str(tmp_path / "bags" / name) for name in ("a", "b", "c", "other"))
     assert (said["read"], said["unread"]) == ([a, c], [b])
     assert [kind["recordings"] for kind in said["kinds"]] == [[a, b, c], [other]]
-    assert "# NOT READ, of that kind: bags/b\n" in said["toml"]
-    assert "# NOT OF THAT KIND: bags/other: lidar" in said["toml"]
+    assert "# not read, of that kind: bags/b\n" in said["toml"]
+    assert "# not of that kind: bags/other: lidar" in said["toml"]
 
 
 @dataclass
@@ -168,7 +168,7 @@ def test_a_drive_that_gives_no_rows_is_no_base(tmp_path, capsys):
     # Ticks are .2 s apart; the goal's radius is reached a little before its place.
     assert 79 + 74 - 4 <= said["transitions"] <= 79 + 74
     assert "#   bags/idle: 0  (no transition" in file.read_text()
-    reported = "1 of 3 recordings give no transition: bags/idle; "
+    reported = "1 of 3 recordings give no transition: bags/idle"
     assert any(reported in each["text"] for each in said["advice"])
 
 

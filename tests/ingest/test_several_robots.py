@@ -45,7 +45,7 @@ def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_pat
     assert inputs.scan is not None
     assert inputs.scan.topic == ("/robot2/scan" if robot == "/robot2" else "/front/scan")
     assert document["transitions"] > 5
-    said = next(one["text"] for one in document["advice"] if one["key"] == "inputs")
+    said = next(one["text"] for one in document["advice"] if one["key"] == "name")
     assert said.startswith(f"of the robot {robot}, one of 2 in the recording: ")
     assert f"--robot NAME` proposes a profile of another name for {other};" in said
 

@@ -34,7 +34,7 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, o
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint, SeenScans, scans_of
-from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
+from restock.ingest.propose.roles import KINDS, Kind, topics_for
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.needs import angle_keys
 from restock.train.twin.floors.occupancy_grid import (
@@ -158,7 +158,7 @@ def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Ki
             return None
         origin = next((kind.origin for kind in KINDS["scan"] if kind.type == scan.type), "")
         return named, Kind(scan.type, scan.fields, origin=origin)
-    found = topics_for(recording, usable_topics(recording), KINDS["scan"])
+    found = topics_for(recording, KINDS["scan"])
     return min(found, key=lambda fit: "fake" in fit[0].name or "sim" in fit[0].name, default=None)
 
 

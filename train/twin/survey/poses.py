@@ -19,11 +19,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import AXES, FRAME_ID, TURN, plain, transform_fields
 from restock.ingest.profile.tables import Frames
 from restock.ingest.propose.pose_choice import transform_edges, transform_frames
-from restock.ingest.propose.roles import (
-    KINDS,
-    topics_for,
-    usable_topics,
-)
+from restock.ingest.propose.roles import KINDS, topics_for
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import PARENT, Edges, rotations
 from restock.ingest.steps.input_columns import fixes_of
@@ -131,12 +127,11 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     if profile is not None:
         at, (x_m, y_m) = _by_profile(recording, profile), profile.origin_m or (0.0, 0.0)
         return [] if at is None else [replace(at, x_m=at.x_m - x_m, y_m=at.y_m - y_m)]
-    usable = usable_topics(recording)
     guess = transform_frames(recording, transform_edges(recording))
     along = None
     if guess is not None:
         along = along_transforms(recording, guess.frames)
-    kinds = topics_for(recording, usable, KINDS["pose"])
+    kinds = topics_for(recording, KINDS["pose"])
     fixes = {topic.name: kind.fields for topic, kind in kinds if kind.by_fix}
     found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
     if not found and along is None:  # another frame than anything else's, and no heading
