@@ -18,6 +18,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.tables import CustomSignal, name_problem
+from restock.ingest.propose.roles import usable_topics
 from restock.ingest.steps.cameras import TYPES
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
@@ -80,10 +81,8 @@ def candidates(
     `without` are topics to leave out, `used` fields (topic, path).
     """
     named: dict[str, Candidate] = {}
-    for topic in recording.topics.values():
-        if topic.skipped or topic.expected < 2 or _IGNORED_TYPES.search(topic.type):
-            continue
-        if topic.name in without:
+    for topic in usable_topics(recording).values():
+        if topic.expected < 2 or topic.name in without or _IGNORED_TYPES.search(topic.type):
             continue
         possible = [
             _candidate(topic, path, words)

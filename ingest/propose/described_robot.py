@@ -102,11 +102,11 @@ def described_robot(
             values["casters_m"] = casters
     if lidar := _lidar_z(places, scan_frame, floor):
         values["lidar.z_m"] = lidar
-    meshes = [name for name, link in description.links.items() if link.find(".//mesh") is not None]
-    if meshes := [name for name in meshes if name not in boxes]:
-        notes.append(
-            f"left out are links of only meshes, whose size is in other files: {len(meshes)}"
-        )
+    if meshes := sum(
+        name not in boxes and link.find(".//mesh") is not None
+        for name, link in description.links.items()
+    ):
+        notes.append(f"only meshes, whose size is in other files: {counted(meshes, 'link')}")
     rounded = {key: _rounded(value) for key, value in values.items()}
     return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
 

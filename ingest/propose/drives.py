@@ -39,6 +39,7 @@ from restock.ingest.propose.commands import (
 )
 from restock.ingest.propose.footprint import RobotText, descriptions
 from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather
+from restock.ingest.propose.pose_choice import on_map
 from restock.ingest.propose.propose import (
     Proposal,
     RobotKind,
@@ -162,7 +163,7 @@ def _best(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
         (pooled(base, drives) for base in _bases(bases)),
         key=lambda one: (
             sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), drives))
-            * (LOCALISED_WORTH if _on_map(one) else 1.0)
+            * (LOCALISED_WORTH if one.poses_from_frames and on_map(one.frames) else 1.0)
         ),
     )
 
@@ -262,10 +263,6 @@ def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
 
 def _at_rate(clock: ClockChoice, period_s: float, why: str) -> ClockChoice:
     return replace(replace(clock, period_s=period_s).at_a_rate(), comments=(*clock.comments, why))
-
-
-def _on_map(one: Evidence) -> bool:
-    return one.poses_from_frames and one.frames is not None and one.frames.localised
 
 
 def _fullness(one: Evidence) -> tuple[int, int, float]:

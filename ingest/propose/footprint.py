@@ -69,6 +69,20 @@ class Footprint:
         """Return whether the lidar is so far beside the middle that its input gives its place."""
         return abs(self.lidar_y_m) > MIN_ASIDE_M
 
+    def with_lidar_at(self, x_m: float, y_m: float, source: str) -> Footprint:
+        """Place the lidar; a guessed outline is enlarged to contain it."""
+        length_m, width_m = self.length_m, self.width_m
+        if not self.measured:
+            length_m, width_m = max(length_m, 2 * abs(x_m)), max(width_m, 2 * abs(y_m))
+        return replace(
+            self,
+            length_m=length_m,
+            width_m=width_m,
+            lidar_x_m=x_m,
+            lidar_y_m=y_m,
+            lidar_source=source,
+        )
+
     @property
     def sane(self) -> bool:
         low, high = SIZES_M
@@ -370,18 +384,7 @@ def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
     source = f"{footprint.lidar_source}, and the pose in its scans"
     if footprint.lidar_x_m is None:
         source = f"by the pose in its scans; that {scans.frame} is the middle is a guess"
-    length, width = footprint.length_m, footprint.width_m
-    if not footprint.measured:  # a guess holds it
-        length, width = max(length, 2 * abs(x)), max(width, 2 * abs(y))
-    return replace(
-        footprint,
-        length_m=length,
-        width_m=width,
-        lidar_x_m=x,
-        lidar_y_m=y,
-        lidar_yaw_rad=yaw,
-        lidar_source=source,
-    )
+    return replace(footprint.with_lidar_at(x, y, source), lidar_yaw_rad=yaw)
 
 
 def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, SeenScans]:
@@ -446,9 +449,8 @@ def with_lidar(
 ) -> Footprint:
     """Add the lidar's place by the last of the recording's transforms, if they say it sanely.
 
-    The base frame is taken for the middle of the outline. A guessed outline is enlarged to contain
-    the lidar. If the lidar is outside a measured one, the base frame is not its middle: then only
-    the lidar's yaw is known.
+    The base frame is taken for the middle of the outline. If the lidar is outside a measured one,
+    it is not: then only the lidar's yaw is known.
     """
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     bases = [
@@ -461,14 +463,10 @@ def with_lidar(
         return footprint
     (x_m, y_m), yaw_rad, upside_down = place
     turned = replace(footprint, lidar_yaw_rad=yaw_rad, upside_down=upside_down)
-    source = f"of {bases[0]}, by transforms; that this is the middle is a guess"
-    if not footprint.measured:
-        sizes = (footprint.length_m, x_m), (footprint.width_m, y_m)
-        length, width = (max(usual, 2 * abs(at)) for usual, at in sizes)
-        turned = replace(turned, length_m=length, width_m=width)
-    elif abs(x_m) > footprint.length_m / 2:
+    if footprint.measured and abs(x_m) > footprint.length_m / 2:
         return replace(turned, lidar_source=f"{bases[0]} has it {x_m:.2f} m ahead, outside")
-    return replace(turned, lidar_x_m=x_m, lidar_y_m=y_m, lidar_source=source)
+    source = f"of {bases[0]}, by transforms; that this is the middle is a guess"
+    return turned.with_lidar_at(x_m, y_m, source)
 
 
 def _place(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.signal_paths import conventions_of, plain
-from restock.ingest.profile.tables import HINDSIGHT, Input, is_motion
+from restock.ingest.profile.tables import HINDSIGHT, Frames, Input, is_motion
 from restock.ingest.propose.candidates import Candidate, candidates
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps, choose_clock
 from restock.ingest.propose.commands import (
@@ -36,9 +36,9 @@ from restock.ingest.propose.footprint import (
     with_lidar,
 )
 from restock.ingest.propose.pose_choice import (
-    FrameGuess,
     MotionChoice,
     choose_motion,
+    on_map,
     pose_series,
     transform_edges,
     transform_frames,
@@ -47,13 +47,11 @@ from restock.ingest.propose.robot_choice import RobotProposal, propose_robot, re
 from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
-    NODE_TOPICS,
     ODOMETRY_AS_COMMAND,
     REQUIRED,
     SPENT,
     Kind,
     Roles,
-    other_robots_topics,
     own_bumpers,
     topics_for,
 )
@@ -120,7 +118,7 @@ class Evidence:
 
     recording: Recording
     roles: Roles
-    frames: FrameGuess | None
+    frames: Frames | None  # that transforms join
     poses_from_frames: bool
     motion: MotionChoice | None  # if no topic has the wheels' speeds
     commands: Commands
@@ -185,7 +183,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
         roles["pose"] = []  # transforms say where it faces, too
     # Odometry drifts: transforms that lead to a map are the better pose.
     drifts = all(is_motion(topic.type) for topic, _ in roles["pose"])
-    framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
+    framed = frames is not None and (on_map(frames) or not roles["pose"]) and drifts
     poses, poses_from = None, ""
     if framed or roles["pose"]:
         poses, poses_from = pose_series(recording, roles, frames if framed else None, edges)
@@ -219,25 +217,27 @@ def gather(recording: Recording, given: Given) -> Evidence:
     robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
-    paces_s = _paces(recording, roles)
-    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces_s, roles, poses))
+    best = {role: fits[0] for role, fits in roles.items() if fits}
+    used = {role: topic.name for role, (topic, _) in best.items()}
+    paces_s = _paces(recording, {*used.values()})
+    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces_s, used, poses))
     motion = None
     if not roles["wheels"] and poses is not None:
         motion = choose_motion(recording, poses, poses_from)
-    best = [(role, *fits[0]) for role, fits in roles.items() if fits]
+    sensors = {used[role] for role in (*REQUIRED, "scan") if role in used}
+    if not commands.measured:
+        sensors.discard(commands.topic)
     clock = choose_clock(
         recording,
-        list(dict.fromkeys(topic.name for _, topic, _ in best)),
-        frozenset(topic.name for role, topic, _ in best if role in LATCHED),
+        list(dict.fromkeys(used.values())),
+        frozenset(name for role, name in used.items() if role in LATCHED),
         gaps,
-        stamped=_stamped(recording, roles, commands),
+        stamped=bool(sensors) and all(STAMP in recording.leaves(name) for name in sensors),
     )
     signals = candidates(
         recording,
-        without={topic.name for role, topic, _ in best if role in SPENT}
-        | NODE_TOPICS
-        | other_robots_topics(recording),
-        used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
+        without={name for role, name in used.items() if role in SPENT},
+        used={(topic.name, path) for topic, kind in best.values() for path in kind.fields.values()},
     )
     return Evidence(
         recording=recording,
@@ -317,9 +317,8 @@ def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
     return replace(seen, motion=motion)
 
 
-def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
-    """Return the usual time between two messages of each topic in use (s, log time)."""
-    names = {fitting[0][0].name for fitting in roles.values() if fitting}
+def _paces(recording: Recording, names: Collection[str]) -> dict[str, float]:
+    """Return the usual time between two messages of each topic (s, log time)."""
     found = {}
     for name, columns in recording.read({name: [] for name in sorted(names)}).items():
         gaps = columns.gaps_s()
@@ -329,21 +328,12 @@ def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
     return found
 
 
-def _slowest_s(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) -> float:
+def _slowest_s(
+    paces: Mapping[str, float], used: Mapping[str, str], poses: PoseSeries | None
+) -> float:
     """Return the time between two messages of pose or wheels, whichever come less often."""
-    names = [
-        fitting[0][0].name for role in ("pose", "wheels") for fitting in [roles[role]] if fitting
-    ]
+    names = [used[role] for role in ("pose", "wheels") if role in used]
     known = [paces[name] for name in names if name in paces]
     if poses is not None and len(poses) > 1 and not names:
         known.append(float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
     return max(known, default=0.0)
-
-
-def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:
-    """Return whether the sensors carry header stamps."""
-    sensors = [
-        fitting[0][0] for role, fitting in roles.items() if fitting and role in (*REQUIRED, "scan")
-    ]
-    sensing = [t for t in sensors if t.name != commands.topic or commands.measured]
-    return bool(sensing) and all(STAMP in recording.leaves(t.name) for t in sensing)

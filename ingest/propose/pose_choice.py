@@ -28,33 +28,24 @@ from restock.ingest.task.task import wrap_angle, yaw_of
 FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 
-@dataclass(frozen=True)
-class FrameGuess:
-    """A fixed frame and the robot's, which transforms join."""
+def on_map(frames: Frames | None) -> bool:
+    """Return whether these frames lead to a map."""
+    return frames is not None and frames.fixed.split("/")[-1] == "map"
 
-    fixed: str
-    base: str
-    localised: bool  # it leads to a map
-    topic: str = Frames().topic
-    static_topic: str = Frames().static_topic
 
-    @property
-    def frames(self) -> Frames:
-        """Return the `[frames]` of a profile."""
-        return Frames(self.fixed, self.base, topic=self.topic, static_topic=self.static_topic)
-
-    def lines(self, *, used: bool) -> list[str]:
-        """Write the `[frames]` of a profile, commented out if it is not `used`."""
-        mark = "" if used else "# "
-        topics = [f'topic = "{self.topic}"', f'static_topic = "{self.static_topic}"']
-        lines = [
-            f"[frames]  # poses from {self.topic}, " + ("" if used else "instead of inputs.pose"),
-            f'fixed = "{self.fixed}"',
-            f'base = "{self.base}"',
-            "max_age_s = 0.5",
-            *(topics if self.topic != Frames().topic else []),
-        ]
-        return [*(mark + line for line in lines), ""]
+def frame_lines(frames: Frames, *, used: bool) -> list[str]:
+    """Write the `[frames]` of a profile, commented out if they are not `used`."""
+    mark, use = ("", "poses") if used else ("# ", "instead of inputs.pose: poses")
+    usual = frames.topic == Frames().topic
+    lines = [
+        f"[frames]  # {use} from {frames.topic}",
+        f'fixed = "{frames.fixed}"',
+        f'base = "{frames.base}"',
+        f"max_age_s = {frames.max_age_s:g}",
+        *([] if usual else [f'topic = "{frames.topic}"']),
+        *([] if usual else [f'static_topic = "{frames.static_topic}"']),
+    ]
+    return [*(mark + line for line in lines), ""]
 
 
 def transform_topics(recording: Recording) -> tuple[str, str]:
@@ -92,7 +83,7 @@ def transform_edges(recording: Recording) -> Edges:
     return Edges.of(frames, recording.read(wanted) if wanted else {})
 
 
-def transform_frames(recording: Recording, edges: Edges) -> FrameGuess | None:
+def transform_frames(recording: Recording, edges: Edges) -> Frames | None:
     """Guess the map's and the robot's frame from transforms (`transform_edges`).
 
     None if they join no such two.
@@ -103,8 +94,8 @@ def transform_frames(recording: Recording, edges: Edges) -> FrameGuess | None:
     for fixed in named_frames(FIXED_FRAMES, frames):
         for base in named_frames(BASE_FRAMES, frames):
             if fixed in upward(base, edges.parents):
-                localised = fixed.split("/")[-1] == "map"
-                return FrameGuess(fixed, base, localised, *transform_topics(recording))
+                topic, static_topic = transform_topics(recording)
+                return Frames(fixed, base, topic=topic, static_topic=static_topic)
     return None
 
 
@@ -158,19 +149,17 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
 
 
 def pose_series(
-    recording: Recording, roles: Roles, frames: FrameGuess | None, edges: Edges
+    recording: Recording, roles: Roles, frames: Frames | None, edges: Edges
 ) -> tuple[PoseSeries, str]:
     """Return every pose at its log time, and its source in words.
 
     `frames` of the transforms `edges`, else the topic for poses.
     """
     if frames is not None:
-        usual = frames.frames
-        edges = edges.only({usual.base, usual.fixed})
+        edges = edges.only({frames.base, frames.fixed})
         segments, _ = align(edges.topics, Clock(alignment="log_time"))
-        tree = Tree(usual, edges, segments)
-        series = PoseSeries.joined(poses_along(tree))
-        return series, f"{frames.fixed} -> {frames.base} of {usual.topic}"
+        series = PoseSeries.joined(poses_along(Tree(frames, edges, segments)))
+        return series, f"{frames.fixed} -> {frames.base} of {frames.topic}"
     topic, kind = roles["pose"][0]
     if kind.by_fix:
         fixes = fixes_in(recording, topic.name, kind.fields)

@@ -11,15 +11,17 @@ import msgspec
 import numpy as np
 
 from restock.errors import visible
+from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import TAKEOVER
+from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.profile.tables import CLOUD, FALLBACKS, SCAN_OF_CLOUD, Input
 from restock.ingest.propose.candidates import camera_lines
 from restock.ingest.propose.clock_choice import ClockChoice
 from restock.ingest.propose.commands import Commands
 from restock.ingest.propose.footprint import DESCRIBED, GUESS, TIGHT_PER_WIDTH, range_lines
 from restock.ingest.propose.gather import Evidence
-from restock.ingest.propose.pose_choice import fix_lines, fix_noise_lines
+from restock.ingest.propose.pose_choice import fix_lines, fix_noise_lines, frame_lines
 from restock.ingest.propose.robot_choice import RobotProposal
 from restock.ingest.propose.roles import (
     KINDS,
@@ -33,6 +35,7 @@ from restock.ingest.propose.roles import (
 )
 from restock.ingest.propose.trial import Advice, Trial
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
+from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Noise, Rewards, Task
@@ -95,7 +98,7 @@ def profile_lines(
         lines += source.toml(seen.commands.wheelbase_m)
     lines += _takeover_lines(seen)
     if seen.frames is not None:
-        lines += seen.frames.lines(used=seen.poses_from_frames)
+        lines += frame_lines(seen.frames, used=seen.poses_from_frames)
     if seen.motion is not None and not seen.motion.problem:
         lines += seen.motion.lines()
     if seen.signals:
@@ -393,6 +396,7 @@ def _input_lines(role: str, fits: Sequence[tuple[TopicInfo, Kind]], seen: Eviden
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
 ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
 MAX_TIME_LIMIT_STEPS = 1000
+MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 MIN_TIGHT_M = 0.05  # a lidar's noise hides what is less
 
 
@@ -411,8 +415,7 @@ def task_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
     actions = actions_of(commands, seen.robot)
     return [
         "[task]",
-        "bump_terminates = true  # a protective stop"
-        + ("" if roles["bumper"] else "; no bumper seen: in the twin, any contact is one"),
+        _bump_line(seen.recording, roles["bumper"]),
         *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
         *_time_limit_lines(seen, max(speed for speed, _ in actions)),
@@ -476,6 +479,20 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(v, side * 0.99 * w) for v, w in curves for side in (1, -1)]
     return actions + [(-back, 0.0) for back in commands.reverse_mps]
+
+
+def _bump_line(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> str:
+    """Let a bumper stop the robot, unless it is pressed too often to be one."""
+    if not fits:
+        return "bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"
+    topic, kind = fits[0]
+    wanted = field_paths(Input(topic.name, topic.type, kind.fields))
+    columns = recording.read({topic.name: wanted})[topic.name]
+    pressed = pressed_in(columns.fields, kind.fields["pressed"], len(columns))
+    if len(pressed) and pressed.mean() > MOSTLY_FREE and not kind.at_changes:
+        share = f"{pressed.mean():.0%} of its messages"
+        return f"# bump_terminates = true  # CHECK the bumper: it is pressed in {share}"
+    return "bump_terminates = true  # a protective stop"
 
 
 def _body_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:

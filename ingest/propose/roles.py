@@ -225,12 +225,8 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
 
     Topics of Restock's node and of other robots are left out.
     """
-    others = other_robots_topics(recording)
-    return {
-        name: topic
-        for name, topic in _readable(recording)
-        if name not in NODE_TOPICS and name not in others
-    }
+    found = {name: topic for name, topic in _readable(recording) if name not in NODE_TOPICS}
+    return {name: found[name] for name in own_first(recording, found)}
 
 
 @dataclass
@@ -308,12 +304,6 @@ def _namespaces(recording: Recording) -> dict[str, _Namespace]:
         for namespace in beside if len(beside) > 1 else ():
             found[namespace].shared.add(kind)
     return dict(found)
-
-
-def other_robots_topics(recording: Recording) -> set[str]:
-    """Return the topics of the other robots in a recording."""
-    others = tuple(f"{robot}/" for robot in robots_in(recording)[1:])
-    return {name for name in recording.topics if name.startswith(others)}
 
 
 def own_first(recording: Recording, names: Iterable[str]) -> list[str]:

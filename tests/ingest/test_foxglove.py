@@ -84,7 +84,7 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, capsys):
         messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
     path = write_robot(tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda one: one[0]))
     toml = proposed(path, capsys)
-    assert "fixes of 0.02 m, mostly" in toml
+    assert "Fixes of 0.02 m, mostly" in toml
     assert parse_profile(toml, where="p").inputs.pose.topic == "/gps/fix"
     steps = steps_in(path, toml)
     usable = np.array([problem == "" for problem in steps.problem])

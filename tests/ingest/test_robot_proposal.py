@@ -99,7 +99,7 @@ def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (robot(), "'test' has no wheels: none of its joints (none)"),
+        (robot(), "'test' has no wheels: no joint of it turns without end"),
         (robot(wheels((0, 0.2), (0.1, 0.2))), "no driven pair on both sides"),
     ],
 )

@@ -18,7 +18,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import AXES, FRAME_ID, TURN, plain, transform_fields
 from restock.ingest.profile.tables import Frames
-from restock.ingest.propose.pose_choice import transform_edges, transform_frames
+from restock.ingest.propose.pose_choice import on_map, transform_edges, transform_frames
 from restock.ingest.propose.roles import KINDS, topics_for
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import PARENT, Edges, rotations
@@ -130,14 +130,13 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     guess = transform_frames(recording, transform_edges(recording))
     along = None
     if guess is not None:
-        along = along_transforms(recording, guess.frames)
+        along = along_transforms(recording, guess)
     kinds = topics_for(recording, KINDS["pose"])
     fixes = {topic.name: kind.fields for topic, kind in kinds if kind.by_fix}
     found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
     if not found and along is None:  # another frame than anything else's, and no heading
         found = [p for name, of in fixes.items() for p in [_by_fixes(recording, name, of)] if p]
-    localised = guess is not None and guess.localised
-    return [p for p in ((along, *found) if localised else (*found, along)) if p is not None]
+    return [p for p in ((along, *found) if on_map(guess) else (*found, along)) if p is not None]
 
 
 def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) -> Poses | None:
