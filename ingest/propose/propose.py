@@ -105,9 +105,14 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     advice = [*advice_of(seen), *trial.advice]
     return Proposal(
         "\n".join(profile_lines(seen, name, problems, trial, advice)),
-        *(recording.path, missing, len(seen.signals)),
-        *(trial.ticks, trial.transitions, problems, advice),
-        several_commands(recording),
+        recording.path,
+        missing=missing,
+        signals=len(seen.signals),
+        ticks=trial.ticks,
+        transitions=trial.transitions,
+        problems=problems,
+        advice=advice,
+        commands=several_commands(recording),
         findings=trial.findings,
         wheeled=other is None,
     )
