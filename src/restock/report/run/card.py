@@ -15,11 +15,10 @@ from typing import Any
 import msgspec
 
 from restock.files import write_text
-from restock.replay.sampling.rules import RULES
 from restock.report.look import write
-from restock.report.look.blocks import Rows, Section, Table, cell, estimate, shown, words
+from restock.report.look.blocks import Rows, Section, Table, estimate, shown
 from restock.report.run.facts import Facts, evaluation_bias, gather
-from restock.report.run.page import AGES, FED, POLICIES, PRACTICE
+from restock.report.run.page import AGES, FED, POLICIES, PRACTICE, feed_rules, in_words
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"
@@ -59,33 +58,16 @@ def write_card(run: Path) -> tuple[dict[str, Any], str]:
 def replay_card(facts: Facts) -> dict[str, Any]:
     """Return the card as JSON values, with null for what the run does not say."""
     settings = facts.config.get("config", {})
-    replay, teacher = settings.get("replay", {}), settings.get("teacher", {})
-    panel = facts.panel
+    teacher, panel = settings.get("teacher", {}), facts.panel
     mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None
     logs = [row for row in facts.sampled if row["source"] == "logs"]
     return {
         "format": FORMAT,
         "run": str(facts.run),
         "policy": None if facts.policy is None else facts.policy.document,
-        "capacity": {
-            "ring_rows": replay.get("ring_capacity"),
-            "panel_rows": len(panel) if panel is not None else None,
-            "panel": (facts.config.get("panel") or {}).get("id"),
-            "store_version": panel.header.store_version if panel is not None else None,
-        },
-        "sampling": {
-            "batch_size": replay.get("batch_size"),
-            "logs_share": _drawn_share(facts, "logs"),
-            "logs": _rule(mixture),
-            "fresh": _fresh_rule(facts, mixture),
-            "n_step": {
-                "logs": panel.n_step if panel is not None else None,
-                "fresh": settings.get("loss", {}).get("n_step"),
-            },
-        },
+        **feed_rules(facts),
         "fed": _columns(facts.fed, *FED, "drawn_rows"),
         "ages": facts.ages,
-        "target": facts.config.get("target") or settings.get("target"),
         "conditions": _columns(facts.conditions, *_CONDITIONS),
         "strata": _columns(
             facts.sampled,
@@ -146,7 +128,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         for row in card["off_policy"]
     ]
     tables = {
-        "What it was": [{"of the run": name, "": _words(value)} for name, value in facts.items()],
+        "What it was": [{"of the run": name, "": in_words(value)} for name, value in facts.items()],
         "Quotas of the batch, and what filled them (shares of all rows fed)": shown(
             card["fed"], FED
         ),
@@ -170,43 +152,5 @@ def as_markdown(card: dict[str, Any]) -> str:
     )
 
 
-def _rule(mixture: dict[str, Any] | None) -> str | None:
-    """Say how the logged part of a batch is drawn."""
-    if mixture is None:
-        return None
-    name = str(mixture.get("within", "uniform"))
-    within = RULES[name].doc if name in RULES else name
-    cap = mixture.get("max_replays_per_row")
-    most = f", a row at most {cap:g} times" if cap else ""
-    return f"quotas by stratum, within one {within}{most}"
-
-
-def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
-    """Say how the fresh part of a batch was drawn; None if there was none."""
-    if not _drawn_share(facts, "fresh"):
-        return None
-    rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
-    by_quota = any(rule.get("share", "natural") != "natural" for rule in rules)
-    return "quotas by stratum, each of its rows alike" if by_quota else "uniform over the ring"
-
-
-def _drawn_share(facts: Facts, source: str) -> float | None:
-    rows = sum(row["drawn_rows"] for row in facts.sampled)
-    of_source = sum(row["drawn_rows"] for row in facts.sampled if row["source"] == source)
-    return of_source / rows if rows else None
-
-
 def _columns(rows: Rows, *names: str) -> Rows:
     return [{name: row[name] for name in names} for row in rows]
-
-
-def _words(value: Any, name: str = "") -> str:
-    """Write a small document for people."""
-    if isinstance(value, dict):
-        parts = [f"{words(key)} {_words(item, key)}" for key, item in value.items()]
-        return ", ".join(parts) or "none"
-    if isinstance(value, list | tuple):
-        return " and ".join(map(_words, value)) or "none"
-    if value is None or isinstance(value, bool):
-        return "yes" if value else "no" if value is False else "none"
-    return cell(name, value)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import base64
 from typing import Any
 
+import msgspec
 from markupsafe import Markup
 
 from restock.errors import RestockError, counted, policy_words
 from restock.files import read_json
 from restock.replay.plan.exclusions import DAY_NS
+from restock.replay.sampling.rules import RULES
 from restock.report.look import charts, floor_map
-from restock.report.look.blocks import Figure, Rows, Section, Table, pretty, shown, words
+from restock.report.look.blocks import Figure, Rows, Section, Table, cell, pretty, shown, words
 from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
 from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
@@ -138,6 +140,13 @@ def sampled(facts: Facts) -> Section:
         tables=[
             Table(shown(facts.fed, FED)),
             Table(
+                [
+                    {"of the run": key, "": in_words(rule)}
+                    for key, rule in feed_rules(facts).items()
+                ],
+                title="By which rules",
+            ),
+            Table(
                 shown(facts.ages, AGES),
                 title="How old the sampled rows were",
                 caption="Upper ends of log2 buckets: days before training began for logs"
@@ -146,6 +155,71 @@ def sampled(facts: Facts) -> Section:
             Table(shown(facts.policies, POLICIES), title="Who drove the sampled rows"),
         ],
     )
+
+
+def feed_rules(facts: Facts) -> dict[str, Any]:
+    """Return capacity, sampling rule and target rule, with null for what the run does not say."""
+    settings, panel = facts.config.get("config", {}), facts.panel
+    replay = settings.get("replay", {})
+    mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None
+    return {
+        "capacity": {
+            "ring_rows": replay.get("ring_capacity"),
+            "panel_rows": len(panel) if panel is not None else None,
+            "panel": (facts.config.get("panel") or {}).get("id"),
+            "store_version": panel.header.store_version if panel is not None else None,
+        },
+        "sampling": {
+            "batch_size": replay.get("batch_size"),
+            "logs_share": _drawn_share(facts, "logs"),
+            "logs": _rule(mixture),
+            "fresh": _fresh_rule(facts, mixture),
+            "n_step": {
+                "logs": panel.n_step if panel is not None else None,
+                "fresh": settings.get("loss", {}).get("n_step"),
+            },
+        },
+        "target": facts.config.get("target") or settings.get("target"),
+    }
+
+
+def _rule(mixture: dict[str, Any] | None) -> str | None:
+    """Say how the logged part of a batch is drawn."""
+    if mixture is None:
+        return None
+    name = str(mixture.get("within", "uniform"))
+    within = RULES[name].doc if name in RULES else name
+    cap = mixture.get("max_replays_per_row")
+    most = f", a row at most {cap:g} times" if cap else ""
+    return f"quotas by stratum, within one {within}{most}"
+
+
+def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
+    """Say how the fresh part of a batch was drawn; None if there was none."""
+    if not _drawn_share(facts, "fresh"):
+        return None
+    rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
+    by_quota = any(rule.get("share", "natural") != "natural" for rule in rules)
+    return "quotas by stratum, each of its rows alike" if by_quota else "uniform over the ring"
+
+
+def _drawn_share(facts: Facts, source: str) -> float | None:
+    rows = sum(row["drawn_rows"] for row in facts.sampled)
+    of_source = sum(row["drawn_rows"] for row in facts.sampled if row["source"] == source)
+    return of_source / rows if rows else None
+
+
+def in_words(value: Any, name: str = "", *, inside: bool = False) -> str:
+    """Write a small document for people."""
+    if isinstance(value, dict):
+        between, after = (", ", " ") if inside else ("; ", ": ")
+        parts = [f"{words(key)}{after}{in_words(v, key, inside=True)}" for key, v in value.items()]
+        return between.join(parts) or "none"
+    if isinstance(value, list | tuple):
+        return " and ".join(map(in_words, value)) or "none"
+    if value is None or isinstance(value, bool):
+        return "yes" if value else "no" if value is False else "none"
+    return cell(name, value)
 
 
 def _newest(facts: Facts) -> str:
