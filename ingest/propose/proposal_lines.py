@@ -51,14 +51,9 @@ def profile_lines(
     trial: Trial | None = None,
     advice: Sequence[Advice] = (),
 ) -> list[str]:
-    """Write the TOML of a profile.
+    """Write the TOML of a profile, with each piece of `advice` as a comment at its table.
 
-    Args:
-        seen: what the profile rests on.
-        name: of the profile.
-        problems: why it cannot be used, for its first lines.
-        trial: what it made of the recording.
-        advice: comments; each is written at the table of its key.
+    `problems` say why it cannot be used; `trial` is what it made of the recording.
     """
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
@@ -79,7 +74,6 @@ def profile_lines(
         "",
         *task_lines(seen, advice),
         *seen.goal.table_lines(),
-        *_notes(advice, "robot"),
         *seen.robot.limited(*seen.commands.reached).lines(
             outline_guessed=not seen.footprint.measured
         ),
