@@ -117,10 +117,15 @@ def _shuffled(values: Any) -> Any:
     return np.random.default_rng(0).permutation(values)
 
 
-def _twice(rows: FedRows) -> FedRows:
-    again: Any = np.flatnonzero(rows.episode < 3)
+def _tilted(held: Any, at: int) -> None:
+    held[:, at] += 0.1  # of 5 m/s2
+
+
+def _twice(rows: FedRows, from_step: int = 0) -> FedRows:
+    again: Any = np.flatnonzero((rows.episode < 3) & (rows.step >= from_step))
     both = rows.take(np.append(np.arange(len(rows)), again))
     both.episode[len(rows) :] += rows.episode.max() + 1
+    both.step[len(rows) :] -= from_step
     return both
 
 
@@ -154,6 +159,11 @@ PLANTED: dict[str, tuple[Plant, str]] = {
     "a gyroscope with a bias": (lambda rows: _gyroscope(rows, 1, 0.1), "SENSOR_BIASED"),
     "a heading 8 degrees off": (lambda rows: _added(rows, "lateral_speed", "localised_speed", 0.14),
                                 "SENSOR_TURNED"),
+    "a pose .2 m ahead of the centre": (
+        lambda rows: _added(rows, "lateral_speed", "gyro_yaw_rate", 0.2), "SENSOR_OFF_CENTRE"),
+    "an inertial unit that is tilted": (lambda rows: _entries(rows, _tilted, "accel_x"),
+                                        "SENSOR_BIASED"),
+    "one robot's pieces again": (lambda rows: _twice(rows, from_step=10), "EPISODES_REPEATED"),
     "a lidar's ranges halved": (lambda rows: _lidar(rows, lambda seen: seen / 2), "LIDAR_SCALED"),
     "left and right in half of the rows": (
         lambda r: _acted(r, np.where(_shuffled(r.step % 2 > 0), _swapped(r).action, r.action)),
@@ -320,6 +330,49 @@ def _at_ends(rows: FedRows) -> FedRows:
     return replace(rows, next_observation=after)
 
 
+def _repeated_at_ends(rows: FedRows) -> FedRows:
+    after = rows.next_observation.copy()
+    after[rows.last] = rows.observation[rows.last]
+    return replace(rows, next_observation=after)
+
+
+def _open_loop(rows: FedRows) -> FedRows:
+    """Report the command as the wheels' speed, after the step and before the next one."""
+    at = rows.task.observation_names.index("wheel_speed")
+    observation, after = rows.observation.copy(), rows.next_observation.copy()
+    after[:, at] = rows.command()[:, 0]
+    before, known = rows.before(1)
+    observation[known, at] = after[before[known], at]
+    return replace(rows, observation=observation, next_observation=after)
+
+
+def _slow_and_wrong(rows: FedRows) -> FedRows:
+    """Hold a gyroscope for four steps, at values of other rows."""
+    row = np.arange(len(rows)) // 4 * 4
+    return _in_time(rows, "gyro_yaw_rate", lambda one: np.roll(one, 99)[row])
+
+
+def _without_returns(seen: Any) -> Any:
+    zero = np.random.default_rng(0).random(seen.shape) < 0.1
+    return np.where((seen > 3.99) & zero, 0.0, seen)
+
+
+def _cut_by_goals(rows: FedRows) -> FedRows:
+    """Cut every other episode of a robot; its next one goes on in the next step."""
+    cut = rows.last & (rows.episode % 8 < 4)
+    steps = np.where(rows.last & ~cut, 50, 1) * (rows.robot == "r1")
+    begins = (1 + np.cumsum(steps) - steps) * round(1e9 * rows.task.control_period_s)
+    return replace(rows, logged_ns=begins, terminated=rows.terminated & ~cut,
+                   truncated=rows.truncated | cut)  # fmt: skip
+
+
+def _proposed(rows: FedRows) -> FedRows:
+    table = np.asarray(rows.task.actions)
+    proposed = np.stack([rows.now("nav_speed"), rows.now("nav_yaw_rate")], axis=1)
+    away = np.abs(proposed[:, None] - table) / np.abs(table).max(axis=0)
+    return _acted(rows, away.sum(axis=2).argmin(axis=1))
+
+
 def _clipped(held: Any, at: int) -> None:
     held[:, at] = held[:, at].clip(-0.5, 0.5)
 
@@ -347,6 +400,14 @@ PART_OF: dict[str | None, tuple[Plant, str]] = {
     "jumps": (lambda r: _in_time(r, "localised_speed",
                                  lambda one: one + 2.5 * (r.step % 20 == 9)),
               "logs' pose does not follow the other signals: there it has single values"),
+    "copied": (_open_loop, "wheels (speed) are exactly the command"),
+    "opposite": (lambda r: _gyroscope(r, np.where(r.episode % 8 < 4, -1.0, 1.0)),
+                 "the sign of the logs' gyroscope is opposite"),
+    "not held": (_slow_and_wrong, "the logs' gyroscope does not follow"),
+    "no returns": (lambda r: _lidar(r, _without_returns), "the logs' lidar reads 0"),
+    "goals": (_cut_by_goals, "another goal is in force before the goal is reached"),
+    "proposals": (_proposed, "of the actions of 'planner' are navigation's proposals"),
+    "ends again": (_repeated_at_ends, "it repeats the row's own observation"),
     "rewards": (lambda r: replace(r, reward=np.where(r.step % 3, r.reward, np.roll(r.reward, 1))),
                 "are not exactly the task's rewards"),
     "ends": (_at_ends, "the last next observation does not follow from its row"),
@@ -359,7 +420,9 @@ def test_what_lasts_for_a_part_is_named_beside_other_robots(logs, twin, fault, m
     monkeypatch.setattr(before_training, "MIN_ROWS", 300)
     plant, said = PART_OF[fault]
     robot = np.array([f"r{one}" for one in logs.episode % 4])
-    fleet = replace(logs, recording=robot, robot=robot)
+    driver = np.full(len(logs), "planner")
+    stamp_ns = 10**12 * (1 + logs.episode) + 10**9 * logs.step
+    fleet = replace(logs, recording=robot, robot=robot, driver=driver, logged_ns=stamp_ns)
     faulty = plant(fleet)
     parts = [(faulty if name == "r1" else fleet).take(robot == name) for name in np.unique(robot)]
     together = replace(parts[0], **{

@@ -154,7 +154,9 @@ SlipLeftOut = Literal["episodes", "rows", "none"]
 GAIN = 1.2  # of logs over the twin's, or its inverse: robots answer differently
 ALIKE = 1.05  # of two sensors that measure one motion
 BIAS_RADPS, TURN_RADPS = 0.02, 0.06  # of a turn by one sensor where another, or an action, has none
+BIAS_MPS2 = 0.2
 SIDEWAYS = 0.06  # of the way forward, about 3 degrees
+ARM_M = 0.06  # from where the robot turns to where its pose is
 STRAYED = 0.05  # of the missions
 _STRAIGHT_RADPS = 0.15
 
@@ -168,9 +170,11 @@ class Relation:
     y: str
     lags: Ints
     of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
-    gain: float | None = 1.0  # by definition, where there is no twin to ask; 0: in no twin either
+    gain: float | None = 1.0  # by definition, where there is no twin to ask
+    zero: str = ""  # instead of a gain, a figure of this name, which is 0 in the twin too
     most: float = GAIN  # times the twin's gain, or its inverse
     offset: float = math.inf  # most of y where x is 0, less the twin's, in y's unit
+    unit: str = "m/s"  # of y
 
     def fit(
         self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
@@ -272,6 +276,12 @@ def _sideways(rows: FedRows) -> tuple[F64, F64]:
     return forward, np.where(straight & (aside != 0.0), aside, np.nan)  # 0: there was no new pose
 
 
+def _swinging(rows: FedRows) -> tuple[F64, F64]:
+    """Return the yaw rate, and the pose's speed sideways."""
+    aside = rows.after("lateral_speed")
+    return rows.after("gyro_yaw_rate"), np.where(aside != 0.0, aside, np.nan)
+
+
 def _gained(rows: FedRows) -> F64:
     """Return the acceleration of the wheels over the step, m/s2."""
     change = rows.after("wheel_speed") - rows.now("wheel_speed")
@@ -324,21 +334,27 @@ RELATIONS = (
     Relation("speed of the pose to the action", ACTION_SPEED, POSE, COMMANDS,
              lambda rows: (rows.command()[:, 0], rows.after("localised_speed"))),
     Relation("yaw rate of the gyroscope to the action", ACTION_TURN, GYROSCOPE, COMMANDS,
-             lambda rows: (rows.command()[:, 1], rows.after("gyro_yaw_rate")), offset=TURN_RADPS),
+             lambda rows: (rows.command()[:, 1], rows.after("gyro_yaw_rate")), offset=TURN_RADPS,
+             unit="rad/s"),
     Relation("yaw rate of the wheels to the action", ACTION_TURN, WHEEL_TURN, COMMANDS,
-             lambda rows: (rows.command()[:, 1], wheel_turn(rows)), offset=TURN_RADPS),
+             lambda rows: (rows.command()[:, 1], wheel_turn(rows)), offset=TURN_RADPS,
+             unit="rad/s"),
     Relation("speed of the pose to the wheels", WHEEL_SPEED, POSE, SENSORS,
              lambda rows: (rows.after("wheel_speed"), rows.after("localised_speed")),
              most=ALIKE),
     Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
              lambda rows: (rows.after("gyro_yaw_rate"), wheel_turn(rows)),
-             most=ALIKE, offset=BIAS_RADPS),
+             most=ALIKE, offset=BIAS_RADPS, unit="rad/s"),
     Relation("yaw rate of the pose to the gyroscope", GYROSCOPE, POSE, SENSORS,
-             lambda rows: (rows.after("gyro_yaw_rate"), _pose_turn(rows)), offset=BIAS_RADPS),
+             lambda rows: (rows.after("gyro_yaw_rate"), _pose_turn(rows)), offset=BIAS_RADPS,
+             unit="rad/s"),
     Relation("motion of the pose to its heading", POSE, POSE, NOW, lambda rows: _sideways(rows),
-             0.0, SIDEWAYS),
+             zero="turn", most=SIDEWAYS),
+    Relation("motion of the pose to its turn", POSE, POSE, NOW, lambda rows: _swinging(rows),
+             zero="arm", most=ARM_M),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
-             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
+             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None,
+             offset=BIAS_MPS2, unit="m/s2"),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
              lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), None),
     Relation("remaining distance to the speed of the pose", POSE, PLAN, PLANS,
@@ -354,6 +370,7 @@ NOISY_GAIN = 2.0  # of relations that are no measurement of the same thing
 DELAY_STEPS = 0.6
 LATEST_STEPS = 2.0  # without a twin: how late a robot may answer to its commands
 UNEXPLAINED = 0.2
+_LEFT = 0.5  # most of two measurements of the same thing, with a twin or without
 NOISY_UNEXPLAINED = 0.4  # where it depends on who drives, and where
 _KNOWN_GAIN = 0.3  # of logs over the twin's, for a delay to mean something
 HELD = 3  # steps of one action in a row, for its motion to be that action's
@@ -361,6 +378,15 @@ _MIN_HELD = 15
 _AWAY = 0.25  # of the fastest action on each axis
 _MAX_ROWS = 0.8  # of an action's, those with the motion of one other
 TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and what it leaves out
+
+
+@dataclass(frozen=True)
+class Broken:
+    """The stretches of a robot's drives in which a relation does not hold."""
+
+    off_by: float  # root mean square in these stretches, in the unit of y
+    usually: float  # and in the other robots'
+    mended: dict[str, tuple[float, float]]  # by cause: its size, and the share that it mends
 
 
 @dataclass(frozen=True)
@@ -373,11 +399,17 @@ class Answer:
     delay: float  # logs less twin, steps
     rows: FedRows | None = None  # of the logs, if these can be compared with other robots'
     found: Response | None = None
-    shape: tuple[str, float] | None = None  # what happens in some stretches only, and by how much
+    broken: Broken | None = None  # in some stretches, beside other robots
 
     @property
     def off(self) -> bool:
         return any(one.off for one in self.comparisons)
+
+    @property
+    def holds(self) -> bool:
+        """Return whether a scale, a delay and a zero of its own make the relation hold."""
+        left = self.found.unexplained if self.found is not None else 0.0
+        return not self.is_off("unexplained") and (self.relation.gain is None or left <= _LEFT)
 
     @property
     def fine(self) -> bool:
@@ -412,10 +444,12 @@ def _answer(
         of_twin[kept] = relation.fit(twin, rng, leave_out)
     expected = of_twin.get(kept)
     name, what = relation.name, f"answer of the {relation.name}"
-    if found is not None and relation.gain == 0.0:
-        turned = interval_of(found.gain, found.gains, found.clusters)
-        row = judged(f"turn: {name}", what, "difference", turned, logs=found.gain, twin=0.0,
-                     least=-relation.most, most=relation.most, logs_rows=found.rows)  # fmt: skip
+    if found is not None and relation.zero:
+        figure = interval_of(found.gain, found.gains, found.clusters)
+        row = judged(
+            f"{relation.zero}: {name}", what, "difference", figure, logs=found.gain, twin=0.0,
+            least=-relation.most, most=relation.most, logs_rows=found.rows,
+        )  # fmt: skip
         return Answer(relation, (row,), 1.0, 0.0)
     if found is None or (twin is not None and expected is None):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")

@@ -26,7 +26,7 @@ from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.judge.answers import Answer, TwinFits, answers, permuted_actions
-from restock.train.judge.beside import beside_others, signals_beside
+from restock.train.judge.beside import beside_others
 from restock.train.judge.causes import Finding, findings
 from restock.train.judge.fed_rows import (
     Comparison,
@@ -382,11 +382,11 @@ def diagnose_rows(
     ]  # fmt: skip
     for kind in {part.kind for part in parts[1:]}:
         inside = [place for place, part in enumerate(parts) if part.kind == kind]
-        beside = zip(*(checked[place].answers for place in inside), strict=True)
-        for place, own in zip(inside, zip(*map(beside_others, beside), strict=True), strict=True):
-            checked[place] = replace(checked[place], answers=list(own))
-        of_signals = signals_beside([parts[place].rows for place in inside])
-        for place, more_of_it in zip(inside, of_signals, strict=True):
+        relations, of_values = beside_others(
+            [parts[place].rows for place in inside], [checked[place].answers for place in inside]
+        )
+        for place, own, more_of_it in zip(inside, relations, of_values, strict=True):
+            checked[place] = replace(checked[place], answers=own)
             checked[place].others.extend(more_of_it)
     checked = [
         one.corrected(comparisons)

@@ -7,7 +7,7 @@ a drive shows in its stretches, and one that replaces values shows in how these 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.stats import ConfidenceInterval
 from restock.train.judge import answers as ends
-from restock.train.judge.answers import Answer, Relation, lagged, wheel_turn
+from restock.train.judge.answers import Answer, Broken, Relation, lagged, wheel_turn
 from restock.train.judge.fed_rows import Comparison, FedRows, judged, shares_compared
 from restock.train.judge.row_checks import implied_reward
 
@@ -23,13 +23,36 @@ MIN_BESIDE = 4  # robots or recordings, for one to be the odd one out
 _ALIKE = 0.75  # of the others, for what they agree on to be the measure
 GAIN, ANSWER, NOISY = 1.02, 1.15, 1.25  # of two sensors of one motion, of commands, of the others
 _DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # most beside the others; the latter of the mean square
+OddRows = dict[tuple[str, str], Bools]  # (N,) of a robot, by the kind of tally and the signal
 
 
-def beside_others(answers: Sequence[Answer]) -> list[Answer]:
+def beside_others(
+    parts: Sequence[FedRows], answers: Sequence[Sequence[Answer]]
+) -> tuple[list[list[Answer]], list[list[Comparison]]]:
+    """Compare robots: each one's relations and repeated values with those of the others.
+
+    Returns the answers of each robot with these comparisons, and the comparisons of its values.
+    """
+    if len(parts) < MIN_BESIDE:
+        return [list(one) for one in answers], [[] for _ in parts]
+    each = [_largest(tallies(rows)) for rows in parts]
+    values = _signals_beside(each)
+    off = [{row.check for row in of_part if row.off} for of_part in values]
+    odd = [
+        {
+            key: one.rows
+            for key, one in of_part.items()
+            if "".join(key) in names and one.rows is not None
+        }
+        for of_part, names in zip(each, off, strict=True)
+    ]
+    relations = [_relation_beside(list(one), odd) for one in zip(*answers, strict=True)]
+    return [list(one) for one in zip(*relations, strict=True)], values
+
+
+def _relation_beside(made: list[Answer], odd: Sequence[OddRows]) -> list[Answer]:
     """Compare one relation in several robots: each with the middle of the others."""
-    made = list(answers)
-    if len(made) < MIN_BESIDE:
-        return made
+    answers = tuple(made)
     for figure, least, most in _allowed(answers[0].relation):
         rows = [_of_figure(one, figure) for one in answers]
         for place, own in enumerate(rows):
@@ -43,7 +66,7 @@ def beside_others(answers: Sequence[Answer]) -> list[Answer]:
                     made[place] = replace(made[place], gain=beside.effect)
                 elif figure == "delay":
                     made[place] = replace(made[place], delay=beside.effect)
-    return made if answers[0].relation.lags is ends.NOW else _stretches(made)
+    return made if answers[0].relation.lags is ends.NOW else _stretches(made, odd)
 
 
 def _allowed(relation: Relation) -> list[tuple[str, float, float]]:
@@ -106,12 +129,11 @@ def _only_off(row: Comparison) -> Comparison:
 _WINDOW = 10  # steps of a stretch
 _USUAL, _BROKEN = 0.98, 2.0  # a stretch is broken beyond this quantile of the others', times
 _IN_PART = 0.05  # of the stretches, beyond the others'
-_SPIKE, _FEW = 9.0, 0.35  # times the median square; of the rows in a broken stretch
-_SHIFTS = 10  # steps
-_EXPLAINED, _EXPLAINED_TOO = 0.5, 0.9  # of what is left, with what is said of broken stretches
+_FEW = 0.25  # of the rows in broken stretches, if single values are to be far off
+_STEPS = (*range(-10, 0), *range(1, 11))  # of a shift
 
 
-def _stretches(answers: list[Answer]) -> list[Answer]:
+def _stretches(answers: list[Answer], odd: Sequence[OddRows]) -> list[Answer]:
     """Compare in how many stretches of a drive each robot's relation breaks, beside the others'.
 
     All are held against one response: the middle of the robots' own.
@@ -128,28 +150,45 @@ def _stretches(answers: list[Answer]) -> list[Answer]:
         for place, one in enumerate(answers)
         if one.rows is not None
     }
-    usually = np.median([one.moves.mean() for one in drives.values() if len(one.moves)] or [0.0])
-    errors = {place: one.relative_error(float(usually)) for place, one in drives.items()}
+    usually = float(np.median([one.moves.mean() for one in drives.values() if len(one.moves)] or 0))
+    errors = {place: one.relative_error(usually) for place, one in drives.items()}
     for place, drive in drives.items():
-        others = np.concatenate([error for other, error in errors.items() if other != place])
-        if not len(others) or not len(errors[place]):
+        others = [other for other in drives if other != place]
+        error = np.concatenate([errors[other] for other in others])
+        if not len(error) or not len(errors[place]):
             continue
-        most = _BROKEN * np.quantile(others, _USUAL)
-        broken, usual = errors[place] > most, int((others > most).sum())
+        most = _BROKEN * float(np.quantile(error, _USUAL))
+        broken = errors[place] > most
         row = _only_off(
             shares_compared(
                 f"stretches: {relation.name}",
                 f"stretch of {_WINDOW} steps without the answer of {relation.name}",
                 (int(broken.sum()), len(broken)),
-                (usual, len(others)),
+                (int((error > most).sum()), len(error)),
                 -1.0,
                 _IN_PART,
             )
         )
         one = answers[place]
-        shape = drive.shape(broken) if row.off else None
-        answers[place] = replace(one, comparisons=(*one.comparisons, row), shape=shape)
+        found = None
+        if row.off:
+            usual = np.concatenate([drives[other].left for other in others]).mean()
+            mended = drive.mended(broken, most, usually, _of_ends(relation, odd[place]))
+            found = Broken(drive.left[broken].mean() ** 0.5, usual**0.5, mended)
+        answers[place] = replace(one, comparisons=(*one.comparisons, row), broken=found)
     return answers
+
+
+def _of_ends(relation: Relation, odd: OddRows) -> dict[str, Bools]:
+    """Return the rows (N,) that odd values of the relation's signals are part of, by check."""
+    found = {}
+    for (kind, signal), rows in odd.items():
+        after, before = np.append(rows[1:], False), np.append(False, rows[:-1])
+        if signal == relation.x:  # what follows from it depends on rows around it, too
+            found[kind + signal] = rows | after | before
+        elif signal == relation.y:  # a motion of the pose is between two poses
+            found[kind + signal] = rows | (after & (signal == ends.POSE))
+    return found
 
 
 @dataclass(frozen=True)
@@ -190,53 +229,64 @@ class Stretches:
         """Return how far off each stretch is (W,), over how much it moves and is usual to move."""
         return np.sqrt(self.left / np.maximum(self.moves + usually, 1e-12))
 
-    def shape(self, broken: Bools) -> tuple[str, float] | None:
-        """Return what explains the broken stretches, and by how much it does.
-
-        That is the best of `_explanations`; "spikes" or "unlike" if none is good, and None if the
-        best explains the other stretches as well.
+    def mended(
+        self, broken: Bools, most: float, usually: float, odd: Mapping[str, Bools]
+    ) -> dict[str, tuple[float, float]]:
+        """Return what could explain broken stretches: its size, and the share that holds with it.
 
         Args:
             broken: (W,)
+            most: relative error up to which a stretch holds.
+            odd: rows (N,) whose values are odd by themselves, by check: without them, it may hold.
         """
         inside = broken[self.stretch]
-        measured = self.measured[self.at]
-        square = (measured - self.expected[self.at]) ** 2
-
-        def left(values: F64, rows: Bools) -> float:
-            """Return the part of the error that is left with other expected values."""
-            rows = rows & np.isfinite(values)
-            error = float(((measured - values)[rows] ** 2).sum())
-            return error / max(float(square[rows].sum()), 1e-12)
-
-        explained = self._explanations(inside)
-        best = min(explained, key=lambda one: left(explained[one], inside))
-        if left(explained[best], inside) <= _EXPLAINED:
-            return None if left(explained[best], ~inside) < _EXPLAINED_TOO else best
-        far = square > _SPIKE * np.median(square[inside])
-        is_few = far[inside].mean() < _FEW
-        most_of_it = square[inside & ~far].sum() < _EXPLAINED * square[inside].sum()
-        return ("spikes", float(far.mean())) if is_few and most_of_it else ("unlike", 0.0)
-
-    def _explanations(self, inside: Bools) -> dict[tuple[str, float], F64]:
-        """Return what a scale, a bias or a delay would let one expect, (n,) each, with its size.
-
-        Scale and bias are those of the rows `inside` (n,).
-        """
         expected, measured = self.expected[self.at], self.measured[self.at]
         p, y = expected[inside], measured[inside]
         scale = float(p @ y) / max(float(p @ p), 1e-12)
         bias = float((y - p).mean())
-        made = {("scaled", scale): expected * scale, ("biased", bias): expected + bias}
-        for steps in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
-            row = np.clip(self.at - steps, 0, len(self.expected) - 1)
-            same = self.episode[row] == self.episode[self.at]
-            made["shifted", float(steps)] = np.where(same, self.expected[row], np.nan)
-        return made
+        made: dict[str, list[tuple[float, F64]]] = {
+            "shifted": [(float(steps), self._later(steps)) for steps in _STEPS],
+            "scaled": [(scale, expected * scale)],
+            "biased": [(bias, expected + bias)],
+        }
+        far = (measured - expected) ** 2 > most**2 * (expected**2 + usually)
+        if far[inside].mean() < _FEW:
+            made["spikes"] = [(float(far.mean()), np.where(far, np.nan, expected))]
+        for check, rows in odd.items():
+            if (inside & ~rows[self.at]).any():
+                made[check] = [(0.0, np.where(rows[self.at], np.nan, expected))]
+        return {
+            cause: max(
+                ((by, self._held(values, broken, most, usually)) for by, values in each),
+                key=lambda one: one[1],
+            )
+            for cause, each in made.items()
+        }
+
+    def _later(self, steps: int) -> F64:
+        """Return what was expected some steps before, (n,); NaN if that is another episode."""
+        row = np.clip(self.at - steps, 0, len(self.expected) - 1)
+        same = self.episode[row] == self.episode[self.at]
+        return np.where(same, self.expected[row], np.nan)
+
+    def _held(self, expected: F64, broken: Bools, most: float, usually: float) -> float:
+        """Return the share of broken stretches that hold with other expected values (n,).
+
+        Rows whose value is NaN are left out.
+        """
+        known = np.isfinite(expected)
+        stretch, expected = self.stretch[known], expected[known]
+        square = (self.measured[self.at][known] - expected) ** 2
+        count, left, moves = (
+            np.bincount(stretch, weights, len(broken)) for weights in (None, square, expected**2)
+        )
+        holds = left <= most**2 * (moves + count * usually)
+        return float(holds[broken & (count > 0)].mean())
 
 
-HELD, ZEROS, LIMIT, ROUNDED = "held: ", "zeros: ", "limit: ", "coarse: "
+HELD, ZEROS, LIMIT, ROUNDED, COPIED = "held: ", "zeros: ", "limit: ", "coarse: ", "copied: "
 FAR, FLICKER, REWARDS = "lidar far", "lidar flicker", "reward values"
+PROPOSED, REPLACED = "proposed: ", "goals replaced"
 
 
 @dataclass(frozen=True)
@@ -248,6 +298,9 @@ class _Kind:
 
 
 _KINDS = {
+    COPIED: _Kind("row in which the robot moves and the value is exactly another signal's", 0.05),
+    PROPOSED: _Kind("action of a driver that is navigation's proposal", 0.1),
+    REPLACED: _Kind("episode whose goal is replaced before it is reached", 0.1),
     HELD: _Kind("row in which the robot moves and the value of the row before stays", 0.05),
     ZEROS: _Kind("row in which the robot moves and the value is 0", 0.02),
     LIMIT: _Kind("row in which the value is its largest, which is less than others'", 0.04),
@@ -258,6 +311,8 @@ _KINDS = {
 }
 _MOVES = 0.2  # of the fastest command
 _EQUAL = 1e-5  # of a signal's spread
+_SAME = 1e-4  # m/s or rad/s: one and the same value
+_MIN_DRIVEN = 100  # rows of a driver
 _LESS = 0.9  # of the largest value of others
 _UNSEEN = 0.999  # of the lidar's entry
 _JUMP, _STILL = 0.15, 0.05  # of it
@@ -272,7 +327,9 @@ class Tally:
     signal: str  # an end of the relations; "" where the kind has one signal alone
     found: int
     of: int
-    note: float = 0.0  # seconds at a time, or the largest value
+    size: float = 0.0  # seconds at a time, or the largest value
+    rows: Bools | None = None  # (N,) with such a value, if these can be left out
+    note: str = ""
 
     @property
     def share(self) -> float:
@@ -288,6 +345,9 @@ def tallies(rows: FedRows) -> Iterator[Tally]:
             yield from _repeats(signal, value, before, known, rows.task.control_period_s)
     if rows.task.lidar:
         yield from _of_lidar(rows)
+    yield from _copies(rows)
+    yield from _of_drivers(rows)
+    yield from _of_goals(rows)
     off = np.abs(rows.reward - implied_reward(rows))
     yield Tally(REWARDS, "", int((off > _EXACT).sum()), int(np.isfinite(off).sum()))
 
@@ -321,14 +381,58 @@ def _repeats(
     largest = float(np.abs(finite[known]).max())
     zero = np.abs(finite) < step
     limit = (np.abs(finite) > largest - step) & (comes > 1)
-    held, runs = known & same & ~zero & ~limit, begins & ~zero & ~limit
+    stays = same & ~zero & ~limit
+    held, runs = known & stays, begins & ~zero & ~limit
     after = np.append(held[1:], False)
     times = int((runs & after).sum())
     of = int(known.sum())
-    yield Tally(HELD, signal, int(held.sum()), of, (1 + held.sum() / max(times, 1)) * period_s)
-    yield Tally(ZEROS, signal, int((known & zero).sum()), of)
-    yield Tally(LIMIT, signal, int((known & limit).sum()), of, largest)
+    for kind, found, rows, size in (
+        (HELD, held, stays, (1 + held.sum() / max(times, 1)) * period_s),
+        (ZEROS, known & zero, zero, 0.0),
+        (LIMIT, known & limit, limit, largest),
+    ):
+        yield Tally(kind, signal, int(found.sum()), of, size, rows)
     yield Tally(ROUNDED, signal, int((runs & (comes > 1)).sum()), int(runs.sum()))
+
+
+def _copies(rows: FedRows) -> Iterator[Tally]:
+    """Count rows in which a signal is exactly the one that it should only follow."""
+    speed, turn = rows.command().T
+    for signal, value, other, of in (
+        (ends.WHEEL_SPEED, rows.after("wheel_speed"), speed, "the command"),
+        (ends.WHEEL_TURN, wheel_turn(rows), turn, "the command"),
+        (ends.GYROSCOPE, rows.after("gyro_yaw_rate"), wheel_turn(rows), "the wheels' turn"),
+        (ends.POSE, rows.after("localised_speed"), rows.after("wheel_speed"), "the wheels' speed"),
+    ):
+        moves = np.abs(value) > _SAME
+        same = moves & (np.abs(value - other) < _SAME)
+        yield Tally(COPIED, signal, int(same.sum()), int(moves.sum()), note=of)
+
+
+def _of_drivers(rows: FedRows) -> Iterator[Tally]:
+    """Count the actions of each driver that are those nearest to navigation's proposals."""
+    table = np.asarray(rows.task.actions, np.float64)
+    proposed = np.stack([rows.now("nav_speed"), rows.now("nav_yaw_rate")], axis=1)
+    scale = np.maximum(np.abs(table).max(axis=0), 1e-9)
+    nearest = (np.abs(proposed[:, None] - table) / scale).sum(axis=2).argmin(axis=1)
+    known = rows.now("nav_known") > 0.5
+    for name in np.unique(rows.driver[known]).tolist() if rows.driver is not None else ():
+        own = known & (rows.driver == name)
+        if name and own.sum() >= _MIN_DRIVEN:
+            same = int((own & (nearest == rows.action)).sum())
+            yield Tally(PROPOSED, name, same, int(own.sum()), note=name)
+
+
+def _of_goals(rows: FedRows) -> Iterator[Tally]:
+    """Count episodes that are cut and go on in the next step as another one."""
+    recording = np.unique(rows.recording, return_inverse=True)[1].reshape(-1)
+    order = np.lexsort((rows.logged_ns, recording))
+    later_s = np.diff(rows.logged_ns[order]) * 1e-9
+    goes_on = np.zeros(len(rows), np.bool_)
+    goes_on[order[:-1]] = (later_s > 0) & (later_s < 1.5 * rows.task.control_period_s)
+    goes_on[order[:-1]] &= np.diff(recording[order]) == 0
+    cut = rows.last & rows.truncated & goes_on
+    yield Tally(REPLACED, "", int(cut.sum()), int(rows.last.sum()))
 
 
 def _of_lidar(rows: FedRows) -> Iterator[Tally]:
@@ -341,14 +445,14 @@ def _of_lidar(rows: FedRows) -> Iterator[Tally]:
     seen = now[now < _UNSEEN] ** 2 * rows.task.range_max_m
     farthest = float(np.quantile(seen, 0.995)) if len(seen) else 0.0
     yield Tally(FAR, "", int((now >= _UNSEEN).mean(axis=1).sum()), len(rows), farthest)
+    moves = np.abs(rows.after("wheel_speed")) > _SAME
+    zero = moves & (now == 0.0).any(axis=1)
+    yield Tally(ZEROS, ends.LIDAR, int(zero.sum()), int(moves.sum()))
 
 
-def signals_beside(parts: Sequence[FedRows]) -> list[list[Comparison]]:
+def _signals_beside(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[Comparison]]:
     """Compare each robot's tallies with those of the other robot that has most."""
-    made: list[list[Comparison]] = [[] for _ in parts]
-    if len(parts) < MIN_BESIDE:
-        return made
-    each = [_largest(tallies(rows)) for rows in parts]
+    made: list[list[Comparison]] = [[] for _ in each]
     for key in sorted({key for of_part in each for key in of_part}):
         for place, of_part in enumerate(each):
             others = [
@@ -359,7 +463,7 @@ def signals_beside(parts: Sequence[FedRows]) -> list[list[Comparison]]:
             if key not in of_part or len(others) < MIN_BESIDE - 1:
                 continue
             own, (kind, signal) = of_part[key], key
-            if kind in (LIMIT, FAR) and own.note > _LESS * np.median([one.note for one in others]):
+            if kind in (LIMIT, FAR) and own.size > _LESS * np.median([one.size for one in others]):
                 continue
             most = max(others, key=lambda one: one.share)
             row = shares_compared(
@@ -369,17 +473,24 @@ def signals_beside(parts: Sequence[FedRows]) -> list[list[Comparison]]:
                 (most.found, most.of),
                 -1.0,
                 _KINDS[kind].most,
-                f"{own.note:.2g}",
+                own.note or f"{own.size:.2g}",
             )
             made[place].append(_only_off(row))
     return made
 
 
 def _largest(each: Iterator[Tally]) -> dict[tuple[str, str], Tally]:
-    """Return the tallies by kind and signal: of several of one signal, the largest share."""
+    """Return the tallies by kind and signal: of several of one signal, the largest share.
+
+    Its rows are those of all of them.
+    """
     found: dict[tuple[str, str], Tally] = {}
     for one in each:
         key = one.kind, one.signal
-        if one.of and (key not in found or one.share > found[key].share):
-            found[key] = one
+        if one.of:
+            other = found.get(key, one)
+            most = max(other, one, key=lambda tally: tally.share)
+            if one.rows is not None and other.rows is not None:
+                most = replace(most, rows=one.rows | other.rows)
+            found[key] = most
     return found

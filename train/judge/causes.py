@@ -8,8 +8,7 @@ share is at fault.
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from statistics import median
@@ -30,7 +29,7 @@ from restock.train.judge.answers import (
     WHEEL_TURN,
     Answer,
 )
-from restock.train.judge.beside import HELD, LIMIT, ROUNDED, ZEROS
+from restock.train.judge.beside import COPIED, HELD, LIMIT, PROPOSED, ROUNDED, ZEROS
 from restock.train.judge.fed_rows import Comparison
 from restock.train.judge.mission_checks import CHOSEN
 
@@ -39,9 +38,20 @@ GOALS = "GOALS_OF_OTHERS"
 _FIRST = (  # nothing can be told of rows before these
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
-OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, HELD)  # what one value shows, first what explains the others
+OF_SIGNALS = (
+    COPIED,
+    LIMIT,
+    ZEROS,
+    ROUNDED,
+    HELD,
+)  # what one value shows, first what explains the others
+_PARTS = ("shifted", "scaled", "biased", "spikes")  # of causes that mend alike, the first
+_UNDONE = {"opposite": "scaled", "reversed": "scaled", "early": "shifted"} | {
+    one: one for one in _PARTS
+}
+_ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # by figures that should be 0
 _OPPOSITE, _NONE = -0.6, 0.3  # of what is expected, at most
-_MOST = 0.8  # of the missions: a signal that is wrong in nearly all of them is wrong alike in all
+MENDED = 0.8  # of the stretches that break, those that hold once a cause is undone, at least
 CHANGED = "ACTIONS_CHANGED"  # then nothing that actions show is the profile's fault
 COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever else is right
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
@@ -96,8 +106,8 @@ def findings(
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
         ends.pop(PLAN, None)  # of another goal, not of another scale
-    if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT") for one in of_rows):
-        ends.pop(LIDAR, None)  # known better than by its scale
+    if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT", "LIDAR_BLIND") for one in of_rows):
+        ends.pop(LIDAR, None)  # it is known why
     follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
     of_rows = [one for one in of_rows if one not in changed and not set(one.evidence) <= follow]
     found += changed + [_of_end(end, off, task) for end, off in ends.items()]
@@ -110,13 +120,18 @@ def _of_signals(
     off: dict[str, Comparison], of_rows: Sequence[Finding], answers: Sequence[Answer]
 ) -> tuple[list[Finding], tuple[str, ...]]:
     """Return the findings of signals' own values, and which signals (ends) these explain."""
-    if any(one.cause == "EPISODES_REPEATED" for one in of_rows):
+    causes = {one.cause for one in of_rows}
+    if "EPISODES_REPEATED" in causes:
         return [], ()  # every value comes again
+    if "LIDAR_OFF" in causes:
+        off.pop(ZEROS + LIDAR, None)  # of what is nearer than that
     by_end: dict[str, list[tuple[str, Comparison]]] = {}
     for check, row in off.items():
         kind = next(one for one in OF_SIGNALS if check.startswith(one))
-        by_end.setdefault(check.removeprefix(kind), []).append((kind, row))
-    if POSE in by_end:
+        end = check.removeprefix(kind)
+        if _mends(check, [one for one in answers if _has(one, (end,))]):
+            by_end.setdefault(end, []).append((kind, row))
+    if POSE in by_end or POSE in odd_ends(answers):
         by_end.pop(PLAN, None)  # seen from the pose
     shown, found = tuple(by_end), []
     if by_end.keys() >= set(GROUPS["wheels"]):
@@ -128,6 +143,16 @@ def _of_signals(
         evidence = (*(each.check for _, each in rows), *(row.check for row in explained if row.off))
         found.append(TABLES.ends[kind].finding(evidence, end=end, row=row, key=TABLES.keys[end]))
     return found, shown
+
+
+def _mends(check: str, answers: Sequence[Answer]) -> bool:
+    """Return whether most of the relations that break hold without the values of a check.
+
+    Copies and coarse values are plain to see.
+    """
+    broken = [one.broken.mended for one in answers if one.broken]
+    shares = [mended[check][1] for mended in broken if check in mended]
+    return not shares or median(shares) >= MENDED or check.startswith((COPIED, ROUNDED))
 
 
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
@@ -176,79 +201,94 @@ def _is_shift(scale: float, delay: float) -> bool:
 
 
 def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
-    scale, delay = _distortion(end, off)
+    """Return the cause that makes the relations of an end hold; else, how they do not."""
     rows = [row for one in off for row in one.comparisons if row.off]
     named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # the first of each figure
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
-    surely, some, turn = _surely_reversed(off), named.get("missions"), named.get("turn")
+    scale, steps, bias = (*_distortion(end, off), 0.0)
+    kind, some, mended = "", named.get("stretches"), _mended(end, off)
+    if all(one.holds for one in off):
+        bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
+        kind = _of_all(end, scale, steps, off, named)
+        if mended and mended.get(_UNDONE.get(kind, ""), (1.0, 0.0))[0] < MENDED:
+            kind = ""
+    if not kind and mended:
+        best = max(mended, key=lambda cause: mended[cause][0])
+        share, by = mended[best]
+        if share >= MENDED:
+            scale, steps, bias = (by * (best == one) for one in ("scaled", "shifted", "biased"))
+            if best == "scaled" and by < _NONE:
+                best = "opposite" if by < _OPPOSITE else "still"
+            kind = "part " + best
     gain = 1 / scale if scale else math.inf
     units = ((scale, ""), (gain, "the inverse of "))
     unit = [f": {inverse}{name}?" for by, inverse in units for (low, high), name in _UNITS
             if low <= by <= high]  # fmt: skip
-    degrees = math.degrees(math.atan(turn.effect or 0.0)) if turn else 0.0
-    bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
-    part = _in_part(end, off)
-    mixed = some is not None and (some.logs or 0.0) < _MOST
-    if part and not surely and not (mixed and part[0] in ("opposite", "still", "unlike")):
-        return _part_of(end, part, rows, task)
-    if is_action and gain < 1 / GAIN:
-        kind = "opposite" if surely and gain < -1 / GAIN else "weak"
-    elif scale < 0 and surely:
-        kind = "reversed"
-    elif _is_shift(scale, delay):
-        kind = "early" if is_action and delay < 0 else "shifted"
-    elif mixed:
-        kind = "mixed"
-    elif scale > 0 and scale != 1:
-        kind = "scaled"
-    else:
-        kind = "turned" if turn else "biased" if "offset" in named else "unlike"
-    return TABLES.ends[kind].finding(
+    turn, arm = (row.effect or 0.0 if (row := named.get(one)) else 0.0 for one in ("turn", "arm"))
+    degrees = math.degrees(math.atan(turn))
+    return TABLES.ends[kind or "unlike"].finding(
         tuple(row.check for row in rows), end=end, key=TABLES.keys[end], scale=scale, some=some,
         what="ACTIONS" if is_action else "SENSOR", scaled="COMMAND" if is_action else "SENSOR",
         way=TABLES.ways.get(end, TABLES.ways["actions"]), unit="".join(unit[:1]), gain=gain,
-        part=max(gain, 0.0), share=(1 - (gain if surely else max(gain, 0.0))) / 2,
-        others=min(1 - gain, 1.0), steps=abs(delay), late="late" if delay > 0 else "early",
-        seconds=abs(delay) * task.control_period_s, degrees=abs(degrees),
-        side="left" if degrees > 0 else "right", bias=abs(bias),
+        steps=abs(steps), late="late" if steps > 0 else "early",
+        seconds=abs(steps) * task.control_period_s, degrees=abs(degrees),
+        side="left" if degrees > 0 else "right", arm=arm, bias=bias, rate=off[0].relation.unit,
+        unlike="ACTIONS_MIXED" if is_action else "SENSOR_MIXED" if some else "UNLIKE_TWIN",
+        does="do" if end in GROUPS else "does", how=_how(end, off, named),
     )  # fmt: skip
 
 
-def _in_part(end: str, off: Sequence[Answer]) -> tuple[str, float] | None:
-    """Return what most of the relations show that an end does in some stretches only."""
+def _of_all(
+    end: str, scale: float, steps: float, off: Sequence[Answer], named: Container[str]
+) -> str:
+    """Return what is wrong in all rows, if relations hold with a scale, delay and zero; or ""."""
+    is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
+    if scale < 0:
+        kind = "opposite" if is_action else "reversed"
+        return kind if _surely_reversed(off) else ""
+    if _is_shift(scale, steps):
+        return "early" if is_action and steps < 0 else "shifted"
+    if scale != 1:  # no scale mends a zero, and a lidar's is in what it is compared with, too
+        return "scaled" if "offset" not in named and end != LIDAR else ""
+    return next((kind for figure, kind in _ZEROS.items() if figure in named), "")
+
+
+def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
+    """Return the share of broken stretches that undoing each cause mends, and the cause's size.
+
+    Medians of the end's relations; nothing if none of them breaks in some stretches.
+    """
     ends = GROUPS.get(end, (end,))
-    shapes: list[tuple[str, float]] = []
-    for one in sorted(off, key=lambda one: one.relation.y not in ends):
-        if one.shape is not None:
-            shape, by = one.shape
-            if one.relation.y not in ends:
-                if any(shape != "unlike" for shape, _ in shapes):
-                    break  # it shows less: what is wrong is expected
-                by = 1 / by if shape == "scaled" and by else -by
-            if shape == "scaled" and by < _NONE:
-                shape = "opposite" if by < _OPPOSITE else "still"
-            shapes.append((shape, by))
-    counts = Counter(shape for shape, _ in shapes if shape != "unlike")
-    if not counts:
-        return shapes[0] if shapes and not any(one.is_off("gain") for one in off) else None
-    best = counts.most_common(1)[0][0]
-    return best, median(by for shape, by in shapes if shape == best)
+    found: dict[str, list[tuple[float, float]]] = {}
+    for one in off:
+        if one.broken is None or not one.is_off("stretches"):
+            continue
+        for cause in _PARTS:
+            by, share = one.broken.mended.get(cause, (1.0, 0.0))
+            if one.relation.y not in ends:  # what is wrong is expected
+                by = 1 / by if cause == "scaled" and by else -by
+            found.setdefault(cause, []).append((share, by))
+    return {
+        cause: (
+            median(share for share, _ in each),
+            median([by for share, by in each if share >= MENDED] or [0.0]),
+        )
+        for cause, each in found.items()
+    }
 
 
-def _part_of(end: str, part: tuple[str, float], rows: Sequence[Comparison], task: Task) -> Finding:
-    shape, by = part
-    some = next(row for row in rows if row.check.startswith("stretches"))
-    action = end in (ACTION_SPEED, ACTION_TURN, "actions")
-    what = "ACTIONS" if action else "SENSOR"
-    names = {"shifted": f"{what}_SHIFTED", "spikes": f"{what}_SPIKES", "biased": f"{what}_BIASED",
-             "scaled": "COMMAND_SCALED" if action else "SENSOR_SCALED"}  # fmt: skip
-    how = TABLES.shapes[shape].format(
-        by=by, steps=abs(by), seconds=abs(by) * task.control_period_s,
-        late="late" if by > 0 else "early",
-    )  # fmt: skip
-    return TABLES.ends["part"].finding(
-        tuple(row.check for row in rows), end=end, key=TABLES.keys[end], some=some, how=how,
-        name=names.get(shape, f"{what}_MIXED"),
+def _how(end: str, off: Sequence[Answer], named: Mapping[str, Comparison]) -> str:
+    """Return in words which signals an end does not follow, in how much of the drive, how far."""
+    ends = GROUPS.get(end, (end,))
+    signals = dict.fromkeys(one for each in off for one in (each.relation.x, each.relation.y))
+    *others, last = [one for one in signals if one not in ends] or ["where it heads"]
+    followed = " and ".join([", ".join(others), last] if others else [last])
+    figure = next(one for one in TABLES.how if one in named or one == "gain")
+    one = next((one for one in off if one.is_off(figure)), off[0])
+    rows = {row.check.partition(":")[0]: row for row in one.comparisons}
+    return TABLES.how[figure].format(
+        others=followed, row=rows.get(figure), left=rows.get("unexplained"), broken=one.broken,
+        unit=one.relation.unit,
     )  # fmt: skip
 
 
@@ -276,6 +316,8 @@ def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Findi
 def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
     """Return findings of checks that imply their cause; the first one claims a check."""
     left = {row.check: row for row in off}
+    if "driver" in left:  # another driver's actions are proposals as often as that one's
+        left = {name: row for name, row in left.items() if not name.startswith(PROPOSED)}
     found: list[Finding] = []
     for kind in TABLES.kinds:
         beside = not kind.beside or any(check in left for check in kind.beside)
@@ -290,9 +332,10 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
             found.append(kind.finding(used, shares=", ".join(each)))
             left = {name: row for name, row in left.items() if name not in used}
     for name, row in left.items():
-        kind = TABLES.ends["chosen" if name.startswith(CHOSEN) else "value"]
+        kind = next((one for one in (CHOSEN, PROPOSED) if name.startswith(one)), "value")
         note = f" ({row.note})" if row.note else ""
-        found.append(kind.finding((name,), row=row, of=name.removeprefix(CHOSEN), note=note))
+        of = name.removeprefix(kind)
+        found.append(TABLES.ends[kind].finding((name,), row=row, of=of, note=note))
     return found
 
 
@@ -318,7 +361,7 @@ class _Tables:
     ways: dict[str, str]
     follow: dict[str, tuple[str, ...]]
     ends: dict[str, Kind]
-    shapes: dict[str, str]
+    how: dict[str, str]
     labels: dict[str, Kind]
     kinds: tuple[Kind, ...]
 
