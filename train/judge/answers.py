@@ -386,7 +386,7 @@ class Broken:
 
     off_by: float  # root mean square in these stretches, in the unit of y
     usually: float  # and in the other robots'
-    mended: dict[str, tuple[float, float]]  # by cause: its size, and the share that it mends
+    mended: dict[str, tuple[float, float]]  # by cause: the share that holds without it, its size
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ MIN_BESIDE = 4  # robots or recordings, for one to be the odd one out
 _ALIKE = 0.75  # of the others, for what they agree on to be the measure
 GAIN, ANSWER, NOISY = 1.02, 1.15, 1.25  # of two sensors of one motion, of commands, of the others
 _DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # most beside the others; the latter of the mean square
-OddRows = dict[tuple[str, str], Bools]  # (N,) of a robot, by the kind of tally and the signal
 
 
 def beside_others(
@@ -39,18 +38,14 @@ def beside_others(
     values = _signals_beside(each)
     off = [{row.check for row in of_part if row.off} for of_part in values]
     odd = [
-        {
-            key: one.rows
-            for key, one in of_part.items()
-            if "".join(key) in names and one.rows is not None
-        }
+        {"".join(key): one for key, one in of_part.items() if "".join(key) in names}
         for of_part, names in zip(each, off, strict=True)
     ]
     relations = [_relation_beside(list(one), odd) for one in zip(*answers, strict=True)]
     return [list(one) for one in zip(*relations, strict=True)], values
 
 
-def _relation_beside(made: list[Answer], odd: Sequence[OddRows]) -> list[Answer]:
+def _relation_beside(made: list[Answer], odd: Sequence[Mapping[str, Tally]]) -> list[Answer]:
     """Compare one relation in several robots: each with the middle of the others."""
     answers = tuple(made)
     for figure, least, most in _allowed(answers[0].relation):
@@ -130,10 +125,11 @@ _WINDOW = 10  # steps of a stretch
 _USUAL, _BROKEN = 0.98, 2.0  # a stretch is broken beyond this quantile of the others', times
 _IN_PART = 0.05  # of the stretches, beyond the others'
 _FEW = 0.25  # of the rows in broken stretches, if single values are to be far off
+_COUNTS = 0.1  # of the largest of a kernel: what less counts for is not part of a value
 _STEPS = (*range(-10, 0), *range(1, 11))  # of a shift
 
 
-def _stretches(answers: list[Answer], odd: Sequence[OddRows]) -> list[Answer]:
+def _stretches(answers: list[Answer], odd: Sequence[Mapping[str, Tally]]) -> list[Answer]:
     """Compare in how many stretches of a drive each robot's relation breaks, beside the others'.
 
     All are held against one response: the middle of the robots' own.
@@ -173,21 +169,24 @@ def _stretches(answers: list[Answer], odd: Sequence[OddRows]) -> list[Answer]:
         found = None
         if row.off:
             usual = np.concatenate([drives[other].left for other in others]).mean()
-            mended = drive.mended(broken, most, usually, _of_ends(relation, odd[place]))
+            mended = drive.mended(broken, most, usually, _of_ends(relation, kernel, odd[place]))
             found = Broken(drive.left[broken].mean() ** 0.5, usual**0.5, mended)
         answers[place] = replace(one, comparisons=(*one.comparisons, row), broken=found)
     return answers
 
 
-def _of_ends(relation: Relation, odd: OddRows) -> dict[str, Bools]:
+def _of_ends(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[str, Bools]:
     """Return the rows (N,) that odd values of the relation's signals are part of, by check."""
+    lags = relation.lags[np.abs(kernel) > _COUNTS * np.abs(kernel).max()]
     found = {}
-    for (kind, signal), rows in odd.items():
-        after, before = np.append(rows[1:], False), np.append(False, rows[:-1])
-        if signal == relation.x:  # what follows from it depends on rows around it, too
-            found[kind + signal] = rows | after | before
-        elif signal == relation.y:  # a motion of the pose is between two poses
-            found[kind + signal] = rows | (after & (signal == ends.POSE))
+    for check, one in odd.items():
+        if one.rows is None or one.signal not in (relation.x, relation.y):
+            continue
+        if one.signal == relation.x:
+            found[check] = np.any([np.roll(one.rows, lag) for lag in lags], axis=0)
+        else:  # a motion of the pose is between two poses
+            after = np.append(one.rows[1:], False) & (one.signal == ends.POSE)
+            found[check] = one.rows | after
     return found
 
 
@@ -232,7 +231,7 @@ class Stretches:
     def mended(
         self, broken: Bools, most: float, usually: float, odd: Mapping[str, Bools]
     ) -> dict[str, tuple[float, float]]:
-        """Return what could explain broken stretches: its size, and the share that holds with it.
+        """Return the share of broken stretches that hold without each cause, and the cause's size.
 
         Args:
             broken: (W,)
@@ -257,8 +256,8 @@ class Stretches:
                 made[check] = [(0.0, np.where(rows[self.at], np.nan, expected))]
         return {
             cause: max(
-                ((by, self._held(values, broken, most, usually)) for by, values in each),
-                key=lambda one: one[1],
+                ((self._held(values, broken, most, usually), by) for by, values in each),
+                key=lambda one: one[0],
             )
             for cause, each in made.items()
         }
@@ -281,7 +280,8 @@ class Stretches:
             np.bincount(stretch, weights, len(broken)) for weights in (None, square, expected**2)
         )
         holds = left <= most**2 * (moves + count * usually)
-        return float(holds[broken & (count > 0)].mean())
+        judged_ones = broken & (count > 0)
+        return float(holds[judged_ones].mean()) if judged_ones.any() else 0.0
 
 
 HELD, ZEROS, LIMIT, ROUNDED, COPIED = "held: ", "zeros: ", "limit: ", "coarse: ", "copied: "
@@ -338,14 +338,18 @@ class Tally:
 
 def tallies(rows: FedRows) -> Iterator[Tally]:
     """Count, in one robot's rows, what is compared with other robots'."""
+    copied: dict[str, Bools] = {}
+    for signal, moves, same, note in _copies(rows):
+        copied[signal] = same
+        yield Tally(COPIED, signal, int(same.sum()), int(moves.sum()), note=note)
     for signal, value, moves in _signals(rows):
         before, known = rows.before(1)
         known &= np.isfinite(value) & moves & moves[before]
         if known.any() and np.ptp(value[np.isfinite(value)]) > 0:
-            yield from _repeats(signal, value, before, known, rows.task.control_period_s)
+            period_s, same = rows.task.control_period_s, copied.get(signal, np.zeros_like(known))
+            yield from _repeats(signal, value, before, known, same, period_s)
     if rows.task.lidar:
         yield from _of_lidar(rows)
-    yield from _copies(rows)
     yield from _of_drivers(rows)
     yield from _of_goals(rows)
     off = np.abs(rows.reward - implied_reward(rows))
@@ -369,9 +373,12 @@ def _signals(rows: FedRows) -> Iterator[tuple[str, F64, Bools]]:
 
 
 def _repeats(
-    signal: str, value: F64, before: Ints, known: Bools, period_s: float
+    signal: str, value: F64, before: Ints, known: Bools, copied: Bools, period_s: float
 ) -> Iterator[Tally]:
-    """Count how the values (N,) of a signal repeat, in `known` rows; `before` is the row before."""
+    """Count how the values (N,) of a signal repeat, in `known` rows; `before` is the row before.
+
+    Values that are `copied` may come again without being coarse.
+    """
     finite = np.where(np.isfinite(value), value, 0.0)
     step = _EQUAL * max(float(np.subtract(*np.quantile(finite[known], [0.95, 0.05]))), 1e-9)
     code = np.unique(np.round(finite / step), return_inverse=True)[1].reshape(-1)
@@ -392,11 +399,12 @@ def _repeats(
         (LIMIT, known & limit, limit, largest),
     ):
         yield Tally(kind, signal, int(found.sum()), of, size, rows)
+    runs &= ~copied
     yield Tally(ROUNDED, signal, int((runs & (comes > 1)).sum()), int(runs.sum()))
 
 
-def _copies(rows: FedRows) -> Iterator[Tally]:
-    """Count rows in which a signal is exactly the one that it should only follow."""
+def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
+    """Yield a signal, in which rows (N,) it moves, and in which it is exactly another: which."""
     speed, turn = rows.command().T
     for signal, value, other, of in (
         (ends.WHEEL_SPEED, rows.after("wheel_speed"), speed, "the command"),
@@ -405,8 +413,7 @@ def _copies(rows: FedRows) -> Iterator[Tally]:
         (ends.POSE, rows.after("localised_speed"), rows.after("wheel_speed"), "the wheels' speed"),
     ):
         moves = np.abs(value) > _SAME
-        same = moves & (np.abs(value - other) < _SAME)
-        yield Tally(COPIED, signal, int(same.sum()), int(moves.sum()), note=of)
+        yield signal, moves, moves & (np.abs(value - other) < _SAME), of
 
 
 def _of_drivers(rows: FedRows) -> Iterator[Tally]:

@@ -38,17 +38,10 @@ GOALS = "GOALS_OF_OTHERS"
 _FIRST = (  # nothing can be told of rows before these
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
-OF_SIGNALS = (
-    COPIED,
-    LIMIT,
-    ZEROS,
-    ROUNDED,
-    HELD,
-)  # what one value shows, first what explains the others
+# What one value shows, first what explains the others.
+OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, COPIED, HELD)
 _PARTS = ("shifted", "scaled", "biased", "spikes")  # of causes that mend alike, the first
-_UNDONE = {"opposite": "scaled", "reversed": "scaled", "early": "shifted"} | {
-    one: one for one in _PARTS
-}
+_UNDONE = {"opposite": "scaled", "reversed": "scaled", "early": "shifted"}  # else by its own name
 _ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # by figures that should be 0
 _OPPOSITE, _NONE = -0.6, 0.3  # of what is expected, at most
 MENDED = 0.8  # of the stretches that break, those that hold once a cause is undone, at least
@@ -151,7 +144,7 @@ def _mends(check: str, answers: Sequence[Answer]) -> bool:
     Copies and coarse values are plain to see.
     """
     broken = [one.broken.mended for one in answers if one.broken]
-    shares = [mended[check][1] for mended in broken if check in mended]
+    shares = [mended[check][0] for mended in broken if check in mended]
     return not shares or median(shares) >= MENDED or check.startswith((COPIED, ROUNDED))
 
 
@@ -210,7 +203,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     if all(one.holds for one in off):
         bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
         kind = _of_all(end, scale, steps, off, named)
-        if mended and mended.get(_UNDONE.get(kind, ""), (1.0, 0.0))[0] < MENDED:
+        if mended and mended.get(_UNDONE.get(kind, kind), (1.0, 0.0))[0] < MENDED:
             kind = ""
     if not kind and mended:
         best = max(mended, key=lambda cause: mended[cause][0])
@@ -264,7 +257,7 @@ def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
         if one.broken is None or not one.is_off("stretches"):
             continue
         for cause in _PARTS:
-            by, share = one.broken.mended.get(cause, (1.0, 0.0))
+            share, by = one.broken.mended.get(cause, (0.0, 1.0))
             if one.relation.y not in ends:  # what is wrong is expected
                 by = 1 / by if cause == "scaled" and by else -by
             found.setdefault(cause, []).append((share, by))

@@ -58,12 +58,8 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     nearer = rows.next_observation[:, first : first + rows.task.sectors]
     own = rows.previous_action(after=True) != rows.action
     strange = own | (np.abs(after - nearer) > 10 * _EQUAL).any(axis=1)
-    copied = same[strange & rows.last]
-    own_again = (
-        "it repeats the row's own observation"
-        if copied.size and copied.mean() > 0.8
-        else ("it is of another episode, or missing")
-    )
+    own_again = same[strange & rows.last].sum() > 0.8 * (strange & rows.last).sum()
+    of_end = "it repeats the row's own observation" if own_again else "it is another's, or missing"
     late = np.diff(rows.logged_ns, prepend=0) > 1.5e9 * rows.task.control_period_s
     together = np.bincount(rows.episode, apart & late & joined) > 0
     begins = np.append(True, rows.last[:-1])[: len(rows)]
@@ -80,7 +76,8 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
          held == rows.action, joined & (rows.action != previous)),
         ("closing", "clearances did not change as in the observation",
          (np.abs(change - closing) > 10 * _EQUAL).any(axis=1), joined),
-        ("unchanged", "next observation is the observation, though the robot moves", same, moving),
+        ("unchanged", "next observation is the observation, though the robot moves", same,
+         moving & ~rows.last),
         ("last next", "last next observation of an episode does not follow from its row", strange,
          rows.last),
         ("split episodes", "episode stops where another begins, and has no end", cut,
@@ -88,13 +85,13 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
         ("joined episodes", "episode leaves out time, and goes on elsewhere",
          together[rows.episode], rows.last),
     ):  # fmt: skip
-        note = own_again if check == "last next" else ""
+        note = of_end if check == "last next" else ""
         yield share_judged(check, what, int((off & of).sum()), int(of.sum()), MOST, note=note)
     yield _repeated(rows, moving & ~same)
 
 
 def _repeated(rows: FedRows, moving: Bools) -> Comparison:
-    """Count moving rows that equal another one byte for byte: noise never comes twice."""
+    """Count moving rows that equal another one byte for byte; noise is never the same twice."""
     both = np.concatenate([rows.observation, rows.next_observation], axis=1)[moving]
     again = len(both) - len(set(map(bytes, both)))
     return share_judged(
