@@ -325,10 +325,10 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
             found.append(kind.finding(used, shares=", ".join(each)))
             left = {name: row for name, row in left.items() if name not in used}
     for name, row in left.items():
-        kind = next((one for one in (CHOSEN, PROPOSED) if name.startswith(one)), "value")
+        prefix = next((one for one in (CHOSEN, PROPOSED) if name.startswith(one)), "")
+        kind = TABLES.ends[prefix or "value"]
         note = f" ({row.note})" if row.note else ""
-        of = name.removeprefix(kind)
-        found.append(TABLES.ends[kind].finding((name,), row=row, of=of, note=note))
+        found.append(kind.finding((name,), row=row, of=name.removeprefix(prefix), note=note))
     return found
 
 
