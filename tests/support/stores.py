@@ -1,5 +1,6 @@
 """A small synthetic store of transitions, for tests that need one without a recording."""
 
+import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -21,6 +22,7 @@ from restock.ingest.task.task import Body, Task
 from restock.replay.store.definitions import Definitions
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
+from support.paths import ROOT
 
 _kept: list[Definitions] = []
 _summaries: dict[bytes, pa.Table] = {}  # manifests with their summaries, of `summarised_once`
@@ -241,3 +243,12 @@ def shown(path: Path | str) -> dict[str, int]:
             " GROUP BY ALL ORDER BY ALL"
         ).fetchall()
     return dict(found)
+
+
+def hindsight_profile(folder: Path) -> Path:
+    """Write the shipped profile with goals in hindsight, in place of those that were recorded."""
+    text = (ROOT / "src/restock/ingest/profile/profiles/warehouse_amr.toml").read_text()
+    text = re.sub(r"(?ms)^\[inputs\.(?:goal|plan)\].*?(?=^\[)", "", text)
+    path = folder / "hindsight.toml"
+    path.write_text(text.replace("[clock]", '[goal]\nsource = "hindsight"\n\n[clock]', 1))
+    return path

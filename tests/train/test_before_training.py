@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of
 from support.paths import ROOT
-from support.stores import TASK, recording_transitions, write_store
+from support.stores import TASK, hindsight_profile, recording_transitions, write_store
 
 from restock.arrays import Ints
 from restock.cli import main
@@ -23,8 +23,9 @@ from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.panel.panel import HEADER, META, FileRecord, Panel, seal
+from restock.replay.store.store import Store
 from restock.stats import ConfidenceInterval
-from restock.train.judge import before_training, fed_rows
+from restock.train.judge import before_training, fed_rows, row_checks
 from restock.train.judge.answers import ACTION_TURN, GAIN, RELATIONS, Answer
 from restock.train.judge.before_training import (
     OpenedRows,
@@ -612,6 +613,23 @@ def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None
     assert off == ["labels: blocked_aisle", "terminations"]
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
+
+
+def test_labels_that_goals_in_hindsight_leave_unknown_are_not_wrong(tmp_path: Path) -> None:
+    profile = load_profile(hindsight_profile(tmp_path))
+    ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
+    rule = {"name": "on_the_plan", "sql": "plan_gap_m > 0", "let": {}}
+    on_the_plan = msgspec.structs.replace(profile.conditions[0], **rule)
+    opened = open_rows(tmp_path / "store")
+    with Store(tmp_path / "store") as store:
+        checks = [
+            one.check
+            for one in row_checks.stored(
+                store, opened.rows, profile, [*profile.conditions, on_the_plan]
+            )
+        ]
+    assert "labels: wheel_slip" in checks
+    assert not {"labels: blocked_aisle", "labels: on_the_plan"} & set(checks)
 
 
 def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> None:

@@ -1,12 +1,12 @@
 """Which logged rows are cloned: those of named drivers, and others' successful episodes."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from support.paths import ROOT
+from support.stores import hindsight_profile
 
 from restock.cli.learning.train import describe_run
 from restock.errors import ConfigError
@@ -97,11 +97,7 @@ def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -
 
 
 def test_goals_in_hindsight_show_no_success(tmp_path: Path) -> None:
-    text = (ROOT / "src/restock/ingest/profile/profiles/warehouse_amr.toml").read_text()
-    changed = tmp_path / "hindsight.toml"
-    text = re.sub(r"(?ms)^\[inputs\.(?:goal|plan)\].*?(?=^\[)", "", text)
-    changed.write_text(text.replace("[clock]", '[goal]\nsource = "hindsight"\n\n[clock]', 1))
-    settings = [f"profile={changed}"]
+    settings = [f"profile={hindsight_profile(tmp_path)}"]
     assert prepare_new(tmp_path / "r", None, None, settings).config.teacher.successes is False
     with pytest.raises(ConfigError, match=r"teacher\.successes: goals are found in hindsight"):
         prepare_new(tmp_path / "r", None, None, [*settings, "teacher.successes=true"])
