@@ -325,7 +325,8 @@ def _unfilled_lines(role: str, seen: Evidence) -> list[str]:
             f"# fields = {{ {named} }}",
         ]
     if role == "wheels":
-        return ["# [inputs.wheels]  # no usable odometry; instead: speeds from poses"]
+        by_hand = ["# [motion]", "# window_s = 0.5"] if seen.motion is None else []
+        return ["# [inputs.wheels]  # no usable odometry; instead: speeds from poses", *by_hand]
     fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
     lines = [f"# [inputs.{role}]  # nothing usable; instead: {fallback}"]
     clouds = [one for one in usable_topics(seen.recording).values() if one.type == CLOUD]
