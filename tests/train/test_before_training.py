@@ -22,6 +22,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.task import nearest_action
 from restock.replay.panel.panel import HEADER, META, FileRecord, Panel, seal
 from restock.replay.store.store import Store
 from restock.stats import ConfidenceInterval
@@ -34,6 +35,7 @@ from restock.train.judge.before_training import (
     gap_evidence,
     open_rows,
 )
+from restock.train.judge.beside import PROPOSED, tallies
 from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
 from restock.train.judge.fed_rows import FedRows, drive_twin, judged, over_parts
@@ -370,10 +372,11 @@ def _cut_by_goals(rows: FedRows) -> FedRows:
 
 
 def _proposed(rows: FedRows) -> FedRows:
-    table = np.asarray(rows.task.actions)
-    proposed = np.stack([rows.now("nav_speed"), rows.now("nav_yaw_rate")], axis=1)
-    away = np.abs(proposed[:, None] - table) / np.abs(table).max(axis=0)
-    return _acted(rows, away.sum(axis=2).argmin(axis=1))
+    fastest_mps, fastest_radps = np.abs(rows.task.actions).max(axis=0)  # the units of observations
+    speed_mps = rows.now("nav_speed") * fastest_mps
+    return _acted(
+        rows, nearest_action(rows.task, speed_mps, rows.now("nav_yaw_rate") * fastest_radps)[0]
+    )
 
 
 def _clipped(held: Any, at: int) -> None:
@@ -438,6 +441,17 @@ def test_what_lasts_for_a_part_is_named_beside_other_robots(logs, twin, fault, m
     texts = [one.text for one in found.findings]
     assert [text for text in texts if not text.startswith("in 1 of 4 robots (robot r1)")] == []
     assert [text for text in texts if said in text] or fault is None, texts
+
+
+def test_proposals_are_compared_in_the_units_of_observations(logs: FedRows) -> None:
+    """A robot of a quarter of the speed does the same, as observations are in units of that."""
+    slow = tuple((speed / 4, turn / 4) for speed, turn in logs.task.actions)
+    driven = replace(logs, driver=np.full(len(logs), "planner"))
+    shares = [
+        [one.share for one in tallies(replace(driven, task=task)) if one.kind == PROPOSED]
+        for task in (logs.task, msgspec.structs.replace(logs.task, actions=slow))
+    ]
+    assert shares[0] == shares[1] != []
 
 
 def test_a_check_in_many_parts_is_corrected_for_their_number():

@@ -418,10 +418,9 @@ def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
 
 def _of_drivers(rows: FedRows) -> Iterator[Tally]:
     """Count the actions of each driver that are those nearest to navigation's proposals."""
-    table = np.asarray(rows.task.actions, np.float64)
     proposed = np.stack([rows.now("nav_speed"), rows.now("nav_yaw_rate")], axis=1)
-    scale = np.maximum(np.abs(table).max(axis=0), 1e-9)
-    nearest = (np.abs(proposed[:, None] - table) / scale).sum(axis=2).argmin(axis=1)
+    away = np.linalg.norm(proposed[:, None] - rows.task.scaled_actions, axis=2)
+    nearest = away.argmin(axis=1)
     known = rows.now("nav_known") > 0.5
     for name in np.unique(rows.driver[known]).tolist() if rows.driver is not None else ():
         own = known & (rows.driver == name)
