@@ -332,7 +332,7 @@ POSE_FALLBACK = "from transforms, by [frames]"
 WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be detected"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
 HINDSIGHT = {
-    "goal": "in hindsight: where the drive stopped, turned back or passed often",
+    "goal": "in hindsight: where the drive stopped, turned back or went far enough",
     "plan": "in hindsight: the path that was driven",
 }
 

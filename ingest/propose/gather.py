@@ -103,7 +103,7 @@ class GoalChoice:
         """Write the [goal] of the profile, if it needs one."""
         if self.source != "hindsight":
             return []
-        why = "where a drive stopped, turned back or passed often"
+        why = "where a drive stopped, turned back or went far enough"
         return ["[goal]  # no goal and plan seen", f'source = "hindsight"  # {why}', ""]
 
 
