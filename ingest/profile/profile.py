@@ -68,6 +68,7 @@ from restock.ingest.task.conditions import (
     label_with_probabilities,
     labels_version,
     of_kind,
+    reported,
     shipped,
     unseen,
     with_files,
@@ -139,6 +140,11 @@ class Profile(Checked, frozen=True, dict=True):
     def definitions(self) -> list[Condition]:
         """Return both, conditions first."""
         return [*self.conditions, *self.exposures]
+
+    def shown_by_logs(self, conditions: Sequence[Condition]) -> list[Condition]:
+        """Return the conditions that this robot's logged steps can show."""
+        in_hindsight = self.goal_source == "hindsight"
+        return reported(conditions, lidar=self.task.lidar, driven_plan=in_hindsight)
 
     @cached_property
     def labels_version(self) -> str:

@@ -39,7 +39,6 @@ from restock.ingest.task.conditions import (
     Condition,
     held,
     primary,
-    reported,
     unknown_rows,
     unseen,
 )
@@ -116,9 +115,7 @@ def uncertain_conditions(profile: Profile) -> list[str]:
     """Return the conditions and exposures whose labels rest on an outline that nobody measured."""
     if profile.robot is None or not profile.robot.outline_guessed:
         return []
-    hindsight = profile.goal_source == "hindsight"
-    known = reported(profile.definitions, lidar=profile.task.lidar, driven_plan=hindsight)
-    return sorted(unseen(known, OUTLINE_SIGNALS))
+    return sorted(unseen(profile.shown_by_logs(profile.definitions), OUTLINE_SIGNALS))
 
 
 def driven_plan(rows: pa.Table) -> bool:

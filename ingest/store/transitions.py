@@ -22,7 +22,6 @@ from restock.ingest.task.conditions import (
     Condition,
     label_several,
     primary,
-    reported,
     too_near_to_call,
 )
 from restock.ingest.task.schema import (
@@ -127,11 +126,7 @@ def episode_rows(
             signals[name][old] = column
     custom = steps.custom.take(tick)
     table = label_table(signals, episode, step, custom)
-    lidar, driven_plan = profile.task.lidar, profile.goal_source == "hindsight"
-    conditions, situations = (
-        reported(several, lidar=lidar, driven_plan=driven_plan)
-        for several in (profile.conditions, profile.exposures)
-    )
+    conditions, situations = map(profile.shown_by_logs, (profile.conditions, profile.exposures))
     held, probable = yield label_several, (table, [*conditions, *situations])
     labels, exposures = (
         {condition.name: held[condition.name] for condition in several}

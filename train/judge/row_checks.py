@@ -16,7 +16,7 @@ from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.store.transitions import label_table
-from restock.ingest.task.conditions import Condition, label, reported
+from restock.ingest.task.conditions import Condition, label
 from restock.ingest.task.task import STORED_SIGNALS, Signals, reward_parts, terminated
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
@@ -391,9 +391,7 @@ def stored(
         return
     steps = logged_steps(store, rows.task.hash, recordings)
     whole = _whole(steps)
-    in_hindsight = profile.goal_source == "hindsight"
-    known = reported(conditions, lidar=profile.task.lidar, driven_plan=in_hindsight)
-    yield from _labels(steps, whole, known, left_out)
+    yield from _labels(steps, whole, profile.shown_by_logs(conditions), left_out)
     yield _terminations(steps, rows)
 
 
