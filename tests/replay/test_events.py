@@ -1,23 +1,13 @@
 """Events: where a condition began and ended, and what came of it, against a plain loop."""
 
 from collections import defaultdict
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pytest
-from deltalake import write_deltalake
-from support.paths import ROOT
-from support.stores import START_NS, TASK, manifest, recording_transitions, write_store
+from support.stores import TASK, recording_transitions, write_store
 
-from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import replaced
-from restock.ingest.store.version import FORMAT
-from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.schema import STEP_BITS
 from restock.replay.store.store import Store
 
 PERIOD_NS = 200_000_000
@@ -89,26 +79,21 @@ def compare(store: Store) -> None:
         assert {key: seen[name][key] for key in row} == row, name
 
 
-def test_events_of_the_sample_logs_are_those_of_a_plain_loop(tmp_path):
-    store, profile = tmp_path / "store", load_profile("warehouse_amr")
-    ingest(
-        ROOT / "sample_logs" / "amr_tuesday",
-        profile,
-        store=StoreWriter(store),
-        tags={"robot": "amr-07"},
-    )
-    with Store(store) as opened:
-        compare(opened)
-        assert {row["condition"] for row in events_of(opened).values()} > {"wheel_slip"}
-
-
 def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path):
-    """Rows are missing in the middle of episodes and at their ends, and log time is not stamps."""
+    """Rows are missing, drivers take turns, and a third of the episodes end in recovery."""
     tables = []
-    for number in (1, 2, 3):
-        table = recording_transitions(number, episodes=25)
-        keep = np.random.default_rng(number).random(len(table)) > 0.1
-        tables.append(table.filter(pa.array(keep)))
+    for number in range(1, 10):
+        table = recording_transitions(number, episodes=7)
+        rng = np.random.default_rng(number)
+        keep = rng.random(len(table)) > 0.1
+        late = zip(table["episode_index"].to_pylist(), table["step_index"].to_pylist(), strict=True)
+        held = zip(table["conditions"].to_pylist(), late, strict=True)
+        changed = {
+            "behaviour_policy": rng.choice(["planner", "operator"], len(table)),
+            "bumped": rng.random(len(table)) < 0.1,
+            "conditions": [["recovery"] if e % 3 == 0 and s > 5 else h for h, (e, s) in held],
+        }
+        tables.append(replaced(table, changed).filter(pa.array(keep)))
     with Store(
         write_store(tmp_path / "store", tables, tags=[{"robot": "a"}, {"robot": "b"}])
     ) as store:
@@ -121,80 +106,3 @@ def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path):
         ).fetchall()
         held = sum(len(names) for table in tables for names in table["conditions"].to_pylist())
         assert rows == [(held, len(events_of(store)), 0)]
-
-
-@dataclass(frozen=True)
-class Case:
-    """Labels `s` slips, `b` blocked, `x` both; events: name, first, last, outcome, after."""
-
-    labels: str
-    events: list[tuple[str, int, int, str, float | None]]
-    ended: str = "truncated"
-    reached: bool = False
-    more_s: float = 60.0  # for which the recording goes on
-
-
-CASES = [
-    Case(".ss..", [("wheel_slip", 1, 2, "recovered", 0.4)]),
-    Case(".ss", [("wheel_slip", 1, 2, "recovered", 0.4)], ended="terminated", reached=True),
-    Case(".ss", [("wheel_slip", 1, 2, "not recovered", None)], ended="terminated"),
-    Case(".ss", [("wheel_slip", 1, 2, "not recovered", None)]),
-    Case(".ss", [("wheel_slip", 1, 2, "open", None)], more_s=0.2),
-    Case(".ss", [("wheel_slip", 1, 2, "open", None)], ended=""),
-    # Another condition takes over: nominal is where no condition holds.
-    Case(
-        "sxb.", [("blocked_aisle", 1, 2, "recovered", 0.4), ("wheel_slip", 0, 1, "recovered", 0.6)]
-    ),
-    Case(
-        "s.s", [("wheel_slip", 0, 0, "recovered", 0.2), ("wheel_slip", 2, 2, "not recovered", None)]
-    ),
-    Case("....", []),
-]
-
-
-def write_case(path: Path, number: int, case: Case, policies: str = "") -> None:
-    """Add a recording of one episode to a store."""
-    names = {"s": ["wheel_slip"], "b": ["blocked_aisle"], "x": ["blocked_aisle", "wheel_slip"]}
-    count = len(case.labels)
-    held = [names.get(letter, []) for letter in case.labels]
-    one = recording_transitions(number, episodes=1).slice(0, 1)
-    table = pa.concat_tables([one] * count)
-    stamps = START_NS + np.arange(count) * PERIOD_NS
-    last = np.arange(count) == count - 1
-    values = {
-        "transition_id": (number << STEP_BITS) + np.arange(count),
-        "step_index": np.arange(count),
-        "stamp_ns": stamps,
-        "conditions": held,
-        "condition": [(names or ["nominal"])[0] for names in held],
-        "behaviour_policy": list(policies) or ["planner"] * count,
-        "terminated": last & (case.ended == "terminated"),
-        "truncated": last & (case.ended == "truncated"),
-        "reward": last * (TASK.rewards.goal if case.reached else 0.0),
-    }
-    table = replaced(table, values)
-    row = replaced(manifest(table), {"end_stamp_ns": [int(stamps[-1] + case.more_s * 1e9)]})
-    write_deltalake(str(path / "recordings"), row, mode="append", description=FORMAT)
-    write_deltalake(str(path / "transitions"), table, mode="append", description=FORMAT)
-
-
-def test_what_came_of_events(tmp_path):
-    for number, case in enumerate(CASES, 1):
-        write_case(tmp_path / "store", number, case)
-    with Store(tmp_path / "store") as store:
-        for number, case in enumerate(CASES, 1):
-            found = store.sql(
-                "SELECT condition, onset_step, end_step, outcome, recovered_after_s FROM events"
-                f" WHERE recording_id = '{number:016x}' ORDER BY ALL"
-            ).fetchall()
-            assert found == [pytest.approx(event) for event in case.events], case
-
-
-def test_who_drove_before_and_after(tmp_path):
-    write_case(tmp_path / "store", 1, Case("s.ss.s", []), policies="pppooo")
-    with Store(tmp_path / "store") as store:
-        found = store.sql(
-            "SELECT onset_step, policy_before, behaviour_policy, policy_after FROM events"
-            " ORDER BY onset_step"
-        ).fetchall()
-    assert found == [(0, "p", "p", "p"), (2, "p", "p", "o"), (5, "o", "o", "o")]
