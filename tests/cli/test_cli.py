@@ -83,9 +83,7 @@ sys.exit(cli.main([]))
 """
 
 
-@pytest.mark.parametrize(
-    "python", [["-m", "restock", "--help"], ["-m", "restock", "info", "--help"], ["-c", PRINTS]]
-)
+@pytest.mark.parametrize("python", [["-m", "restock", "info", "--help"], ["-c", PRINTS]])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str) -> None:
     read_end, write_end = os.pipe()
@@ -102,58 +100,45 @@ def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str)
     assert done.returncode == 0
 
 
-def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(sample_rows, monkeypatch, capsys):
-    store, query = sample_rows
-    capsys.readouterr()
-    assert cli.main(["sql", str(store), query]) == 0
+def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(store_path, monkeypatch, capsys):
+    store = str(store_path)
+    columns = "i AS number, range(30) AS numbers, '[a]' || chr(10) || 'b' AS text"
+    query = f"SELECT {columns} FROM range(100) AS t(i)"
+    assert cli.main(["sql", store, query]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + 100  # a header, a rule, and every row on one line
     assert lines[0].split() == ["number", "numbers", "text"]
     assert lines[-1].split()[0] == "99"
     assert lines[-1].endswith(r"[a]\nb")
     assert lines[-1].count(",") == 29
-    assert cli.main(["sql", str(store), f"FROM ({query}) LIMIT 2 \\G"]) == 0
+    assert cli.main(["sql", store, f"FROM ({query}) LIMIT 2 \\G"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["row", "number", "numbers", "text"] * 2
 
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    assert cli.main(["sql", str(store), query]) == 0
+    assert cli.main(["sql", store, query]) == 0
     shown, said = capsys.readouterr()
     assert [line.split()[0] for line in shown.splitlines()[2:]] == [str(n) for n in range(40)]
     assert "100 rows, 40 shown" in said
-    assert cli.main(["sql", str(store), f"FROM ({query}) LIMIT 1 \\G"]) == 0
+    assert cli.main(["sql", store, f"FROM ({query}) LIMIT 1 \\G"]) == 0
     assert "… 30 in all" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("columns", "shown"), [(80, 8), (40, 3)])
-def test_a_terminal_leaves_out_columns_in_the_middle(
-    store_path, columns, shown, monkeypatch, capsys
-):
+def test_a_terminal_leaves_out_columns_in_the_middle(store_path, monkeypatch, capsys):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("COLUMNS", "40")
     named = ", ".join(f"{number} AS c_{number}" for number in range(1, 20))
     query = f"SELECT NULL AS first, {named}, {{'a': [1, NULL]}} AS last"
     assert cli.main(["sql", str(store_path), query]) == 0
     out, err = capsys.readouterr()
     header, _, row = out.splitlines()
-    assert max(map(len, out.splitlines())) <= columns
+    assert max(map(len, out.splitlines())) <= 40
     assert header.split()[0] == "first"
     assert header.split()[-1] == "last"
     assert header.split().count("…") == 1
     assert row.split()[0] == "NULL"
     assert row.endswith("{a: [1, NULL]}")
     assert f"21 columns, {len(header.split()) - 1} shown" in err
-
-
-@pytest.fixture
-def sample_rows(tmp_path):
-    """Return a store, and a query of 100 rows with a list of 30 and a text of two lines."""
-    from support.driven_robot import Drive, write_bag
-
-    bag, store = write_bag(Drive(), tmp_path / "bag"), tmp_path / "store"
-    assert cli.main(["ingest", str(bag), "--store", str(store)]) == 0
-    columns = "i AS number, range(30) AS numbers, '[a]' || chr(10) || 'b' AS text"
-    return store, f"SELECT {columns} FROM range(100) AS t(i)"
 
 
 @pytest.mark.parametrize(
@@ -191,15 +176,10 @@ def test_an_empty_path_is_not_the_working_directory(words, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("verb", ["info", "ingest", "sql", "mix"])
-def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(verb, capsys, tmp_path):
-    more = {
-        "ingest": ["--store", str(tmp_path)],
-        "sql": ["SELECT 1"],
-        "mix": ["--mixture", "uniform"],
-    }
-    more["mix"] += ["--out", str(tmp_path / "p")]
-    assert cli.main([verb, "s3://AKIA:hu/sh@bucket/logs", *more.get(verb, [])]) == 2
+@pytest.mark.parametrize("more", ["info", "ingest --store s", "sql FROM", "mix --out p"])
+def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(more, capsys):
+    verb, *words = more.split()
+    assert cli.main([verb, "s3://AKIA:hu/sh@bucket/logs", *words]) == 2
     said = "".join(capsys.readouterr())
     assert "***:***@bucket/logs" in said
     assert "hu/sh" not in said

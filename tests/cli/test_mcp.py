@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 from support.bag_samples import write_bag
-from support.driven_robot import Drive
-from support.driven_robot import write_bag as write_drive
 
 from restock import cli
 
@@ -39,15 +37,7 @@ async def answer(client: Any, tool: str, **arguments: Any) -> Any:
     return text if found.is_error else json.loads(text)
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("mcp")
-    bag = write_drive(Drive(), folder / "bag")
-    assert cli.main(["ingest", str(bag), "--store", str(folder / "store")]) == 0
-    return folder / "store"
-
-
-def test_an_assistant_asks_a_store(store, tmp_path):
+def test_an_assistant_asks_a_store(store_path, tmp_path):
     outside = tmp_path / "secret.csv"
     outside.write_text("a\n1\n")
     refused = {
@@ -84,18 +74,18 @@ def test_an_assistant_asks_a_store(store, tmp_path):
         assert "restock gate RUN" in await answer(client, "gate")
 
     before = sorted(tmp_path.iterdir())
-    ask(store, job, "--rows", "3")
+    ask(store_path, job, "--rows", "3")
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_question_that_takes_too_long_is_stopped(store):
+def test_a_question_that_takes_too_long_is_stopped(store_path):
     endless = "SELECT count(*) FROM range(100000000) a, range(100000000) b"
 
     async def job(client: Any) -> None:
         assert "stopped after 0.5 s" in await answer(client, "sql", query=endless)
         assert "stopped after 0.5 s" in await answer(client, "diagnose")
 
-    ask(store, job, "--seconds", "0.5")
+    ask(store_path, job, "--seconds", "0.5")
 
 
 def test_an_assistant_asks_recordings(tmp_path):

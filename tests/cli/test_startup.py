@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 from support.driven_robot import Drive, write_bag
+from support.stores import one
 
-from restock import cli
+from restock.ingest.store.writer import StoreWriter
 
 OF_LEARNING = {"torch", "mujoco", "gymnasium", "scipy", "altair", "tensorboard", "onnxruntime"}
 SLOW = OF_LEARNING | {"pandas", "pyarrow.dataset", "typeguard", "asyncio", "rosbags", "ruamel.yaml"}
@@ -35,10 +36,9 @@ def test_help_imports_no_library_at_all() -> None:
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("startup")
-    bag = write_bag(Drive(), folder / "bag")
-    assert cli.main(["ingest", str(bag), "--store", str(folder / "store")]) == 0
-    return folder / "store"
+    path = tmp_path_factory.mktemp("startup") / "store"
+    StoreWriter(path).write_all([one(1)])
+    return path
 
 
 def test_a_query_imports_no_learning_and_no_readers(store: Path) -> None:
