@@ -32,8 +32,6 @@ from restock.ingest.propose import drives
 from restock.replay.store.store import Store
 from restock.train.twin.missions import DEFAULT_CONDITIONS
 
-BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
-
 
 def commands(document: Any) -> dict[str, str]:
     return {stage["name"]: stage["command"] for stage in document["stages"]}
@@ -108,35 +106,28 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_robots_own_types_are_read_by_their_definitions(tmp_path: Path) -> None:
+def test_a_robots_own_types_are_read_by_their_definitions(tmp_path, capsys) -> None:
+    """A bumper of an unknown type is asked for, and proposed once its definition is there."""
     message = tmp_path / "definitions" / "neato2_interfaces" / "msg" / "Bump.msg"
     message.parent.mkdir(parents=True)
-    message.write_text(BUMP + "uint8 right_side\n")
+    sides = ("left_front", "left_side", "right_front", "right_side")
+    message.write_text("".join(f"uint8 {side}\n" for side in sides))
     bag = SHARED / "fleet-neato" / "2024-danpark" / "drive_square"
-    to = Settings((str(bag),), tmp_path / "out", definitions=str(message.parents[2]))
-    work = Work(to.out, cli.main, lambda line: None)
-    (recording,) = work.do(stages.info(to)).document["recordings"]
-    assert recording["topics"]["/bump"]["skipped"] is None
-    assert "--definitions" in recording["topics"]["/accel"]["skipped"]
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_bumper_of_an_unknown_type_is_asked_for_and_proposed(tmp_path, capsys) -> None:
-    message = tmp_path / "definitions" / "neato2_interfaces" / "msg" / "Bump.msg"
-    message.parent.mkdir(parents=True)
-    message.write_text(BUMP + "uint8 right_side\n")
-    bag = SHARED / "fleet-neato" / "2024-danpark" / "drive_square"
+    definitions = str(message.parents[2])
     words = ["profile", "new", str(bag), "--hindsight-goals", "--out"]
     cli.main([*words, str(tmp_path / "without.toml")])
     asked = "a topic /bump of unknown type neato2_interfaces/msg/Bump is there: give its definition"
     assert asked in capsys.readouterr().err
-    with_type = ["--definitions", str(message.parents[2])]
-    cli.main([*words, str(tmp_path / "with.toml"), *with_type])
+    cli.main([*words, str(tmp_path / "with.toml"), "--definitions", definitions])
     assert asked not in capsys.readouterr().err
     bumper = load_profile(str(tmp_path / "with.toml")).inputs.bumper
     assert bumper is not None
-    pressed = "left_front or left_side or right_front or right_side"
-    assert (bumper.topic, bumper.fields["pressed"]) == ("/bump", pressed)
+    assert (bumper.topic, bumper.fields["pressed"]) == ("/bump", " or ".join(sides))
+    to = Settings((str(bag),), tmp_path / "out", definitions=definitions)
+    work = Work(to.out, cli.main, lambda line: None)
+    (recording,) = work.do(stages.info(to)).document["recordings"]
+    assert recording["topics"]["/bump"]["skipped"] is None
+    assert "--definitions" in recording["topics"]["/accel"]["skipped"]
 
 
 def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkeypatch, capsys):

@@ -17,7 +17,7 @@ from restock.ingest.store.damaged_files import verify_store
 from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.store import Store
 
-FLIPS = 16
+FLIPS = 8
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ by name, and only when a name is asked for; no module of Restock imports from th
 """
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -158,8 +158,10 @@ MODULES = {
 }
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Yield what a file imports of Restock, as paths: `ingest/task/task`, `errors`."""
+@cache
+def imports(path: Path) -> set[str]:
+    """Return what a file imports of Restock, as paths: `ingest/task/task`, `errors`."""
+    found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
@@ -171,9 +173,8 @@ def imports(path: Path) -> Iterator[str]:
                 is_module = inside.replace(".", "/").removeprefix("restock/") in MODULES
                 shared = node.module == "restock"
                 names.append(inside if is_module or shared else node.module or "")
-        for name in names:
-            if name.startswith("restock."):
-                yield name.removeprefix("restock.").replace(".", "/")
+        found |= {name for name in names if name.startswith("restock.")}
+    return {name.removeprefix("restock.").replace(".", "/") for name in found}
 
 
 def edges(folder: str) -> dict[str, str]:
@@ -239,7 +240,7 @@ def test_the_front_door_is_small_and_nothing_behind_it_uses_it() -> None:
     faces = {name.removesuffix("/__init__") for name in FRONT_DOOR}
     for paths in FOLDERS.values():
         for path in paths:
-            assert not faces & set(imports(path)) or path.name == "__init__.py", path
+            assert not faces & imports(path) or path.name == "__init__.py", path
 
 
 def test_the_twin_knows_no_learner() -> None:
@@ -250,7 +251,7 @@ def test_the_twin_knows_no_learner() -> None:
 @pytest.mark.parametrize("name", sorted(SHARED))
 def test_what_all_share_imports_no_room(name: str) -> None:
     compiled = {"_native"} if name == "native" else set()
-    assert set(imports(ROOT / "src" / "restock" / f"{name}.py")) <= SHARED | compiled
+    assert imports(ROOT / "src" / "restock" / f"{name}.py") <= SHARED | compiled
 
 
 @pytest.mark.parametrize("room", ["ingest", "replay", "train"])

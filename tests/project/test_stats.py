@@ -112,19 +112,6 @@ def test_an_interval_is_cut_at_the_range_of_its_quantity() -> None:
     assert np.isnan([unknown.low, unknown.high]).all()
 
 
-def test_over_five_seeds_t_covers_and_a_bootstrap_does_not() -> None:
-    rng = np.random.default_rng(0)
-    t_hits = bootstrap_hits = 0
-    for _ in range(500):
-        ahead = rng.normal(0.1, 0.06, 5)
-        interval, _ = paired_t(ahead)
-        t_hits += interval.low <= 0.1 <= interval.high
-        low, high = percentiles(ahead[rng.integers(5, size=(400, 5))].mean(axis=1))
-        bootstrap_hits += low <= 0.1 <= high
-    assert t_hits / 500 == pytest.approx(0.95, abs=0.03)
-    assert bootstrap_hits / 500 < 0.88
-
-
 @pytest.mark.parametrize(("runs", "episodes"), [(3, 40), (5, 60)])
 def test_a_difference_of_arms_covers_seeds_and_episodes(runs: int, episodes: int) -> None:
     rng = np.random.default_rng(1)

@@ -37,6 +37,7 @@ from restock.replay.store.store import Store
 
 AUDITS = {audit.name: audit for audit in shipped_audits()}
 Tables = tuple[pa.Table, pa.Table]  # transitions, recordings
+TABLE = re.compile(r"\b(FROM|INTO|UPDATE) (transitions|recordings)\b")  # named by a fault
 
 
 @pytest.fixture(scope="module")
@@ -62,25 +63,13 @@ FAULTS = [  # audit, rows that it finds, part of the first of them, SQL that pla
 ]
 
 
-def planted(clean: Tables, sql: str) -> Tables:
-    """Return the tables after statements that change them."""
-    with duckdb.connect() as connection:
-        connection.execute("CREATE MACRO number(name) AS right(name, 1)::INTEGER")
-        for name, table in zip(("transitions", "recordings"), clean, strict=True):
-            connection.register("given", table)
-            connection.execute(f"CREATE TABLE {name} AS FROM given")
-        connection.execute(sql).fetchall()
-        transitions, recordings = (
-            connection.table(name).to_arrow_table() for name in ("transitions", "recordings")
-        )
-    return transitions, recordings
-
-
-def found(tables: Tables, names: list[str], **stricter: float) -> list[Finding]:
+def found(tables: Tables, names: list[str], sql: str = "", **stricter: float) -> list[Finding]:
+    """Return what audits find, once statements have changed the tables."""
     thresholds = load_thresholds()
     chosen = {n: thresholds[n] | stricter for n in names if AUDITS[n].parameters}
     with duckdb.connect() as connection:
-        views_over(connection, *tables)
+        connection.execute("CREATE MACRO number(name) AS right(name, 1)::INTEGER")
+        views_over(connection, *tables, planted=TABLE.sub(r"\1 stored_\2", sql))
         return run_audits(connection, [AUDITS[name] for name in names], chosen)
 
 
@@ -109,7 +98,7 @@ def test_each_audit_finds_its_planted_fault_and_nothing_else(
     clean, statuses, name, rows, first, sql
 ):
     assert statuses[name] == "pass" or name in NOT_CLEAN
-    (finding,) = found(planted(clean, sql), [name], **STRICTER.get(name, {}))
+    (finding,) = found(clean, [name], sql, **STRICTER.get(name, {}))
     assert finding.rows == rows
     expected = {"error": "fail", "warning": "warn", "info": "info"}[AUDITS[name].severity]
     assert finding.status == expected

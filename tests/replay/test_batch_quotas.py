@@ -164,20 +164,17 @@ def test_another_plan_changes_what_logged_rows_give():
 def ring_of(strata: list[int], rows: int = 40) -> FreshRing:
     """Return a ring in which one ended episode's steps are in these strata, -1: in none."""
     ring = FreshRing(rows, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
-    key = 0
-    for step in range(len(strata)):
-        (key,) = ring.append(
-            observation=np.zeros((1, 1)),
-            action=np.zeros(1),
-            reward=np.zeros(1),
-            terminated=np.array([step == len(strata) - 1]),
-            truncated=np.zeros(1, np.bool_),
-            next_observation=np.zeros((1, 1)),
-            env_step=step,
-            gradient_step=0,
-        )
-    ring.set_labels(int(key), np.zeros(len(strata), np.int64), np.array(strata))
+    keys = [append(ring, step, ends=step == len(strata) - 1) for step in range(len(strata))]
+    ring.set_labels(keys[-1], np.zeros(len(strata), np.int64), np.array(strata))
     return ring
+
+
+def append(ring: FreshRing, step: int, ends: bool = False) -> int:
+    """Append a step, and return its episode's key."""
+    values = dict.fromkeys(("action", "reward"), np.zeros(1))
+    values |= dict.fromkeys(("observation", "next_observation"), np.zeros((1, 1)))
+    ended = {"terminated": np.array([ends]), "truncated": np.array([False])}
+    return int(ring.append(**values, **ended, env_step=step, gradient_step=0)[0])
 
 
 def test_a_ring_gives_rows_of_a_stratum_and_none_too_often():
@@ -200,16 +197,7 @@ def test_a_row_that_is_overwritten_leaves_its_stratum():
     again.load_state_dict(state)
     np.testing.assert_array_equal(again.draws, ring.draws)
     for _ in range(2):
-        ring.append(
-            observation=np.zeros((1, 1)),
-            action=np.zeros(1),
-            reward=np.zeros(1),
-            terminated=np.zeros(1, np.bool_),
-            truncated=np.zeros(1, np.bool_),
-            next_observation=np.zeros((1, 1)),
-            env_step=9,
-            gradient_step=0,
-        )
+        append(ring, 9)
     assert ring.by_stratum.counts.tolist() == [0, 2]
     assert ring.stratum.tolist() == [-1, -1, 1, 1]
     assert ring.draws[:2].tolist() == [0, 0]

@@ -9,24 +9,9 @@ from support.stores import recording_transitions, write_store
 
 from restock import cli
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.transitions import replaced
-from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
-from restock.replay.panel.panel import Panel
 from restock.replay.store.audit import recommend_capacity
 from restock.replay.store.store import Store
-
-MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
-
-
-@pytest.fixture(scope="module")
-def panel(tmp_path_factory) -> Panel:
-    """Of rows of the twin's task."""
-    task = load_profile("warehouse_amr").task
-    rows = recording_transitions(1, episodes=10, task=task)
-    path = tmp_path_factory.mktemp("panels") / "panel"
-    return build_panel(rows, parse_mixture(MIXTURE), path, task=task)
 
 
 def newest_first(transitions: pa.Table) -> list[dict[str, object]]:

@@ -89,28 +89,6 @@ def test_whose_drive_it_was_goes_along(tmp_path):
     assert "robot" not in pq.read_schema(out).names
 
 
-def test_whole_episodes_come_back_in_order(store_path, transitions):
-    found, counts = of(store_path)
-    rows = ordered(transitions)
-    assert counts.rows == counts.transitions == len(rows)
-    assert counts.cut == 0
-    assert counts.terminated == int(np.sum(rows["terminated"].to_numpy()))
-    assert counts.truncated == int(np.sum(rows["truncated"].to_numpy()))
-    observations = np.concatenate([t.observations[:-1] for t in found])
-    after = np.concatenate([t.observations[1:] for t in found])
-    np.testing.assert_array_equal(observations, matrix(rows["observation"]))
-    np.testing.assert_array_equal(after, matrix(rows["next_observation"]))
-    for name, column in (("rewards", "reward"), ("actions", "action")):
-        joined = np.concatenate([getattr(t, name) for t in found])
-        np.testing.assert_array_equal(joined, rows[column].to_numpy())
-    ids = np.concatenate([t.carried["transition_id"] for t in found])
-    np.testing.assert_array_equal(ids, rows["transition_id"].to_numpy())
-    assert [t.terminated for t in found] == [
-        end for end, cut in zip(rows["terminated"].to_pylist(), rows["truncated"].to_pylist(),
-                                strict=True) if end or cut
-    ]  # fmt: skip
-
-
 def test_an_episode_is_cut_where_a_query_leaves_rows_out(store_path, transitions):
     found, counts = of(store_path, query=SLIP)
     slipping = {
@@ -224,12 +202,15 @@ def provenance_in(to: str, out: Path) -> Any:
 
 
 def test_parquet_reads_back(store_path, tmp_path, transitions):
-    export_dataset(store_path, "parquet", tmp_path / "a.parquet")
+    document = export_dataset(store_path, "parquet", tmp_path / "a.parquet")
     table, rows = pq.read_table(tmp_path / "a.parquet"), ordered(transitions)
+    assert (document["rows"], document["transitions"], document["cut"]) == (len(rows), len(rows), 0)
     for name in ("observation", "next_observation"):
         np.testing.assert_array_equal(matrix(table[name]), matrix(rows[name]))
     for name in ("action", "reward", "terminated", "truncated", "transition_id", "condition"):
         assert table[name].to_pylist() == rows[name].to_pylist()
+    for name in ("terminated", "truncated"):
+        assert document[name] == sum(rows[name].to_pylist())
     export_dataset(store_path, "parquet", tmp_path / "b.parquet", continuous=True)
     commands = [rows[f"command_{name}"].to_numpy() for name in ("speed_mps", "yaw_rate_radps")]
     given = matrix(pq.read_table(tmp_path / "b.parquet")["action"])

@@ -75,14 +75,6 @@ def test_a_stratum_lacks_what_its_share_would_draw_too_often(store):
     assert 0.7 < filled.closes_with < 0.9  # what was asked for, .8
 
 
-def test_a_store_that_has_what_is_asked_for_has_no_gaps(store):
-    mixture = parse_mixture(ASKING.replace("1000", "10"))
-    with Store(store) as opened:
-        yields, gaps = find_gaps(opened, mixture, name="mine", kinds=KINDS)
-    assert not gaps
-    assert shopping_list(yields, gaps).orders == []
-
-
 def test_audits_and_cells_ask_too(store):
     mixture = parse_mixture(ASKING.replace("1000", "10"))
     limits = {
@@ -160,8 +152,6 @@ def test_a_gap_names_its_action(tmp_path, capsys):
     cells = [one for one in gaps if one["asked_by"] == "audit missing_cells"]
     (gap,) = [one for one in cells if (one["condition"], one["action"]) == ("wheel_slip", 3)]
     assert (gap["action_name"], gap["cell"]) == ("turn left 1.2", "wheel_slip, turn left 1.2")
-    assert main(["coverage", "gaps", str(path)]) == 0
-    assert "turn left 1.2" in capsys.readouterr().out
     assert main(["coverage", str(path), "--out", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text("utf-8")
     assert "turn left 1.2" in page

@@ -26,7 +26,7 @@ from restock.replay.trace.origin import MessageAtTick, messages_at_tick
 
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"
-ROWS = 10  # each reads the recording again
+ROWS = 6  # each reads the recording again
 # The wheel's joint says more often than the command what time it is, and after the last of them.
 SIGNALS = """
 [signals.left_wheel_radps]

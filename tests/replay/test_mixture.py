@@ -25,13 +25,8 @@ from restock.replay.mixture.mixture import (
     parse_mixture,
 )
 from restock.replay.mixture.shares import plan_shares, wanted_shares
-from restock.replay.plan.plan import PanelPlan
-from restock.replay.plan.strata import ResolvedStratum, assign, resolve_strata
-from restock.replay.plan.weights import effective_count, effective_shares, importance_weights
-
-
-def shares(plan: PanelPlan) -> dict[str, float]:
-    return {line.name: line.share for line in plan.strata}
+from restock.replay.plan.strata import ResolvedStratum, resolve_strata
+from restock.replay.plan.weights import importance_weights
 
 
 @pytest.mark.parametrize(
@@ -211,20 +206,6 @@ def test_priority_decides_overlap(transitions):
     assert 0 < count(500) < fast  # before nominal, after every condition
 
 
-def strata_of(*timings: str, correction: str = "full") -> list[ResolvedStratum]:
-    return [
-        ResolvedStratum(
-            StratumRule(name=f"s{i}"),
-            "true",
-            None,
-            i,
-            timing,  # type: ignore[arg-type]
-            "none" if timing == "pre" else correction,  # type: ignore[arg-type]
-        )
-        for i, timing in enumerate(timings)
-    ]
-
-
 def test_strata_take_their_timing_from_conditions():
     conditions = [Condition("slip", "post", "x", 30), Condition("blocked", "pre", "x", 40)]
     mixture = parse_mixture("[correction]\npost = 'clipped'\n" + EVERY)
@@ -235,36 +216,6 @@ def test_strata_take_their_timing_from_conditions():
     assert found["slip"].priority == 30
     where = parse_mixture("[[strata]]\nname = 'x'\nwhere = 'action = 1'\n")
     assert resolve_strata(where, conditions)[0].timing == "post"  # the safe assumption
-
-
-def test_full_correction_keeps_the_outcomes_of_a_state():
-    """States a and b; in each, one row in ten has the outcome that stratum 0 collects."""
-    rng = np.random.default_rng(0)
-    count = 20_000
-    in_b = np.arange(count) % 20 == 0  # state b is rare, and its stratum is boosted
-    outcome = rng.random(count) < 0.1
-    strata = strata_of("post", "pre", "pre")
-    member = np.stack([outcome, in_b, np.ones(count, np.bool_)], axis=1)
-    code = assign(member, strata)
-    state = assign(member, strata, only_pre=True)
-    given = np.array([0.5, 0.3, 0.2])
-    rule = CorrectionRule()
-    weights = importance_weights(code, state, strata, given, rule)
-    drawn = (given / np.bincount(code))[code] * weights  # expected weight of each row in a batch
-    assert drawn.sum() == pytest.approx(1, rel=1e-4)
-    for in_state in (in_b, ~in_b):
-        share = drawn[in_state & outcome].sum() / drawn[in_state].sum()
-        assert share == pytest.approx(outcome[in_state].mean(), rel=1e-4)
-    # The state that was boosted stays boosted.
-    assert drawn[in_b].sum() > 5 * in_b.mean()
-    after = effective_shares(code, weights, given)
-    assert after.sum() == pytest.approx(1)
-    assert after[0] == pytest.approx(drawn[outcome].sum(), rel=1e-4)
-    # Without correction the outcome is five times as frequent as it was.
-    raw = importance_weights(
-        code, state, strata_of("post", "pre", "pre", correction="none"), given, rule
-    )
-    np.testing.assert_allclose(raw, 1.0, rtol=1e-5)
 
 
 def test_the_state_of_a_slip_is_nominal_if_nothing_was_known(transitions):
@@ -294,19 +245,16 @@ def test_clip_stands_between_none_and_full():
     given = np.array([0.5, 0.5])
 
     def ratio(correction: str, **rule: float) -> float:
-        strata = strata_of("post", "pre", correction=correction)
+        strata = [
+            ResolvedStratum(StratumRule(name="outcome"), "true", None, 0, "post", correction),  # type: ignore[arg-type]
+            ResolvedStratum(StratumRule(name="nominal"), "true", None, 1, "pre", "none"),
+        ]
         weights = importance_weights(code, state, strata, given, CorrectionRule(**rule))
         return float(weights[-1] / weights[0])
 
     assert ratio("none") == pytest.approx(1)
     assert ratio("full") == pytest.approx(99)  # boosted 50 times, the others 50/99 times
     assert ratio("clipped", clip=4.0) == pytest.approx(4)
-
-
-def test_effective_count():
-    assert effective_count(np.array([5, 5, 5])) == pytest.approx(3)
-    assert effective_count(np.array([100, 1, 1])) < 1.1
-    assert effective_count(np.array([])) == 0
 
 
 def test_the_plan_counts_replays(transitions):

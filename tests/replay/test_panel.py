@@ -186,26 +186,6 @@ def test_the_id_names_the_content_and_the_packing(transitions, tmp_path, monkeyp
         Panel.open(tmp_path / "a")
 
 
-@pytest.mark.parametrize("by", ["episode", "recording", "time"])
-def test_held_out_data_shares_no_episode_with_the_panel(transitions, tmp_path, by):
-    panel = build_panel(transitions, uniform(by=by), tmp_path / "p")
-    held = pq.read_table(panel.path / "evaluation_split.parquet")
-    assert 0 < len(held) < 0.5 * len(transitions)
-    assert len(held) + len(panel) == len(transitions)
-    column = "recording_id" if by == "recording" else "episode_id"
-    assert not set(held[column].to_pylist()) & set(panel.meta[column].to_pylist())
-    if by == "time":
-        newest = max(panel.meta["stamp_ns"].to_pylist())
-        stamps = dict(
-            zip(
-                transitions["transition_id"].to_pylist(),
-                transitions["stamp_ns"].to_pylist(),
-                strict=True,
-            )
-        )
-        assert min(stamps[i] for i in held["transition_id"].to_pylist()) > newest
-
-
 def test_rows_of_two_tasks_are_refused_unless_one_is_chosen(tmp_path):
     other = Task(body=TASK.body, actions=TASK.actions, sectors=6)
     path = write_store(tmp_path / "store", [recording_transitions(1)])

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
-from support.paths import ROOT, SHARED
+from support.paths import SHARED
 from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
@@ -19,15 +19,7 @@ from restock.replay.store.same_drives import install_shared_rows
 from restock.replay.store.store import Store
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 
-MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
 NEATO = SHARED / "fleet-neato"
-
-
-def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> list[dict[str, object]]:
-    """Return what `restock sql STORE QUERY --json` prints."""
-    assert main(["sql", *map(str, arguments), "--json"]) == 0
-    rows: list[dict[str, object]] = json.loads(capsys.readouterr().out)
-    return rows
 
 
 def audited(store: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, list[dict[str, object]]]:
@@ -54,23 +46,6 @@ def copy_of(
         "stamp_ns": part["stamp_ns"].to_numpy() + moved,
     }
     return replaced(part, values)
-
-
-@pytest.mark.long
-def test_a_salvaged_part_and_the_whole_recording(tmp_path, capsys):
-    content = MONDAY.read_bytes()
-    (tmp_path / "part.mcap").write_bytes(content[: len(content) // 5])
-    store = str(tmp_path / "store")
-    assert main(["ingest", str(tmp_path / "part.mcap"), "--salvage", "--store", store]) == 3
-    assert main(["ingest", str(MONDAY), "--store", store]) == 0
-    (found,) = audited(Path(store), capsys)["repeated_steps"]
-    query = "SELECT min(transitions) AS rows FROM recordings"
-    (part,) = printed(capsys, store, query)
-    assert found["rows"] == part["rows"]
-    assert found["share"] == 1.0
-    # Each ingest estimates the offset of its clocks: not one stamp is the same.
-    same = "SELECT stamp_ns FROM transitions GROUP BY ALL HAVING count(*) > 1"
-    assert printed(capsys, store, same) == []
 
 
 @pytest.mark.long

@@ -101,16 +101,10 @@ def audited(place: Path, **options: Any) -> dict[str, str]:
     return status | pairs
 
 
-PAIR = "nominal: planner 1 > agent 1"
-
-
-def test_a_reward_that_pays_for_haste_fails(tmp_path):
-    paid_for_haste = store_of(tmp_path / "earlier", hasty_and_careful(earlier, 120))
-    found = audited(paid_for_haste, discount=0.97)
-    assert (found["reward_order"], found[PAIR]) == ("fail", "reversed")
-    stops = store_of(tmp_path / "shipped", hasty_and_careful(shipped, 120))
-    found = audited(stops)
-    assert found == {"reward_order": "pass", "reward_undetermined": "pass", PAIR: "agrees"}
+def test_a_reward_that_does_not_pay_for_haste_passes(tmp_path):
+    found = audited(store_of(tmp_path / "store", hasty_and_careful(shipped, 120)))
+    pair = {"nominal: planner 1 > agent 1": "agrees"}
+    assert found == {"reward_order": "pass", "reward_undetermined": "pass"} | pair
 
 
 def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, capsys):

@@ -124,15 +124,6 @@ def advance(ring: FreshRing, drive: Drive, steps: int) -> None:
             ring.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
 
 
-def test_the_oldest_rows_go_first():
-    ring, drive = filled(capacity=20, steps=100)
-    kept = ring.meta["env_step"]
-    assert len(ring) == 20
-    assert ring.appended > 20
-    # 2 environments: rows of the last ten or so steps, n-step rows lag by up to two.
-    assert kept.min() >= len(drive.steps) - 14
-
-
 def test_labels_put_rows_in_strata_and_eviction_takes_them_out():
     ring, _ = filled(capacity=30, steps=200)
     ended = ~np.isin(ring.meta["episode"][: len(ring)], ring.episode_key)

@@ -193,14 +193,19 @@ def views_over(
     transitions: pa.Table,
     recordings: pa.Table,
     observation_type: str = "FLOAT[]",
+    planted: str = "",
 ) -> Definitions:
-    """Return the views of a store over these rows, no summaries; `install_named` adds views."""
+    """Return the views of a store over these rows, no summaries; `install_named` adds views.
+
+    `planted` are statements that change the stored tables before.
+    """
     with passed_in(connection, given=transitions, manifests=recordings):
         connection.execute(
             "CREATE TABLE stored_transitions AS FROM given;"
-            " CREATE TABLE stored_recordings AS FROM manifests;"
+            f" CREATE TABLE stored_recordings AS FROM manifests; {planted};"
             " CREATE TABLE stored_ingests AS SELECT recording_id, ingest_id, count(*) AS rows,"
-            " recording_id || '/' || ingest_id || '.parquet' AS file FROM given GROUP BY ALL"
+            " recording_id || '/' || ingest_id || '.parquet' AS file FROM stored_transitions"
+            " GROUP BY ALL"
         )
     made = Definitions(connection, observation_type)
     _kept.append(made)  # as a store keeps its own
