@@ -1,4 +1,4 @@
-"""Clocks compared: offset, jumps, backsteps, repeated and zero stamps, by hand and as shown."""
+"""Clocks compared, and log time mapped at another pace: rows pair what belonged together."""
 
 import itertools
 import json
@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import LATENCY_NS, SPEED_MPS, START_NS, Drive, write_bag
+from support.ingested import ingested
 
 from restock.cli import main
-from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.steps.align import NS
-from restock.ingest.steps.clocks import STAMP, topic_clock
+from restock.errors import RecordingError
+from restock.ingest.decoding.columns import TopicColumns, join
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.tables import Clock
+from restock.ingest.steps.align import NS, align
+from restock.ingest.steps.clocks import STAMP, ClockMap, topic_clock
+from restock.ingest.steps.episodes import steps_of
 
 
 def topic(stamps: list[int], logs: list[int] | None = None) -> TopicColumns:
@@ -83,3 +88,173 @@ def test_messages_logged_out_of_order_are_counted(tmp_path, capsys):
     assert main(["info", str(write_mcap(tmp_path / "a.mcap")), "--clocks", "--json"]) == 0
     topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
     assert topics["/odom"]["clock"]["log_backsteps"] == 1
+
+
+DAY = 1_700_000_000 * NS
+
+
+def test_a_pause_is_a_flat_piece_and_a_constant_offset_one_knot() -> None:
+    log = DAY + np.array([0, 1, 2, 12, 13], np.int64) * NS  # the simulation stood for ten seconds
+    stamp = np.array([0, 1, 2, 2, 3], np.int64) * NS
+    fitted = ClockMap.through(log, stamp)
+    assert fitted.stamped(DAY + np.array([7 * NS, 12 * NS + NS // 2])).tolist() == [
+        2 * NS,
+        NS * 5 // 2,
+    ]
+    fixed = ClockMap.constant(DAY)
+    assert fixed.is_constant
+    assert fixed.stamped(log).tolist() == (log - DAY).tolist()
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**12), st.integers(0, 10**12)), min_size=1, max_size=40))
+def test_it_never_goes_back_and_meets_its_newest_stamps(pairs: list[tuple[int, int]]) -> None:
+    log, stamp = (np.array(column, np.int64) + DAY for column in zip(*pairs, strict=True))
+    fitted = ClockMap.through(log, stamp)
+    at = np.sort(
+        np.concatenate([log, log + 1, np.linspace(log.min(), log.max(), 50).astype(np.int64)])
+    )
+    assert (np.diff(fitted.stamped(at)) >= 0).all()
+    for one in np.unique(log):
+        newest = stamp[log <= one].max()
+        assert fitted.stamped(np.array([one]))[0] == newest
+
+
+PACES = [0.5, 0.97, 1.0]
+
+
+def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None):
+    """Return messages received at `pace` of log time; `pause` is (stamped, log time) in s."""
+
+    def received(times: np.ndarray) -> np.ndarray:
+        since = times - START_NS
+        late = np.rint(since / pace).astype(np.int64)
+        if pause is not None:
+            late = late + np.where(since >= round(pause[0] * NS), round(pause[1] * NS), 0)
+        return START_NS + late
+
+    return {
+        name: TopicColumns(received(c.log_time_ns), received(c.publish_time_ns), c.fields)
+        for name, c in topics.items()
+    }
+
+
+def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
+    """Return a drive whose command is the x at which it was given: each row tells when it was."""
+    topics = Drive(duration_s, goals=[(0.0, 40.0, 1.0)]).topics()
+    command = topics["/cmd_vel"]
+    given_s = (command.log_time_ns - START_NS) * 1e-9
+    command.fields["linear.x"] = 1.0 + SPEED_MPS * given_s
+    return topics
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_command_and_state_of_a_row_are_within_one_hold(pace: float) -> None:
+    profile = load_profile("warehouse_amr")
+    whole = steps_of(profile, turning())
+    steps = steps_of(profile, at_pace(turning(), pace))
+    assert len(steps) >= len(whole) - 2
+    apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
+    assert apart_s.max() <= 0.1 + 0.02  # a pose each .1 s, odometry (the reference) each .02 s
+    assert not steps.clock.off_clock
+    if pace != 1.0:
+        assert steps.clock.pace == pytest.approx(pace, abs=1e-3)
+    else:
+        assert steps.clock.pace is None
+
+
+def logged_s(stamp_ns: np.ndarray, pace: float) -> np.ndarray:
+    """When what is stamped so was received, in seconds from the start, with the drive's latency."""
+    return ((stamp_ns - START_NS) + LATENCY_NS) * 1e-9 / pace
+
+
+def test_a_clock_that_was_set_has_the_log_times_of_each_part() -> None:
+    topics = turning()
+    for columns in topics.values():
+        late = columns.log_time_ns >= START_NS + 15 * NS
+        if "header.stamp" in columns.fields:
+            columns.fields["header.stamp"] = columns.fields["header.stamp"] + late * 3600 * NS
+    steps = steps_of(load_profile("warehouse_amr"), topics)
+    assert steps.clock.jumps == 1
+    assert np.diff(steps.logged_ns).max() < NS
+    assert np.ptp(steps.logged_ns) * 1e-9 == pytest.approx(29.8, abs=0.5)
+
+
+class Slow(Drive):
+    """A drive in a simulation at .3 of real time."""
+
+    def topics(self) -> dict[str, TopicColumns]:
+        return at_pace(super().topics(), 0.3)
+
+
+def test_rows_have_their_log_time_in_sql(tmp_path: Path) -> None:
+    bag = write_bag(Slow(12.0), tmp_path / "bag")
+    query = "SELECT stamp_ns, logged_ns, epoch_ns(logged_time) AS at_ns FROM transitions"
+    with ingested(bag, "warehouse_amr", tmp_path / "s") as opened:
+        rows = opened.sql(query).fetchnumpy()
+    assert np.ptp(rows["logged_ns"]) * 1e-9 > 30
+    seen_s = (rows["logged_ns"] - START_NS) * 1e-9
+    assert seen_s == pytest.approx(logged_s(rows["stamp_ns"], 0.3), abs=0.02)
+    assert np.abs(rows["logged_ns"] - rows["at_ns"]).max() < 1000
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_a_pause_costs_no_row_and_pairs_nothing_wrongly(pace: float) -> None:
+    profile = load_profile("warehouse_amr")
+    steps = steps_of(profile, at_pace(turning(), pace, pause=(12.0, 0.6)))
+    apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
+    assert len(steps) >= 148
+    assert apart_s.max() <= 0.12
+
+
+def test_a_simulation_reset_starts_a_segment_with_its_own_map() -> None:
+    profile = load_profile("warehouse_amr")
+    first = at_pace(turning(20.0), 0.5)
+    second = at_pace(turning(20.0), 0.9)
+    end = max(int(c.log_time_ns[-1]) for c in first.values()) + NS - START_NS
+    topics = {
+        name: TopicColumns(
+            np.concatenate([c.log_time_ns, second[name].log_time_ns + end]),
+            np.concatenate([c.publish_time_ns, second[name].publish_time_ns + end]),
+            {path: join([column, second[name].fields[path]]) for path, column in c.fields.items()},
+        )
+        for name, c in first.items()
+    }
+    steps = steps_of(profile, topics)
+    assert steps.clock.jumps == 1
+    assert set(steps.segment.tolist()) == {0, 1}
+    apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
+    assert apart_s.max() <= 0.12
+    assert len(steps) >= 195
+
+
+def test_clock_is_followed_where_it_was_recorded() -> None:
+    stamp = np.arange(0, 20 * NS, NS // 2, dtype=np.int64)  # a stamped topic, twice a second
+    time = np.arange(0, 20 * NS, NS // 50, dtype=np.int64)  # /clock, fifty times
+    pace = np.where(time < 10 * NS, 2.0, 1.25)  # half speed, then four fifths
+    log = START_NS + np.concatenate([[0], np.cumsum(np.diff(time) * pace[:-1])]).astype(np.int64)
+    topics = {
+        "/odom": TopicColumns(log[::25], log[::25], {"header.stamp": stamp}),
+        "/cmd": TopicColumns(log[7::10], log[7::10], {}),
+    }
+    clock = {"/clock": TopicColumns(log, log, {"clock": time})}
+    (segment,), report = align(topics | clock, Clock())
+    assert report.mapped_by == "/clock"
+    assert np.abs(segment.topics["/cmd"].stamp_ns - time[7::10]).max() <= 1
+    assert "/clock" not in segment.topics
+
+
+def test_what_cannot_be_mapped_is_refused_with_the_remedy() -> None:
+    rng = np.random.default_rng(0)
+    stamp = np.arange(0, 60 * NS, NS // 2, dtype=np.int64)
+    log = START_NS + np.sort(stamp * 3 // 2 + rng.integers(0, 600_000_000, len(stamp)))
+    topics = {
+        "/odom": TopicColumns(log, log, {"header.stamp": stamp}),
+        "/cmd": TopicColumns(log, log, {}),
+    }
+    with pytest.raises(
+        RecordingError, match=r"/odom gives the time of a message only within 0\.\d+ s"
+    ) as e:
+        align(topics, Clock())
+    assert e.value.remedy == 'set [clock] alignment = "log_time" in the profile'
+    del topics["/cmd"]  # nothing is without a stamp: there is nothing to map
+    assert len(align(topics, Clock())[0][0].topics["/odom"].row) == 120

@@ -1,17 +1,37 @@
-"""Conditions: what they say of a step, and that `pre` ones never look at what comes after."""
+"""Conditions and exposures: what they say of a step, how surely, and what is refused."""
+
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.driven_robot import Drive, write_bag
+from support.profile_texts import WAREHOUSE
+from support.profile_texts import WAREHOUSE as TEXT
 from support.step_tables import changed, steps
+from support.stores import recording_transitions, write_store
 
+from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
+from restock.ingest.store.transitions import replaced
 from restock.ingest.task import conditions
-from restock.ingest.task.conditions import Condition, label, let_values, primary, shipped
+from restock.ingest.task.conditions import (
+    Condition,
+    label,
+    labels_version,
+    let_values,
+    primary,
+    probabilities,
+    settings_of,
+    shipped,
+    too_near_to_call,
+)
 from restock.ingest.task.task import STAND_IN_LIMITS, Noise
+from restock.replay.store.store import Store
 
 SHIPPED = list(shipped().values())
 
@@ -334,3 +354,216 @@ def test_what_a_rule_goes_by_can_be_looked_at():
     assert found[1:].tolist() == [0.5, -0.25]
     with pytest.raises(ConfigError, match=r"VARCHAR|string"):
         let_values(table, Condition(name="text", timing="pre", sql="true", let={"word": "'a'"}))
+
+
+FILE = """-- Fast, for a while.
+-- timing: pre
+-- priority: 35
+-- uncertain: 0.1 to 0.6
+-- let over_mps:
+wheel_speed_mps - 0.5 -- of half a metre a second
+-- let smooth_mps:
+avg(over_mps) OVER (episode ROWS BETWEEN 1 PRECEDING AND CURRENT ROW)
+-- label:
+smooth_mps > 0
+-- probability:
+CASE WHEN step_index > 0 THEN 1 / (1 + exp(-smooth_mps / lidar_noise_m)) END
+"""
+
+
+def condition(text: str = FILE, noise_m: float = 0.1) -> Condition:
+    made = Condition(name="fast", **settings_of(text))
+    return made.with_constants(Noise(lidar_m=noise_m).constants)
+
+
+def test_parts_of_a_condition_file():
+    fast = condition()
+    assert (fast.doc, fast.timing, fast.priority) == ("Fast, for a while.", "pre", 35)
+    assert list(fast.let) == ["over_mps", "smooth_mps"]
+    assert fast.constants == {"lidar_noise_m": 0.1}  # what it names, and no more
+    table = steps(5, wheel_speed_mps=np.array([0.5, 0.7, 0.1, 0.9, 0.9]))
+    assert label(table, [fast])["fast"].tolist() == [False, True, False, False, True]
+    given = probabilities(table, [fast])["fast"]
+    assert np.isnan(given[0])
+    np.testing.assert_allclose(given[1:], 1 / (1 + np.exp([-1, 1, 0, -4])), rtol=1e-5)
+    near = too_near_to_call({"fast": given}, [fast])["fast"]
+    assert near.tolist() == [False, False, True, True, False]
+
+
+def test_more_noise_makes_a_probability_less_sure():
+    table = steps(3, wheel_speed_mps=np.array([0.5, 0.7, 0.9]))
+    sure, unsure = (probabilities(table, [condition(noise_m=n)])["fast"][2] for n in (0.05, 0.5))
+    assert sure > 0.95 > unsure > 0.5
+
+
+def test_the_version_of_labels_follows_what_can_change_them():
+    plain = Condition("fast", "pre", "wheel_speed_mps > 1")
+    assert labels_version([plain]) == labels_version([plain.with_constants(Noise().constants)])
+    versions = {
+        labels_version([condition(text, noise)])
+        for text in (FILE, FILE.replace("0.1 to", "0.3 to"), FILE.replace("0.5 --", "0.6 --"))
+        for noise in (0.1, 0.2)
+    }
+    assert len(versions) == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (FILE.replace("wheel_speed_mps - 0.5", "lead(wheel_speed_mps) OVER episode"), "'over_mps"),
+        (FILE.replace("let smooth_mps", "let pose_x_m"), "'pose_x_m' is already used"),
+        (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "1.5"), "in \\[0, 1\\]"),
+        (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "'much'"), "not a number"),
+        (FILE.replace("1 / (1 +", "1 / (unheard_of +"), "probability of condition 'fast'"),
+        (FILE.replace("1 / (1 +", "1 / ((SELECT 1) +"), "contains a query"),
+    ],
+)
+def test_a_probability_keeps_the_rules_of_a_label(text, said):
+    with pytest.raises(ConfigError, match=said):
+        probabilities(steps(3), [condition(text)])
+
+
+def test_noise_of_a_profile_does_not_change_rows():
+    usual = parse_profile(WAREHOUSE, where="a")
+    noisy = parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0.05\n", where="b")
+    assert usual.hash == noisy.hash
+    assert usual.labels_version != noisy.labels_version
+    near = next(one for one in noisy.conditions if one.name == "near_collision")
+    assert near.constants == {"lidar_noise_m": 0.05, "tight_clearance_m": 0.15}
+    carried = parse_profile(profile_toml(noisy), where="its text")
+    assert carried.labels_version == noisy.labels_version
+    assert shipped(noisy.constants)["near_collision"] == near
+    with pytest.raises(ConfigError, match="lidar_m"):
+        parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0\n", where="c")
+
+
+OWN = '''
+[[condition]]
+name = "tight"
+timing = "pre"
+sql = """
+min(clearance_m) OVER (episode ROWS BETWEEN {{{0}}} PRECEDING AND CURRENT ROW)
+< tight_clearance_m"""
+'''
+
+
+def test_a_condition_of_ones_own_may_name_limits_and_write_times() -> None:
+    profile = parse_profile(WAREHOUSE + OWN.format("1 s"), where="here")
+    tight = profile.conditions[-1]
+    assert "ROWS BETWEEN 5 PRECEDING" in tight.sql
+    assert tight.constants == {"tight_clearance_m": 0.15}
+    carried = parse_profile(profile_toml(profile), where="its text")
+    assert carried.labels_version == profile.labels_version
+    with pytest.raises(ConfigError, match=r"(?s)tight.*\{1\.6 s\}"):
+        parse_profile(WAREHOUSE + OWN.format("1 min"), where="here")
+
+
+def test_probabilities_stand_beside_how_often_they_are_true(tmp_path):
+    table = recording_transitions(1)
+    truth = ["recovery" if row % 3 else "nominal" for row in range(len(table))]
+    path = write_store(tmp_path / "store", [replaced(table, {"true_condition": truth})])
+    rows = [dict(row).get("recovery") for row in table["probabilities"].to_pylist()]
+    want: dict[float, list[bool]] = {}
+    for told, true in zip(rows, truth, strict=True):
+        if told is not None:
+            want.setdefault(min(int(told * 10), 9) / 10, []).append(true == "recovery")
+    with Store(path) as store:
+        found = store.sql("SELECT from_probability, known, true_share FROM label_reliability")
+        for tenth, known, share in found.fetchall():
+            held = want.pop(tenth)
+            assert (known, share) == (len(held), pytest.approx(np.mean(held)))
+    assert not want
+
+
+LISTED = 'exposures = ["closing_traffic", "plan_blocked", "slippery_floor"]'
+assert LISTED in TEXT
+FAR_OUT = """
+[[condition]]
+name = "far_out"
+kind = "exposure"
+timing = "pre"
+sql = "pose_x_m > 2"
+"""
+
+
+def exposed(table: pa.Table, name: str) -> list[int]:
+    return np.flatnonzero(label(table, [shipped(kind="exposure")[name]])[name]).tolist()
+
+
+def test_each_situation_is_told_by_what_is_known_before_acting():
+    assert exposed(steps(20), "closing_traffic") == []
+    someone = steps(20, came_nearer_m=changed(0.1, 0.0, 20, slice(8, 10)))
+    assert exposed(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
+    noise = steps(20, came_nearer_m=np.full(20, 0.03))
+    assert exposed(noise, "closing_traffic") == []
+    pallet = {"plan_return_m": changed(1.5, 4.0, 20, slice(5, 15))}
+    assert exposed(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
+    walker = {"came_nearer_m": changed(0.15, 0.0, 20, slice(3, 5))}
+    assert exposed(steps(20, **pallet, **walker), "plan_blocked") == []
+    ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, 20, slice(10, 12)))
+    assert exposed(ice, "slippery_floor") == list(range(11, 17))
+    assert exposed(steps(20), "slippery_floor") == []
+
+
+def test_an_exposure_takes_no_row_from_a_condition():
+    first = Condition("busy", "pre", "true", priority=0, kind="exposure")
+    every = [*SHIPPED, first]
+    table = steps(20, clearance_m=changed(0.05, 2.0, 20, slice(8, 10)))
+    labels = label(table, every)
+    assert labels["busy"].all()
+    named = primary(labels, every)
+    assert named == primary({name: labels[name] for name in labels if name != "busy"}, SHIPPED)
+    assert {"nominal", "near_collision"} <= set(named)
+    assert labels_version(every) != labels_version(SHIPPED)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a store of one drive, beside the profile `amr.toml` of its rows."""
+    folder = tmp_path_factory.mktemp("exposures")
+    bag, profile = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "a"), folder / "amr.toml"
+    profile.write_text(TEXT.replace(LISTED, 'exposures = ["closing_traffic"]') + FAR_OUT)
+    command = ["ingest", str(bag), "--profile", str(profile), "--store", str(folder / "store")]
+    assert main(command) == 0
+    return folder / "store"
+
+
+@pytest.fixture
+def profile(store: Path) -> Path:
+    return store.parent / "amr.toml"
+
+
+def test_a_store_lists_exposures_beside_its_conditions(store, profile):
+    with Store(store) as opened:
+        assert [one.name for one in opened.exposures()] == ["closing_traffic", "far_out"]
+        assert "far_out" not in {one.name for one in opened.conditions()}
+        held = opened.sql(
+            "SELECT DISTINCT pose_x_m > 2, exposures, primary_condition FROM transitions"
+            " ORDER BY ALL"
+        ).fetchall()
+        assert held == [(False, [], "nominal"), (True, ["far_out"], "nominal")]
+        rows = {row[0]: row[1:] for row in opened.sql(
+            "SELECT exposure, rows, episodes, episode_share, success_share"
+                " FROM coverage_by_exposure"
+        ).fetchall()}  # fmt: skip
+        (count,) = opened.sql("SELECT count(*) FROM transitions WHERE pose_x_m > 2").fetchall()[0]
+        assert rows == {"closing_traffic": (0, 0, 0.0, None), "far_out": (count, 1, 1.0, 1.0)}
+        shelves = opened.sql("SELECT condition FROM coverage_by_condition").fetchall()
+        assert not {"far_out", "closing_traffic"} & {name for (name,) in shelves}
+        carried = opened.sql("SELECT profile_toml FROM recordings").fetchall()[0][0]
+    assert parse_profile(carried, where="").exposures == load_profile(profile).exposures
+    again = parse_profile(profile_toml(load_profile(profile)), where="")
+    assert again.labels_version == load_profile(profile).labels_version
+
+
+def test_changed_exposures_are_told_again_from_the_store(store, profile, tmp_path):
+    store, text = shutil.copytree(store, tmp_path / "store"), profile.read_text()
+    profile = tmp_path / "amr.toml"
+    profile.write_text(text.replace("pose_x_m > 2", "pose_x_m > 2.2"))
+    assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
+    with Store(store) as opened:
+        assert opened.sql(
+            "SELECT min(pose_x_m) > 2.2, any_value(primary_condition) FROM transitions"
+            " WHERE len(exposures) > 0"
+        ).fetchall() == [(True, "nominal")]
+        assert "2.2" in opened.exposures()[-1].sql

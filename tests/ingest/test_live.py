@@ -144,7 +144,7 @@ def test_a_message_off_the_clock_is_left_out_and_counted():
     observer = LiveObserver(PROFILE)
     for index in range(5):
         observer.receive("/odom", odometry(index * 10**8, 1.0), index * 10**8 + 2_000_000)
-    observer.receive("/odom", odometry(10**15, 1.0), 6 * 10**8)
+    observer.receive("/odom", odometry(6 * 10**8 + 2 * 10**9, 1.0), 6 * 10**8)
     assert observer.left_out == {"/odom": 1}
     assert observer.offset_ns == 2_000_000
 

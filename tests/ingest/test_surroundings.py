@@ -1,32 +1,269 @@
-"""Who came nearer between two scans, and what lies on the plan: a scan of points, seen by rays."""
+"""Lidar scans and plans: clearance, who comes nearer, what is on the way."""
 
+from itertools import pairwise
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.rooms import Disc, ranges_in_room
 
+from restock.errors import RecordingError
+from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.tables import Input
+from restock.ingest.steps import needs
+from restock.ingest.steps.needs import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.surroundings import (
+    MovedMap,
     SectorMap,
     came_nearer,
+    outline_reach,
+    pad_plans,
     plan_distances_m,
     returns_on_plan,
+    view_route,
 )
 from restock.ingest.task.task import Body, Task
 
+BODY = Body(length_m=0.7, width_m=0.5)
+POINT = Body(length_m=1e-9, width_m=1e-9)
+CIRCLE = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+
+
+def test_sectors_go_counter_clockwise_from_straight_behind():
+    sectors = SectorMap.build(CIRCLE, 4, POINT)
+    ranges = np.full((1, 360), 3.0)
+    ranges[0, 180 + 45] = 1.0  # 45 degrees to the left of straight ahead
+    assert sectors.clearance(ranges, 0.05, 4.0)[0] == pytest.approx([3, 3, 1, 3])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_range_that_is_a_signalling_nan_is_a_nan():
+    ranges = np.full((1, 360), 3.0, np.float32)
+    ranges.view(np.uint32)[0, :5] = 0x7F800001  # of a damaged message
+    assert SectorMap.build(CIRCLE, 4, POINT).clearance(ranges, 0.05, 4.0)[0, 0] == pytest.approx(3)
+
+
+def test_a_lidar_that_looks_backward():
+    turned = Body(length_m=1e-9, width_m=1e-9, lidar_yaw_rad=np.pi)
+    ranges = np.full((1, 360), 3.0)
+    ranges[0, 180] = 1.0  # its zero bearing, which is the robot's back
+    sectors = SectorMap.build(CIRCLE, 4, turned).clearance(ranges, 0.05, 4.0)[0]
+    assert sectors.argmin() in (0, 3)
+
+
+@pytest.mark.parametrize("nothing", [np.inf, np.nan, 0.0, 0.049, 4.1, -1.0])
+def test_no_valid_return_counts_as_free(nothing):
+    sectors = SectorMap.build(CIRCLE, 36, BODY)
+    assert (sectors.clearance(np.full((2, 360), nothing), 0.05, 4.0) == 4.0).all()
+
+
+@pytest.mark.parametrize("at_m", [None, (0.0, 0.0), (0.2, 0.15)])
+def test_too_close_to_be_measured_is_no_clearance(at_m: tuple[float, float] | None):
+    """-inf (REP 117), in the sector of its beam: of a lidar in the middle, and of one beside it."""
+    ranges = np.full((2, 360), 2.0)
+    ranges[1, 265:275] = -np.inf  # on its left
+    if at_m is None:
+        found = SectorMap.build(CIRCLE, 36, BODY).clearance(ranges, 0.3, 4.0)
+    else:
+        found = MovedMap.build(CIRCLE, 36, BODY, at_m).clearance(ranges, 0.3, 4.0)
+    left = np.flatnonzero(found[1] != found[0])
+    assert found[0].min() > 1.0
+    assert (found[1, left] == 0).all()
+    assert set(left) <= set(range(22, 30))
+    assert len(left)
+
+
+def test_a_sector_without_beams_is_free():
+    front = np.linspace(-0.5, 0.5, 20)
+    clearance = SectorMap.build(front, 36, BODY).clearance(np.full((1, 20), 1.0), 0.05, 4.0)[0]
+    assert clearance[0] == 4.0
+    assert clearance[17:19].max() < 1.0
+
+
+@given(
+    st.integers(2, 40).map(lambda half: 2 * half),
+    st.lists(st.floats(0.05, 4.0), min_size=1, max_size=50),
+    st.floats(-3, 3),
+)
+def test_the_smallest_clearance_is_that_of_some_beam(sectors, ranges, first):
+    bearings = first + np.arange(len(ranges)) * 0.1
+    sector_map = SectorMap.build(bearings, sectors, POINT)
+    clearance = sector_map.clearance(np.array([ranges]), 0.05, 4.0)[0]
+    assert clearance.min() == pytest.approx(min(ranges), abs=1e-6)
+    assert len(clearance) == sectors
+    # Each beam's sector is at most as free as the beam.
+    sector = ((bearings + np.pi) % (2 * np.pi) * (sectors / (2 * np.pi))).astype(int)
+    for beam, range_m in zip(np.minimum(sector, sectors - 1), ranges, strict=True):
+        assert clearance[beam] <= range_m + 1e-9
+
+
+@given(st.floats(-7, 7), st.floats(0.1, 2), st.floats(0.1, 2), st.floats(-0.04, 0.04))
+def test_the_reach_ends_on_the_outline(bearing, length, width, lidar_x):
+    body = Body(length_m=length, width_m=width, lidar_x_m=lidar_x)
+    reach = outline_reach(np.array([bearing]), body)[0]
+    x, y = lidar_x + reach * np.cos(bearing), reach * np.sin(bearing)
+    on_end = abs(abs(x) - length / 2) < 1e-6 and abs(y) <= width / 2 + 1e-6
+    on_side = abs(abs(y) - width / 2) < 1e-6 and abs(x) <= length / 2 + 1e-6
+    assert on_end or on_side
+
+
+SHIPPED = load_profile("warehouse_amr").task
+FIELDS = {
+    "ranges_m": "ranges",
+    "angle_min_rad": "angle_min",
+    "angle_increment_rad": "angle_increment",
+}
+SCAN = Input("/scan", "sensor_msgs/msg/LaserScan", FIELDS)
+REDUCE = scan_reduction(SHIPPED, SCAN)
+
+
+def scans(beams: list[int], firsts: list[float], seed: int) -> dict[str, FieldColumn]:
+    rng = np.random.default_rng(seed)
+    ranges = rng.uniform(-1, 8, sum(beams)).astype(np.float32)
+    ranges[rng.random(len(ranges)) < 0.2] = np.inf
+    ranges[rng.random(len(ranges)) < 0.1] = np.nan
+    return {
+        "ranges": Ragged(ranges, offsets_of(np.array(beams, np.int64))),
+        "angle_min": np.array(firsts, np.float32),
+        "angle_increment": np.full(len(beams), 0.05, np.float32),
+    }
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([0, 1, 9, 120]), st.sampled_from([-3.1, 0.0, np.nan])),
+        min_size=1,
+        max_size=12,
+    ),
+    st.integers(0, 12),
+    st.sampled_from([1, 100, 1 << 18]),
+    st.integers(0, 99),
+)
+def test_a_scan_by_itself_gives_what_it_gives_among_others(kinds, at, values, seed):
+    fields = scans([beams for beams, _ in kinds], [first for _, first in kinds], seed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(needs, "_VALUES", values)
+        whole = REDUCE.apply(fields)
+        rows = np.arange(len(kinds))
+        parts = [
+            REDUCE.apply({name: take(column, some) for name, column in fields.items()})
+            for some in (rows[:at], rows[at:])
+        ]
+    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
+        together = np.concatenate([np.asarray(part[name]) for part in parts])
+        assert np.array_equal(np.asarray(whole[name]), together)
+    for row, (beams, first) in enumerate(kinds):
+        expected = np.full(SHIPPED.sectors, SHIPPED.range_max_m)
+        blind = beams > 0 and np.isfinite(first)
+        if beams and np.isfinite(first):
+            bearings = float(np.float32(first)) + float(np.float32(0.05)) * np.arange(beams)
+            sectors = SectorMap.build(bearings, SHIPPED.sectors, SHIPPED.body)
+            ranges = fields["ranges"]
+            assert isinstance(ranges, Ragged)
+            one = np.asarray(ranges[row])[None]
+            expected = sectors.clearance(one, SHIPPED.range_min_m, SHIPPED.range_max_m)[0]
+            blind = not (one >= SHIPPED.range_min_m).any()
+        assert np.array_equal(np.asarray(whole[SECTORS])[row], expected)
+        assert np.asarray(whole[BEAMS])[row] == beams
+        assert np.asarray(whole[BLIND])[row] == blind
+        assert np.asarray(whole[UNAIMED])[row] == (beams > 0 and np.isnan(first))
+
+
+def test_an_angle_that_is_no_number_is_named() -> None:
+    fields = scans([30], [-3.0], 4)
+    with pytest.raises(RecordingError, match="'angle_min' of /scan is not one number per message"):
+        REDUCE.apply({**fields, "angle_min": fields["ranges"]})
+
+
+def test_the_last_angle_says_what_the_increment_says() -> None:
+    """As of foxglove.LaserScan, which has no increment."""
+    fields = scans([120, 9, 1, 0], [-3.1, 0.0, -3.1, 0.0], seed=3)
+    first, step = (
+        np.asarray(fields[name], np.float64) for name in ("angle_min", "angle_increment")
+    )
+    ends = {"start": first, "end": first + step * np.array([119, 8, 0, 0])}
+    by_last = {"ranges_m": "ranges", "angle_min_rad": "start", "angle_max_rad": "end"}
+    source = msgspec.structs.replace(SCAN, fields=by_last)
+    found = scan_reduction(SHIPPED, source).apply({"ranges": fields["ranges"], **ends})
+    expected = REDUCE.apply(fields | {"angle_min": first, "angle_increment": step})
+    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
+        assert np.allclose(np.asarray(found[name]), np.asarray(expected[name])), name
+
+
+L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
+
+
+def seen(plan, x, y, yaw, distances=(1.0, 2.2)):
+    one = np.ones(1)
+    return view_route(pad_plans([np.asarray(plan, float)]), x * one, y * one, yaw * one, distances)
+
+
+def test_look_ahead_on_a_straight_stretch():
+    view = seen(L_SHAPE, 1.0, 0.5, 0.0)
+    assert view.look_ahead_m[0] == pytest.approx(np.array([[1.0, -0.5], [2.2, -0.5]]))
+    assert view.remaining_m == pytest.approx([6.0])
+    assert view.offset_m == pytest.approx([0.5])
+
+
+def test_look_ahead_goes_round_the_corner():
+    view = seen(L_SHAPE, 3.5, 0.0, 0.0)
+    assert view.look_ahead_m[0] == pytest.approx(np.array([[0.5, 0.5], [0.5, 1.7]]))
+
+
+def test_beyond_the_end_is_the_end():
+    view = seen(L_SHAPE, 4.0, 2.5, 0.0)
+    assert view.look_ahead_m[0] == pytest.approx(np.array([[0.0, 0.5], [0.0, 0.5]]))
+    assert view.remaining_m == pytest.approx([0.5])
+
+
+coordinate = st.floats(-20, 20)
+plans = st.lists(st.tuples(coordinate, coordinate), min_size=1, max_size=8)
+
+
+TWICE_AT_THE_ORIGIN = [(7.203125, 0.0), (-1.0, 0.0), (0.0, 2.0**-23), (0.0, 0.0)]
+
+
+@given(st.lists(plans, min_size=1, max_size=4), coordinate, coordinate, st.floats(-4, 4))
+@example([[(0.0, 0.0)] * 6, TWICE_AT_THE_ORIGIN], 0.0, 0.0, 0.0)
+def test_padding_changes_nothing(several, x, y, yaw):
+    count = len(several)
+    arrays = [np.asarray(plan, float) for plan in several]
+    at = [np.full(count, value) for value in (x, y, yaw)]
+    together = view_route(pad_plans(arrays), *at, (1.0, 2.2))
+    for index, plan in enumerate(arrays):
+        alone = seen(plan, x, y, yaw)
+        assert together.look_ahead_m[index] == pytest.approx(alone.look_ahead_m[0], abs=1e-6)
+        assert together.remaining_m[index] == pytest.approx(alone.remaining_m[0], abs=1e-6)
+
+
+@given(plans, coordinate, coordinate, st.floats(-4, 4))
+def test_the_nearest_point_is_the_nearest_and_the_rest_remains(plan, x, y, yaw):
+    view = seen(plan, x, y, yaw, (0.0,))
+    # A look-ahead of nothing is the nearest point itself.
+    assert np.linalg.norm(view.look_ahead_m[0, 0]) == pytest.approx(view.offset_m[0], abs=1e-6)
+    points = np.asarray(plan, float)
+    dense = np.concatenate([points[:1]] + [np.linspace(a, b, 60) for a, b in pairwise(points)])
+    nearest = np.linalg.norm(dense - [x, y], axis=1).min()
+    assert view.offset_m[0] <= nearest + 1e-6
+    total = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    assert -1e-6 <= view.remaining_m[0] <= total + 1e-6
+
+
 TASK = Task(body=Body(length_m=0.7, width_m=0.5), actions=((0.0, 0.0), (1.0, 0.0)))
 BEARINGS = (np.arange(360) + 0.5) * (2 * np.pi / 360) - np.pi
-SECTORS = SectorMap.build(BEARINGS, TASK.sectors, TASK.body)
+SECTOR_MAP = SectorMap.build(BEARINGS, TASK.sectors, TASK.body)
 PERIOD_S = 0.2
 
 
 def scan(pose: tuple[float, float, float], discs: list[Disc], walls_m: float = 6.0) -> Any:
     """Return the sector clearances (1, K) in a room."""
     ranges = ranges_in_room(BEARINGS, pose, discs, walls_m)
-    return SECTORS.clearance(ranges, TASK.range_min_m, TASK.range_max_m)
+    return SECTOR_MAP.clearance(ranges, TASK.range_min_m, TASK.range_max_m)
 
 
 def signals(step: int, clearance: Any, forward_m: float, turn_rad: float) -> dict[str, Any]:
