@@ -200,7 +200,9 @@ def test_a_killed_process_leaves_whole_groups(tmp_path, when, there):
             again.add(number, waiting(store, one(number, "c", seed=number)))
     again.commit()
     assert [name[:16] for name in sorted(shown(place))] == [f"{n:016x}" for n in (1, 2, 3)]
+    manifests = store.files("recordings")
     assert store.clean() == []  # another writer may be about to commit what lies there
+    assert store.files("recordings") == manifests
     old = time.time() - 3600
     for path in place.rglob("*.parquet"):
         os.utime(path, (old, old))

@@ -28,23 +28,6 @@ def compacted_by_delta(path: Path) -> None:
         table.vacuum(retention_hours=0, dry_run=False, enforce_retention_duration=False)
 
 
-def test_ingest_goes_on_after_another_tool_compacted_the_files(tmp_path):
-    writer = StoreWriter(tmp_path / "s")
-    for recording in (1, 2, 3):
-        writer.write(*one(recording))
-    before = writer.rows(f"{2:016x}", f"{2:016x}-a")
-    compacted_by_delta(tmp_path / "s")
-    assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(before)
-    writer.write(*one(2, "b", seed=7))
-    writer.write(*one(4))
-    expected = {(1, "a"): 0, (2, "b"): 7, (3, "a"): 0, (4, "a"): 0}
-    assert shown(tmp_path / "s") == {
-        f"{recording:016x}-{ingest}": len(one(recording, ingest, seed)[1])
-        for (recording, ingest), seed in expected.items()
-    }
-    assert len(writer.live()) == 4
-
-
 COMMON = (
     "episodes ORDER BY episode_id",
     "coverage",

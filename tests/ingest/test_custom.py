@@ -57,11 +57,6 @@ def test_a_value_is_held_from_its_measurement_to_its_age():
     assert held[20:] == [None] * 10
 
 
-def test_without_an_age_it_is_latched():
-    held = column(signal("s", "v"), {"v": np.array([10.0])}, [0.5])
-    assert held == [None] * 3 + [10.0] * 27
-
-
 def test_messages_that_lack_the_element_are_no_samples():
     """Diagnostics come from many nodes: each message holds the statuses of one."""
     fields = {
@@ -83,28 +78,36 @@ def test_an_empty_list_is_a_value_and_nan_is_null():
     assert [nearest[i] for i in (1, 6, 11, 16)] == [1.0, None, None, 2.0]
 
 
-@pytest.mark.parametrize(
-    ("how", "want"), [("min", 1.0), ("max", 4.0), ("mean", 2.5), ("sum", 5.0), ("count", 3.0)]
-)
-def test_reductions_are_of_the_finite_elements(how, want):
-    ranges = ragged([[4.0, np.inf, 1.0]])
-    assert column(signal("s", "r[]", f'reduce = "{how}"'), {"r": ranges}, [0.0])[5] == want
+HALF = 0.3 / 2  # of a turn
+TURN = {"x": 0.0, "y": 0.0, "z": np.sin(HALF), "w": np.cos(HALF)}
+NUMBERS = [
+    # Reductions are of the finite elements.
+    *(
+        (signal("s", "r[]", f'reduce = "{how}"'), {"r": ragged([[4.0, np.inf, 1.0]])}, want)
+        for how, want in (("min", 1.0), ("max", 4.0), ("mean", 2.5), ("sum", 5.0), ("count", 3.0))
+    ),
+    (signal("s", "v", "scale = 1.8", "offset = 32", 'unit = "°F"'), {"v": np.array([100.0])}, 212),
+    (signal("s", "b"), {"b": np.array([True])}, 1.0),
+    (signal("s", "m", "values = { 3 = 30, 4 = 40 }"), {"m": np.array([4], np.uint8)}, 40.0),
+    (
+        signal("s", "t", "values = { Auto = 1, manual = 2 }"),
+        {"t": np.array(["auto"], object)},
+        1.0,
+    ),
+    (signal("s", "b", "values = { true = -1, false = 1 }"), {"b": np.array([True])}, -1.0),
+    (
+        signal("s", "pose.orientation", 'reduce = "yaw"', 'unit = "rad"'),
+        {f"pose.orientation.{axis}": np.array([value]) for axis, value in TURN.items()},
+        pytest.approx(0.3),
+    ),
+]
 
 
-def test_scale_and_offset():
-    """Fahrenheit, say."""
-    table = signal("s", "v", "scale = 1.8", "offset = 32", 'unit = "°F"')
-    assert column(table, {"v": np.array([100.0])}, [0.0])[5] == 212.0
-
-
-def test_bools_enums_and_texts_as_numbers():
-    assert column(signal("s", "b"), {"b": np.array([True])}, [0.0])[5] == 1.0
-    mode = signal("s", "m", "values = { 3 = 30, 4 = 40 }")
-    assert column(mode, {"m": np.array([4], np.uint8)}, [0.0])[5] == 40.0
-    text = signal("s", "t", "values = { Auto = 1, manual = 2 }")
-    assert column(text, {"t": np.array(["auto"], object)}, [0.0])[5] == 1.0
-    flag = signal("s", "b", "values = { true = -1, false = 1 }")
-    assert column(flag, {"b": np.array([True])}, [0.0])[5] == -1.0
+@pytest.mark.parametrize(("table", "fields", "want"), NUMBERS)
+def test_a_value_becomes_a_number(table, fields, want):
+    held = column(table, fields, [0.5])
+    assert held[:3] == [None] * 3
+    assert held[3:] == [want] * 27  # without an age it is latched
 
 
 def test_texts_that_are_no_number_are_counted_and_shown():
@@ -116,14 +119,6 @@ def test_texts_that_are_no_number_are_counted_and_shown():
     ]
     (row,) = steps.custom.rows()
     assert (row["messages"], row["found"], row["unread"], row["steps"]) == (3, 1, 2, 5)
-
-
-def test_a_quaternion_becomes_its_yaw():
-    half = 0.3 / 2
-    turn = {"x": 0.0, "y": 0.0, "z": np.sin(half), "w": np.cos(half)}
-    fields = {f"pose.orientation.{axis}": np.array([value]) for axis, value in turn.items()}
-    table = signal("s", "pose.orientation", 'reduce = "yaw"', 'unit = "rad"')
-    assert column(table, fields, [0.0])[5] == pytest.approx(0.3)
 
 
 def test_a_topic_that_is_not_there_gives_nulls_and_is_said():

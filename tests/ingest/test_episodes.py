@@ -23,42 +23,51 @@ def episodes_of(topics: dict[str, TopicColumns], **task: object) -> Split:
     return found
 
 
-def test_the_end_of_a_recording_truncates():
-    assert episodes_of(Drive().topics()) == Split(
-        [EpisodeSpan(0, 29, False, "end of the recording", False)], {}
-    )
-
-
-def test_reaching_the_goal_terminates():
-    found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0)]).topics())
+END = "end of the recording"
+FAR, NEAR = (0.0, 11.0, 1.0), (0.0, 3.0, 1.0)
+# goals as (time, x, y), changes of the task, the episodes, the ticks in none
+ENDINGS = {
+    "the end of the recording": ([FAR], {}, [(0, 29, False, END, False)], {}),
     # x = 1 + .5 t comes within .4 m of 3 at t = 3.2 s, tick 16.
-    assert found.episodes == [EpisodeSpan(0, 16, True, "goal", False)]
-    assert found.dropped == {"goal already reached": 13}
+    "the goal": ([NEAR], {}, [(0, 16, True, "goal", False)], {"goal already reached": 13}),
+    # The mission layer sends the next goal at once: judge the tick by the goal before it.
+    "the goal, and the next one at once": (
+        [NEAR, (3.2, 11.0, 1.0)],
+        {},
+        [(0, 16, True, "goal", True), (16, 29, False, END, False)],
+        {},
+    ),
+    # It has driven .5 m past by then.
+    "the same goal again": (
+        [NEAR, (5.0, 3.0, 1.0)],
+        {},
+        [(0, 16, True, "goal", False), (25, 29, False, END, False)],
+        {"goal already reached": 8},
+    ),
+    "a new goal": (
+        [FAR, (2.0, 10.0, 1.0)],
+        {},
+        [(0, 10, False, "new goal", True), (10, 29, False, END, False)],
+        {},
+    ),
+    "the time limit": (
+        [FAR],
+        {"time_limit_steps": 12},
+        [
+            (0, 12, False, "time limit", True),
+            (12, 24, False, "time limit", True),
+            (24, 29, False, END, False),
+        ],
+        {},
+    ),
+}
 
 
-def test_goal_reached_on_the_next_goals_tick_terminates():
-    """The mission layer sends the next goal at once: judge the tick by the goal before it."""
-    found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)]).topics())
-    assert found.episodes == [
-        EpisodeSpan(0, 16, True, "goal", True),
-        EpisodeSpan(16, 29, False, "end of the recording", False),
-    ]
-
-
-def test_the_same_goal_again_is_a_new_episode():
-    again = Drive(goals=[(0.0, 3.0, 1.0), (5.0, 3.0, 1.0)])  # it has driven 0.5 m past by then
-    found = episodes_of(again.topics())
-    assert [(e.first, e.last) for e in found.episodes] == [(0, 16), (25, 29)]
-    assert found.dropped == {"goal already reached": 8}
-
-
-def test_a_new_goal_truncates_and_shares_the_tick():
-    found = episodes_of(Drive(goals=[(0.0, 11.0, 1.0), (2.0, 10.0, 1.0)]).topics())
-    assert found.episodes == [
-        EpisodeSpan(0, 10, False, "new goal", True),
-        EpisodeSpan(10, 29, False, "end of the recording", False),
-    ]
-    assert found.transitions == 29
+@pytest.mark.parametrize("name", ENDINGS)
+def test_an_episode_ends_by(name: str) -> None:
+    goals, task, spans, dropped = ENDINGS[name]
+    found = episodes_of(Drive(goals=goals).topics(), **task)
+    assert found == Split([EpisodeSpan(*span) for span in spans], dropped)
 
 
 def test_a_lost_plan_ends_the_episode_and_the_tick_is_counted():
@@ -79,42 +88,36 @@ def test_the_time_limit_truncates():
     assert not any(e.terminated for e in found.episodes)
 
 
-def test_a_bump_terminates_where_the_task_says_so():
-    topics = Drive().topics()
-    time = np.arange(0, 6, 0.02)
-    pressed = np.zeros(len(time), np.bool_)
-    pressed[103] = True
-    topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
-    assert len(episodes_of(topics, bump_terminates=False).episodes) == 1
+@pytest.mark.parametrize(
+    ("goals", "pressed", "spans", "dropped"),
+    [
+        (
+            [FAR],
+            lambda time: np.isclose(time, 2.06),
+            [(0, 11, True, "bump", False), (16, 29, False, END, False)],
+            4,
+        ),
+        (  # It scrapes along something, and touches it every half second.
+            [FAR],
+            lambda time: (time > 2.0) & (time < 4.0) & (time % 0.5 < 0.1),
+            [(0, 11, True, "bump", False), (23, 29, False, END, False)],
+            11,
+        ),
+        (  # On a new goal's tick it begins no episode.
+            [FAR, (2.0, 10.0, 1.0)],
+            lambda time: time == 2.0,
+            [(0, 10, True, "bump", True), (15, 29, False, END, False)],
+            5,
+        ),
+    ],
+)
+def test_a_bump_terminates_where_the_task_says_so(goals, pressed, spans, dropped):
+    topics, time = Drive(goals=goals).topics(), np.arange(0, 6, 0.02)
+    topics["/bumper"] = columns(time, {"data": pressed(time)}, stamped=False)
+    assert len(episodes_of(topics, bump_terminates=False).episodes) == len(goals)
     found = episodes_of(topics, bump_terminates=True)
-    assert found.episodes == [
-        EpisodeSpan(0, 11, True, "bump", False),
-        EpisodeSpan(16, 29, False, "end of the recording", False),
-    ]
-    assert found.dropped == {"bumper: pressed within the last 1 s": 4}
-
-
-def test_scraping_along_something_is_one_bump():
-    topics = Drive().topics()
-    time = np.arange(0, 6, 0.02)
-    pressed = (time > 2.0) & (time < 4.0) & (time % 0.5 < 0.1)  # touches it every half second
-    topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
-    found = episodes_of(topics, bump_terminates=True)
-    assert [(e.first, e.last, e.ended_by) for e in found.episodes] == [
-        (0, 11, "bump"),
-        (23, 29, "end of the recording"),
-    ]
-    assert found.dropped == {"bumper: pressed within the last 1 s": 11}
-
-
-def test_a_bump_on_a_new_goals_tick_begins_no_episode():
-    topics = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 10.0, 1.0)]).topics()
-    time = np.arange(0, 6, 0.02)
-    topics["/bumper"] = columns(time, {"data": time == 2.0}, stamped=False)
-    found = episodes_of(topics, bump_terminates=True)
-    assert found.episodes[0] == EpisodeSpan(0, 10, True, "bump", True)
-    assert found.dropped == {"bumper: pressed within the last 1 s": 5}
-    assert found.episodes[1].first == 15
+    assert found.episodes == [EpisodeSpan(*span) for span in spans]
+    assert found.dropped == {"bumper: pressed within the last 1 s": dropped}
 
 
 def test_a_gap_truncates_on_the_tick_before():

@@ -152,12 +152,6 @@ def line(x0: float, x1: float, speed: float = 0.5) -> np.ndarray:
     return np.stack([x, np.zeros(len(x))], axis=1)
 
 
-def test_where_a_drive_turns_back_it_has_arrived():
-    made = found(np.concatenate([line(0, 5), line(5, 0)]))
-    assert made.ended_at == ["turned back", "end of the recording"]
-    assert made.goals_m[:, 0] == pytest.approx([5, 0], abs=0.2)
-
-
 def test_no_goal_was_passed_before_its_mission_ends(tmp_path):
     """Half of a drive that ended on its way out had reached its goal while it drove on."""
     bag, file = write_bag(Returning(13.6), tmp_path / "bag"), tmp_path / "p.toml"

@@ -60,6 +60,15 @@ def driven(robot: TwinRobot, each: Callable[[int], None] | None = None, steps: i
     return steps
 
 
+def driving(policy: Path, steps: int = 8) -> tuple[Graph, Any, TwinRobot]:
+    """Return the graph, the active node, and a robot that it drove for some steps."""
+    graph, node = started(policy)
+    node.trigger_activate()
+    robot = TwinRobot(graph, SPEC)
+    driven(robot, steps=steps)
+    return graph, node, robot
+
+
 def speeds(graph: Graph, topic: str = COMMAND) -> list[tuple[float, float]]:
     return [(message.linear.x, message.angular.z) for message in graph.of(topic)]
 
@@ -174,10 +183,7 @@ def test_silence_stale_inputs_and_a_stalled_timer_are_stops(policy, monkeypatch)
 
 
 def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
-    graph, node = started(policy)
-    node.trigger_activate()
-    robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=8)
+    graph, node, robot = driving(policy)
     pilot, beams = node.policy.pilot, len(robot.env.simulation.bearings_rad)
     for nothing in (np.nan, 0.0):
         robot.sense(ranges=np.full(beams, nothing, np.float32))
@@ -200,10 +206,7 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
 
 def test_it_stops_for_what_is_too_close_to_be_measured(policy: Path) -> None:
     """-inf in a scan (REP 117), ahead of a robot that drives ahead."""
-    graph, node = started(policy)
-    node.trigger_activate()
-    robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=8)
+    graph, _, robot = driving(policy)
     assert speeds(graph)[-1][0] > 0
     ranges = robot.env.sensing.ranges_m[0].astype(np.float32)
     ranges[np.abs(robot.env.simulation.bearings_rad) < 0.2] = -np.inf
@@ -252,9 +255,7 @@ def test_values_that_overflow_are_a_stop(policy: Path, tmp_path: Path) -> None:
         large = np.full(tuple(weight.dims), 3e38, np.float32)
         weight.CopyFrom(onnx.numpy_helper.from_array(large, "weight"))
 
-    graph, node = started(changed_policy(policy, tmp_path / "large.onnx", enlarge))
-    node.trigger_activate()
-    driven(TwinRobot(graph, SPEC), steps=8)
+    graph, node, _ = driving(changed_policy(policy, tmp_path / "large.onnx", enlarge))
     assert node.policy.pilot.reason == "policy: the value of its action is not a finite number"
     assert speeds(graph)[-1] == (0.0, 0.0)
 

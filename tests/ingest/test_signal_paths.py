@@ -31,37 +31,30 @@ STATUS = {
 }
 
 
-def test_elements_of_a_fixed_array():
-    columns = {"covariance": np.arange(12.0).reshape(3, 4)}
-    assert values_at("covariance[3]", columns) == [[3], [7], [11]]
-    assert values_at("covariance[::3]", columns) == [[0, 3], [4, 7], [8, 11]]
+FIXED = {"covariance": np.arange(12.0).reshape(3, 4)}
+FOUND = [
+    (FIXED, "covariance[3]", [[3], [7], [11]]),
+    (FIXED, "covariance[::3]", [[0, 3], [4, 7], [8, 11]]),
+    # By the name beside it; names without values beside them find nothing.
+    (JOINTS, "velocity[left]", [[1.0], [4.0], [], []]),
+    (JOINTS, "velocity[arm]", [[], [], [5.0], []]),
+    (JOINTS | {"velocity": ragged([[], [3.0], [], []])}, "velocity[left]", [[], [], [], []]),
+    (JOINTS | {"velocity": ragged([[], [3.0], [], []])}, "velocity[right]", [[], [3.0], [], []]),
+    # By what a field of it says; of two that say so, the first counts.
+    (STATUS, "status[name=battery].values[key=v].value", [["24"], [], []]),
+    (STATUS, "status[name=lidar].values[key=v].value", [[], ["9"], []]),
+    (STATUS, "status[name=lidar].level", [[1], [2], []]),
+    (STATUS, "status[level=2].name", [[], ["lidar"], []]),
+    (STATUS, "status[0].values[-1].value", [["1"], ["9"], []]),
+    (STATUS, "status[].values[].value", [["24", "1", "7"], ["8", "9"], []]),
+    (STATUS, "status[].values[key=n].value", [["7"], ["8"], []]),
+    ({"s[].k": ragged([["a", "a"]]), "s[].v": ragged([[1, 2]])}, "s[k=a].v", [[1]]),
+]
 
 
-def test_an_element_by_the_name_beside_it():
-    assert values_at("velocity[left]", JOINTS) == [[1.0], [4.0], [], []]
-    assert values_at("velocity[arm]", JOINTS) == [[], [], [5.0], []]
-
-
-def test_names_without_values_beside_them_find_nothing():
-    columns = JOINTS | {"velocity": ragged([[], [3.0], [], []])}
-    assert values_at("velocity[left]", columns) == [[], [], [], []]
-    assert values_at("velocity[right]", columns) == [[], [3.0], [], []]
-
-
-def test_an_element_by_what_a_field_of_it_says():
-    path = "status[name=battery].values[key=v].value"
-    assert values_at(path, STATUS) == [["24"], [], []]
-    assert values_at("status[name=lidar].values[key=v].value", STATUS) == [[], ["9"], []]
-    assert values_at("status[name=lidar].level", STATUS) == [[1], [2], []]
-    assert values_at("status[level=2].name", STATUS) == [[], ["lidar"], []]
-    assert values_at("status[0].values[-1].value", STATUS) == [["1"], ["9"], []]
-    assert values_at("status[].values[].value", STATUS) == [["24", "1", "7"], ["8", "9"], []]
-    assert values_at("status[].values[key=n].value", STATUS) == [["7"], ["8"], []]
-
-
-def test_of_two_elements_that_say_so_the_first_counts():
-    columns = {"s[].k": ragged([["a", "a"]]), "s[].v": ragged([[1, 2]])}
-    assert values_at("s[k=a].v", columns) == [[1]]
+@pytest.mark.parametrize(("columns", "path", "values"), FOUND)
+def test_what_a_path_finds(columns, path, values):
+    assert values_at(path, columns) == values
 
 
 @given(

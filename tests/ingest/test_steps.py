@@ -11,7 +11,6 @@ from support.driven_robot import (
     Drive,
     columns,
     pose,
-    scans,
     without,
 )
 
@@ -97,21 +96,6 @@ def test_values_of_no_use_make_ticks_unusable(topic, field, values, problem, tic
     assert steps.problem.count(problem) == ticks
     assert set(steps.problem) == {"", problem}
     assert np.isfinite(steps.signals["wheel_speed_mps"]).all()
-
-
-@pytest.mark.parametrize("nothing", [np.nan, 0.0])
-def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
-    topics = Drive().topics()
-    tenth = np.arange(0, 6, 0.1)
-    ranges = np.full((60, 72), np.inf)  # far from everything: that is free
-    ranges[30:40] = nothing  # a lidar that has failed
-    topics["/scan"] = columns(tenth, scans(ranges))
-    steps = steps_of(PROFILE, topics)
-    blind = np.array(steps.problem) == "scan: no beam has a valid range"
-    at_s = (steps.signals["stamp_ns"] - START_NS) * 1e-9
-    assert blind.sum() == 5  # of 1 s
-    assert ((at_s[blind] >= 3.0) & (at_s[blind] < 4.0)).all()
-    assert set(np.array(steps.problem)[~blind]) == {""}
 
 
 def test_positions_far_from_their_origin_are_refused():

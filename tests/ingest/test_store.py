@@ -104,39 +104,6 @@ def test_a_reader_between_two_commits_sees_the_recording(tmp_path, monkeypatch):
     assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
 
 
-def test_a_manifest_without_rows_is_cleared_away(tmp_path, monkeypatch):
-    """A kill between the two commits."""
-    writer = StoreWriter(tmp_path / "s")
-    writer.write(*one(1, "a"))
-    commit = StoreWriter.commit
-
-    def killed(self, name, *rest):
-        if name == "transitions":
-            raise KeyboardInterrupt
-        return commit(self, name, *rest)
-
-    monkeypatch.setattr(StoreWriter, "commit", killed)
-    monkeypatch.setattr(StoreWriter, "take_back", lambda *_: None)  # who is killed does not
-    with pytest.raises(KeyboardInterrupt):
-        writer.write(*one(1, "b"))
-    monkeypatch.undo()
-    assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
-    writer.write(*one(1, "c"))
-    assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
-
-    def manifests() -> list[str]:
-        kept = DeltaTable(str(tmp_path / "s" / RECORDINGS)).get_add_actions(flatten=True)["path"]
-        return sorted(Path(path).stem[-1] for path in kept.to_pylist())
-
-    # Another writer may still be about to commit what joins nothing, so only age removes it.
-    writer.clean()
-    assert manifests() == ["b", "c"]
-    assert writer.clean(retention_hours=0) != []
-    assert manifests() == ["c"]
-    assert writer.clean(retention_hours=0) == []
-    assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
-
-
 def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))

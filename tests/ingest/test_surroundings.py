@@ -28,6 +28,22 @@ from restock.ingest.task.surroundings import (
 )
 from restock.ingest.task.task import Body, Task
 
+
+def test_the_last_angle_says_what_the_increment_says() -> None:
+    """As of foxglove.LaserScan, which has no increment."""
+    fields = scans([120, 9, 1, 0], [-3.1, 0.0, -3.1, 0.0], seed=3)
+    first, step = (
+        np.asarray(fields[name], np.float64) for name in ("angle_min", "angle_increment")
+    )
+    ends = {"start": first, "end": first + step * np.array([119, 8, 0, 0])}
+    by_last = {"ranges_m": "ranges", "angle_min_rad": "start", "angle_max_rad": "end"}
+    source = msgspec.structs.replace(SCAN, fields=by_last)
+    found = scan_reduction(SHIPPED, source).apply({"ranges": fields["ranges"], **ends})
+    expected = REDUCE.apply(fields | {"angle_min": first, "angle_increment": step})
+    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
+        assert np.allclose(np.asarray(found[name]), np.asarray(expected[name])), name
+
+
 BODY = Body(length_m=0.7, width_m=0.5)
 POINT = Body(length_m=1e-9, width_m=1e-9)
 CIRCLE = np.linspace(-np.pi, np.pi, 360, endpoint=False)
@@ -180,34 +196,12 @@ def test_an_angle_that_is_no_number_is_named() -> None:
         REDUCE.apply({**fields, "angle_min": fields["ranges"]})
 
 
-def test_the_last_angle_says_what_the_increment_says() -> None:
-    """As of foxglove.LaserScan, which has no increment."""
-    fields = scans([120, 9, 1, 0], [-3.1, 0.0, -3.1, 0.0], seed=3)
-    first, step = (
-        np.asarray(fields[name], np.float64) for name in ("angle_min", "angle_increment")
-    )
-    ends = {"start": first, "end": first + step * np.array([119, 8, 0, 0])}
-    by_last = {"ranges_m": "ranges", "angle_min_rad": "start", "angle_max_rad": "end"}
-    source = msgspec.structs.replace(SCAN, fields=by_last)
-    found = scan_reduction(SHIPPED, source).apply({"ranges": fields["ranges"], **ends})
-    expected = REDUCE.apply(fields | {"angle_min": first, "angle_increment": step})
-    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
-        assert np.allclose(np.asarray(found[name]), np.asarray(expected[name])), name
-
-
 L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
 
 
 def seen(plan, x, y, yaw, distances=(1.0, 2.2)):
     one = np.ones(1)
     return view_route(pad_plans([np.asarray(plan, float)]), x * one, y * one, yaw * one, distances)
-
-
-def test_look_ahead_on_a_straight_stretch():
-    view = seen(L_SHAPE, 1.0, 0.5, 0.0)
-    assert view.look_ahead_m[0] == pytest.approx(np.array([[1.0, -0.5], [2.2, -0.5]]))
-    assert view.remaining_m == pytest.approx([6.0])
-    assert view.offset_m == pytest.approx([0.5])
 
 
 def test_look_ahead_goes_round_the_corner():

@@ -226,20 +226,22 @@ def test_clearance_ahead_is_toward_the_waypoint():
     )
 
 
-def test_localised_velocity_of_a_turn_in_place_is_nothing():
-    before = signals(pose_yaw_rad=0.0, pose_stamp_ns=0)
-    now = signals(pose_yaw_rad=0.3, pose_stamp_ns=200_000_000)
-    forward, lateral = localised_velocity(now, before)
-    assert (forward[0], lateral[0]) == (0, 0)
-
-
-def test_localised_velocity_is_in_the_body_frame():
-    half_pi = np.pi / 2
-    before = signals(pose_yaw_rad=half_pi, pose_stamp_ns=0)
-    now = signals(pose_yaw_rad=half_pi, pose_stamp_ns=200_000_000, pose_y_m=0.1, pose_x_m=0.02)
-    forward, lateral = localised_velocity(now, before)
-    assert forward == pytest.approx([0.5])
-    assert lateral == pytest.approx([-0.1])  # +x is to the right of a robot that looks along +y
+@pytest.mark.parametrize(
+    ("before", "now", "expected"),
+    [
+        ({"pose_yaw_rad": 0.0}, {"pose_yaw_rad": 0.3}, (0, 0)),  # a turn in place
+        # +x is to the right of a robot that looks along +y.
+        (
+            {"pose_yaw_rad": np.pi / 2},
+            {"pose_yaw_rad": np.pi / 2, "pose_y_m": 0.1, "pose_x_m": 0.02},
+            (0.5, -0.1),
+        ),
+    ],
+)
+def test_localised_velocity_is_in_the_body_frame(before, now, expected):
+    after = signals(pose_stamp_ns=200_000_000, **now)
+    forward, lateral = localised_velocity(after, signals(**before))
+    assert (forward[0], lateral[0]) == pytest.approx(expected)
 
 
 def test_without_a_new_pose_the_wheels_are_believed():

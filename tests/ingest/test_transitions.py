@@ -53,27 +53,6 @@ def test_next_observation_is_the_observation_of_the_next_row():
     assert now[16, distance] == pytest.approx(0.84, abs=0.001)
 
 
-def test_ends_of_episodes():
-    drive = Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)])
-    table = rows_of(drive.topics())
-    assert np.flatnonzero(table["terminated"]).tolist() == [15]
-    assert np.flatnonzero(table["truncated"]).tolist() == [28]
-    assert table["step_index"].to_pylist() == [*range(16), *range(13)]
-    assert table["episode_id"][16].as_py() == "fedcba9876543210/1"
-
-
-def test_reward_by_hand():
-    table = rows_of(Drive(goals=[(0.0, 3.0, 1.0)]).topics())
-    weight = TASK.rewards
-    reward = table["reward"].to_numpy()
-    progress = SPEED_MPS * TASK.control_period_s * weight.progress_per_m
-    assert reward[1:15] == pytest.approx(np.full(14, progress + weight.step), abs=1e-5)
-    # From standing (no command before) to driving: one change of action.
-    assert reward[0] == pytest.approx(progress + weight.step + weight.action_change, abs=1e-5)
-    assert reward[15] == pytest.approx(progress + weight.step + weight.goal, abs=1e-5)
-    assert table["progress_m"].to_numpy() == pytest.approx(np.full(16, 0.1), abs=1e-5)
-
-
 def test_progress_is_along_the_plan_when_acting():
     """A new, longer plan to the same goal is no loss of progress."""
     topics = Drive().topics()

@@ -111,27 +111,20 @@ def contents(store: Path) -> dict[str, str]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (MemoryError(), "out of memory\n  use fewer --workers"),
-        (KeyError("x"), "a bug in Restock: KeyError: 'x' (test_workers.py, line "),
-    ],
-)
-def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch, error, said):
+def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch):
     from restock.ingest import pipeline
 
     preparing = pipeline.preparing
 
     def failing(path, *args, **kwargs):
         if path.name == "drive1":
-            raise error
+            raise MemoryError
         return preparing(path, *args, **kwargs)
 
     monkeypatch.setattr(pipeline, "preparing", failing)
     job = IngestJob(load_profile("warehouse_amr"), tmp_path / "s")
     results = dict(ingest_all(sorted(bags.iterdir()), job))
-    assert said in str(results.pop(bags / "drive1"))
+    assert "out of memory\n  use fewer --workers" in str(results.pop(bags / "drive1"))
     assert {result.status for result in results.values()} == {"written"}
 
 
