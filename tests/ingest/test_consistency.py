@@ -7,7 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import BEAMS, FREE_M, START_NS, columns, scans, without, write_topics
+from support.driven_robot import (
+    BEAMS,
+    FREE_M,
+    START_NS,
+    columns,
+    pose,
+    scans,
+    without,
+    write_topics,
+)
 from support.ingested import ingested, proposed, steps_in
 
 from restock.cli import main
@@ -17,6 +26,7 @@ from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.gather import Given
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.consistency import Finding
+from restock.ingest.steps.episodes import steps_of
 
 NS = 10**9
 DURATION_S = 45.0
@@ -48,7 +58,7 @@ def winding() -> Topics:
     fast, tenth = np.arange(0, DURATION_S, 0.05), np.arange(0, DURATION_S, 0.1)
     (speed, rate), (requested, turned) = motion(fast), motion(tenth)
     x, y, yaw = poses(fast)
-    odom = {"pose.pose.position.x": x, "pose.pose.position.y": y}
+    odom = pose("pose.pose", x, 0.0) | {"pose.pose.position.y": y}
     odom |= {"pose.pose.orientation.z": np.sin(yaw / 2), "pose.pose.orientation.w": np.cos(yaw / 2)}
     odom |= {"twist.twist.linear.x": speed, "twist.twist.angular.z": rate}
     imu = {"angular_velocity.z": rate, "linear_acceleration.x": np.gradient(speed, fast)}
@@ -129,24 +139,24 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
         )
 
 
-def found_in(topics: Topics, profile: Profile, folder: Path) -> tuple[list[Finding], Any]:
+def found_in(topics: Topics, profile: Profile) -> tuple[list[Finding], Any]:
     """Return the findings, and each step's stamp, pose and command."""
-    steps = steps_in(written(topics, folder / "bag"), profile)
+    steps = steps_of(profile, topics)
     names = ("stamp_ns", "pose_x_m", "pose_y_m", "command_speed_mps", "command_yaw_rate_radps")
     return steps.findings, {name: steps.signals[name] for name in names}
 
 
 @pytest.mark.parametrize("change", [lambda topics: topics, slipping], ids=["clean", "slip"])
-def test_a_robot_that_slips_or_not_does_not_contradict_itself(profile, tmp_path, change):
-    assert found_in(change(winding()), profile, tmp_path)[0] == []
+def test_a_robot_that_slips_or_not_does_not_contradict_itself(profile, change):
+    assert found_in(change(winding()), profile)[0] == []
 
 
 @pytest.mark.parametrize(
     ("topic", "ahead_s"), [("/cmd_vel", 0.4), ("/cmd_vel", -0.7), ("/scan", 0.8)]
 )
-def test_a_topic_of_another_clock_counts_from_its_reception(profile, tmp_path, topic, ahead_s):
+def test_a_topic_of_another_clock_counts_from_its_reception(profile, topic, ahead_s):
     topics = shifted(winding(), topic, ahead_s)
-    found, steps = found_in(topics, profile, tmp_path)
+    found, steps = found_in(topics, profile)
     ((kind, name, repaired),) = [(one.kind, one.topic, one.repaired) for one in found]
     assert (kind, name, repaired) == ("clock", topic, True)
     assert f"{abs(ahead_s):.2f} s {'ahead of' if ahead_s > 0 else 'behind'}" in str(found[0])
@@ -171,8 +181,8 @@ def _times(steps: Any) -> Any:
     return fine[np.argmin(away, axis=1)]
 
 
-def test_a_clock_of_the_recorder_alone_is_no_contradiction(profile, tmp_path):
-    assert found_in(shifted_all(winding(), 3.0), profile, tmp_path)[0] == []
+def test_a_clock_of_the_recorder_alone_is_no_contradiction(profile):
+    assert found_in(shifted_all(winding(), 3.0), profile)[0] == []
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
@@ -236,9 +246,9 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_contradicts_itself_is_kept_and_said(profile, tmp_path, case):
+def test_what_contradicts_itself_is_kept_and_said(profile, case):
     change, kind, topic, words = WRONG[case]
-    found, steps = found_in(change(winding()), profile, tmp_path)
+    found, steps = found_in(change(winding()), profile)
     assert kind in {one.kind for one in found}, found
     one = next(one for one in found if one.kind == kind)
     assert (one.topic, one.repaired) == (topic, False)

@@ -307,64 +307,64 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def damaged(whole: Path, place: Path, file: str, how: str) -> Path:
-    shutil.copytree(whole, place)
-    path = place / file
-    path.write_bytes(LOG_DAMAGES[how](path.read_bytes()))
-    return path
+@pytest.fixture
+def logged(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "s"))
 
 
-@pytest.mark.parametrize(
-    ("table", "number", "how"),
-    [
-        *(("transitions", LAST, how) for how in LOG_DAMAGES),
-        *[("transitions", 3, "empty"), ("recordings", 3, "cut"), ("recordings", LAST, "empty")],
-    ],
-)
-def test_a_damaged_commit_is_named(whole, tmp_path, table, number, how):
-    file = f"{table}/_delta_log/{number:020}.json"
-    path = damaged(whole, tmp_path / "s", file, how)
+def refused(store: Path) -> str:
     with pytest.raises(StoreError) as caught:
-        shown(tmp_path / "s")
-    assert f"{tmp_path / 's'}: its file {file} is " in str(caught.value)
-    if number < LAST:
-        assert "ingest the recordings into a new store" in str(caught.value)
-        return
-    assert "or delete it, as it is the last commit: the store is" in str(caught.value)
-    path.unlink()
-    assert len(shown(tmp_path / "s")) == (LAST if table == "recordings" else LAST - 1)
-    StoreWriter(tmp_path / "s").write(*one(number, "again"))
-    assert len(shown(tmp_path / "s")) == LAST
+        shown(store)
+    return str(caught.value)
 
 
-def test_a_commit_that_is_missing_among_others_is_named(whole, tmp_path):
-    path = damaged(whole, tmp_path / "s", f"transitions/_delta_log/{3:020}.json", "empty")
-    path.unlink()
-    with pytest.raises(StoreError, match=rf"_delta_log/{3:020}.json is missing"):
-        shown(tmp_path / "s")
+COMMITS = [
+    *(("transitions", LAST, how) for how in LOG_DAMAGES),
+    *[("transitions", 3, "empty"), ("recordings", 3, "cut"), ("recordings", LAST, "empty")],
+]
+
+
+def test_a_damaged_commit_is_named_and_the_last_may_go(logged: Path) -> None:
+    for table, number, how in COMMITS:
+        file = logged / f"{table}/_delta_log/{number:020}.json"
+        content = file.read_bytes()
+        file.write_bytes(LOG_DAMAGES[how](content))
+        said = refused(logged)
+        assert f"{logged}: its file {file.relative_to(logged)} is " in said
+        last = "or delete it, as it is the last commit: the store is"
+        assert (last if number == LAST else "ingest the recordings into a new store") in said
+        file.write_bytes(content)
+    for table, left in (("recordings", LAST), ("transitions", LAST - 1)):
+        (logged / f"{table}/_delta_log/{LAST:020}.json").unlink()
+        assert len(shown(logged)) == left
+    StoreWriter(logged).write(*one(LAST, "again"))
+    assert len(shown(logged)) == LAST
+
+
+def test_a_commit_that_is_missing_among_others_is_named(logged: Path) -> None:
+    (logged / f"transitions/_delta_log/{3:020}.json").unlink()
+    assert f"_delta_log/{3:020}.json is missing" in refused(logged)
 
 
 @pytest.mark.parametrize("how", ["empty", "cut", "missing"])
-def test_a_damaged_checkpoint_is_named_and_can_do_without(whole, tmp_path, how):
-    log = tmp_path / "s" / "transitions" / "_delta_log"
+def test_a_damaged_checkpoint_is_named_and_can_do_without(logged: Path, how: str) -> None:
+    log = logged / "transitions" / "_delta_log"
     file = log / f"{2:020}.checkpoint.parquet"
-    name = file.relative_to(tmp_path / "s").as_posix()
-    damaged(whole, tmp_path / "s", name, "empty" if how == "missing" else how)
     if how == "missing":
         file.unlink()
-    with pytest.raises(StoreError) as caught:
-        shown(tmp_path / "s")
-    assert f"its file {name} {'is missing' if how == 'missing' else 'cannot be read'}" in str(
-        caught.value
-    )
-    assert "delete it and _last_checkpoint beside it" in str(caught.value)
+    else:
+        file.write_bytes(LOG_DAMAGES[how](file.read_bytes()))
+    said = refused(logged)
+    what = "is missing" if how == "missing" else "cannot be read"
+    assert f"its file {file.relative_to(logged)} {what}" in said
+    assert "delete it and _last_checkpoint beside it" in said
     file.unlink(missing_ok=True)
     (log / "_last_checkpoint").unlink()
-    assert len(shown(tmp_path / "s")) == LAST
+    assert len(shown(logged)) == LAST
 
 
-def test_a_commit_within_a_checkpoint_may_be_damaged(whole, tmp_path):
-    damaged(whole, tmp_path / "s", f"transitions/_delta_log/{1:020}.json", "empty")
-    assert len(shown(tmp_path / "s")) == LAST
+def test_a_commit_within_a_checkpoint_may_be_damaged(logged: Path) -> None:
+    (logged / f"transitions/_delta_log/{1:020}.json").write_bytes(b"")
+    assert len(shown(logged)) == LAST
     with pytest.raises(StoreError, match=rf"_delta_log/{1:020}.json is empty"):
-        StoreWriter(tmp_path / "s").path.open_table("transitions", 1)
+        StoreWriter(logged).path.open_table("transitions", 1)
