@@ -16,7 +16,6 @@ where compiled ranges cost more than MuJoCo's.
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -121,7 +120,7 @@ def in_pieces(floor: Warehouse, count: int) -> Warehouse:
     return replace(floor, racks=tuple(racks))
 
 
-def ranging(switch: str, beams: int, boxes: int | None) -> Contestant:
+def ranging(used: bool, beams: int, boxes: int | None) -> Contestant:
     """Lidar ranges alone, of robots under way."""
     env = WarehouseVectorEnv(SCALED, seed=1)
     under_way(env)
@@ -132,9 +131,9 @@ def ranging(switch: str, beams: int, boxes: int | None) -> Contestant:
     ids = np.arange(SCALED)
 
     def run() -> None:
-        os.environ[native.SWITCH] = switch
+        native.IS_USED = used
         sim.cast(ids)
-        os.environ[native.SWITCH] = "1"
+        native.IS_USED = True
 
     return Contestant(run, SCALED)
 
@@ -331,10 +330,10 @@ def main() -> int:
     for name in options.layouts:
         contestants[f"floors: {name}"] = vector(SCALED, layouts=name)
     ranged = [(LIDAR_BEAMS, None), (360, None), (LIDAR_BEAMS, PIECES), (360, PIECES)]
-    for beams, boxes in ranged if native.is_used() else []:
+    for beams, boxes in ranged if native.IS_USED else []:
         name = f"{beams} beams, {'default floor' if boxes is None else f'in {boxes} boxes'}"
-        contestants[f"ranges, {name}"] = ranging("1", beams, boxes)
-        contestants[f"MuJoCo's rays, {name}"] = ranging("0", beams, boxes)
+        contestants[f"ranges, {name}"] = ranging(True, beams, boxes)
+        contestants[f"MuJoCo's rays, {name}"] = ranging(False, beams, boxes)
     steps = 160 if options.quick else 640
     rounds = {name: partial(contestant.round, steps) for name, contestant in contestants.items()}
     measured = in_turns(rounds, 3 if options.quick else 12)

@@ -197,7 +197,7 @@ def view_route(
     (`restock.native`), does what NumPy does without it, to the last bit.
     """
     cos, sin = np.cos(pose_yaw_rad), np.sin(pose_yaw_rad)
-    if native.is_used():
+    if native.IS_USED:
         return _view_compiled(plans_m, pose_x_m, pose_y_m, cos, sin, distances_m)
     # Coordinate by coordinate on contiguous arrays: this runs at every step of the twin.
     x, y = np.ascontiguousarray(plans_m[..., 0]), np.ascontiguousarray(plans_m[..., 1])  # (N, P)
@@ -293,7 +293,7 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     walked_m = FASTEST_MPS * np.maximum(elapsed_s, MIN_S)
     before = np.array([one["sector_clearance_m"] for one in earlier])
     motions = _motions([now, *earlier])
-    if not native.is_used():
+    if not native.IS_USED:
         return _came_by_numpy(task, clearance, before, motions, walked_m)
     sectors, came = _sectors(count, task.body), np.empty(len(clearance))
     native.compiled.find_came(  # the same, to the last bit
@@ -384,7 +384,7 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
         (task.body.width_m / 2) ** 2,
         GAP_WITHIN * task.near_m,
     )
-    if native.is_used():  # the same, to the last bit
+    if native.IS_USED:  # the same, to the last bit
         way_m, gap_m = np.empty(len(none)), np.empty(len(none))
         native.compiled.find_returns(
             *(np.ravel(x), np.ravel(y), np.ravel(clearance_m), np.ravel(plan_m)),

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
@@ -23,7 +24,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Ints, stacked
+from restock.arrays import F32, F64, Bools, Ints
 from restock.toml import Checked
 
 Signals = dict[str, NDArray[Any]]  # by name; the leading axis is the step, or the environment
@@ -382,7 +383,7 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
     routed = 1.0 if task.goal == "route" else 0.0  # without a goal these entries are all zero
     clearance = _nearness(now["sector_clearance_m"], task.range_max_m)
     closing = clearance - _nearness(before["sector_clearance_m"], task.range_max_m)
-    scalars = stacked(
+    scalars = (
         np.sin(near) * routed,
         np.cos(near) * routed,
         np.sin(far) * routed,
@@ -397,8 +398,7 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
         now["accel_x_mps2"].clip(-10.0, 10.0) / 5.0,
     )
     one_hot = np.eye(len(task.actions))[previous_action]
-    proposed = _proposed(task, now)
-    parts = [scalars, one_hot, clearance, closing, proposed]
+    parts = [*_entries(*scalars), one_hot, clearance, closing, *_entries(*_proposed(task, now))]
     if task.tracks:
         parts.append(_tracked(task, now))
     if task.observed:
@@ -496,15 +496,23 @@ def clearance_ahead(
     return np.asarray(np.minimum.reduce(nearest, axis=1), np.float64)
 
 
-def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
-    """Return what the navigation stack proposes, (N, 3): whether it is known, speed, yaw rate.
+def _entries(*values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield each of the values (N,) as one entry of an observation, (N, 1)."""
+    return (value[..., None] for value in values)
+
+
+def _proposed(task: Task, now: Signals) -> tuple[NDArray[Any], ...]:
+    """Return what the navigation stack proposes: whether it is known, speed, yaw rate, each (N,).
 
     In units of the fastest action on each axis, up to twice that; all 0 where it is not known.
     """
-    command = stacked(now["nav_speed_mps"], now["nav_yaw_rate_radps"])
-    known = np.isfinite(command).all(axis=-1, keepdims=True)
-    scaled = (np.where(known, command, 0.0) / _fastest(task.actions)).clip(-2.0, 2.0)
-    return np.concatenate([known, scaled], axis=-1)
+    speed, yaw_rate = now["nav_speed_mps"], now["nav_yaw_rate_radps"]
+    known = np.isfinite(speed) & np.isfinite(yaw_rate)
+    fastest = _fastest(task.actions)
+    return known, *(
+        (np.where(known, value, 0.0) / most).clip(-2.0, 2.0)
+        for value, most in zip((speed, yaw_rate), fastest, strict=True)
+    )
 
 
 def _tracked(task: Task, now: Signals) -> NDArray[np.float64]:

@@ -199,7 +199,7 @@ class Per(StratumDraws):
         ends = np.cumsum(sums, dtype=np.float64)
         at = (np.arange(len(within)) + within) * (ends[-1] / len(within))  # ascending
         places: Ints = np.empty(len(at), np.int64)
-        find = native.compiled.find_places if native.is_used() else find_places
+        find = native.compiled.find_places if native.IS_USED else find_places
         find(self._priority.reshape(-1, CHUNK), sums, ends, at, places)
         return np.minimum(places, self.size - 1, out=places)
 

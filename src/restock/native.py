@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from restock import _native as compiled
 
     IS_THERE: bool
+    IS_USED: bool  # where it can be
 else:
     try:
         compiled = import_module("restock._native")
@@ -28,20 +29,16 @@ else:
     except ImportError as error:  # not for this processor
         compiled, _why_not = None, str(error)
     IS_THERE = compiled is not None
-
-
-def is_used() -> bool:
-    """Return whether compiled code is used where it can be."""
-    return IS_THERE and os.environ.get(SWITCH, "").lower() not in ("0", "no", "false", "off")
+    IS_USED = IS_THERE and os.environ.get(SWITCH, "").lower() not in ("0", "no", "false", "off")
 
 
 def state() -> str:
     """Describe the compiled code for people: `in use (AVX-512)`, or why it is not."""
     if not IS_THERE:
         return f"not in use: {_why_not}"
-    if not is_used():
+    if not IS_USED:
         return f"not in use: {SWITCH}={os.environ[SWITCH]}"
     return f"in use ({compiled.INSTRUCTIONS})"
 
 
-__all__ = ["IS_THERE", "SWITCH", "compiled", "is_used", "state"]
+__all__ = ["IS_THERE", "IS_USED", "SWITCH", "compiled", "state"]

@@ -18,7 +18,7 @@ from restock.ingest.task.surroundings import (
 )
 from restock.ingest.task.task import Body, Task
 
-compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
+compiled = pytest.mark.skipif(not native.IS_USED, reason=f"native code is {native.state()}")
 pytestmark = [compiled, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 TASK = Task(
     body=Body(length_m=0.7, width_m=0.5, lidar_x_m=0.2),
@@ -40,7 +40,7 @@ def spoil(rng: np.random.Generator, share: float, *arrays: Any) -> None:
 
 def by_both(call: Callable[[], Any]) -> tuple[Any, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(native.SWITCH, "0")
+        patch.setattr(native, "IS_USED", False)
         plain = call()
     return plain, call()
 

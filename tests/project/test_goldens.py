@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from support.goldens import KEPT, Hashes, compute_hashes, made_on
 
+from restock import native
+
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 GOLDEN = json.loads(KEPT.read_text())
 
@@ -13,7 +15,7 @@ GOLDEN = json.loads(KEPT.read_text())
 @pytest.fixture(scope="module")
 def computed(tmp_path_factory: pytest.TempPathFactory) -> Hashes:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RESTOCK_NATIVE", "0")
+        patch.setattr(native, "IS_USED", False)
         return compute_hashes(Path(tmp_path_factory.mktemp("goldens")))
 
 

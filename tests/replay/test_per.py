@@ -1,7 +1,5 @@
 """Draws are in proportion to priorities, and weights undo exactly that."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -126,7 +124,7 @@ def test_places_are_of_the_stratum_whatever_the_priorities(size, count, seed):
 @settings(max_examples=80)
 @given(st.integers(0, 2**32), st.integers(1, 200), st.integers(0, 300), st.booleans())
 def test_compiled_places_are_those_of_numpy(seed, chunks, draws, some_empty):
-    if not native.IS_THERE:
+    if not native.IS_USED:
         pytest.skip(f"native code is {native.state()}")
     rng = np.random.default_rng(seed)
     priority = (10 ** rng.uniform(-4, 2, (chunks, CHUNK))).astype(np.float32)
@@ -147,13 +145,13 @@ def test_compiled_places_are_those_of_numpy(seed, chunks, draws, some_empty):
 
 
 def test_draws_are_the_same_without_compiled_code(monkeypatch):
-    drawn: dict[str, list[Any]] = {}
-    for switch in ("1", "0"):
-        monkeypatch.setenv(native.SWITCH, switch)
+    drawn = []
+    for used in (native.IS_USED, False):
+        monkeypatch.setattr(native, "IS_USED", used)
         one = sampler(block=4)
         one.update(np.arange(0, 400, 2), errors()[::2])
-        drawn[switch] = [(one.draw()[0].copy(), one.drawn_weights) for _ in range(9)]
-    np.testing.assert_equal(drawn["0"], drawn["1"])
+        drawn.append([(one.draw()[0].copy(), one.drawn_weights) for _ in range(9)])
+    np.testing.assert_equal(*drawn)
 
 
 def test_the_mean_weight_of_many_rows_is_that_of_some():

@@ -10,7 +10,6 @@ the machine that `made_on` describes, and numbers of ingested and mixed rows eve
 
 import hashlib
 import json
-import os
 import platform
 import tempfile
 from importlib.metadata import version
@@ -21,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from restock import native
 from support.paths import ROOT
 
 KEPT = ROOT / "tests/golden/sample_logs.json"
@@ -81,7 +81,7 @@ def _hash_panel(panel: Path) -> dict[str, str | int]:
 
 
 if __name__ == "__main__":
-    os.environ["RESTOCK_NATIVE"] = "0"
+    native.IS_USED = False
     with tempfile.TemporaryDirectory() as folder:
         hashes = compute_hashes(Path(folder))
     KEPT.parent.mkdir(exist_ok=True)

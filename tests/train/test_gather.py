@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from restock import native
-from restock.train.feed import batches
 from restock.train.feed.batches import gather_rows
 
 TABLES = npst.arrays(
@@ -20,15 +19,13 @@ TABLES = npst.arrays(
 )
 
 
-@pytest.fixture(autouse=True, params=["1", "0"], ids=["compiled", "not compiled"])
+@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "not compiled"])
 def way(request: pytest.FixtureRequest) -> Iterator[None]:
-    if request.param == "1" and not native.IS_THERE:
+    if request.param and not native.IS_USED:
         pytest.skip(f"native code is {native.state()}")
-    batches._is_compiled.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(native.SWITCH, request.param)
+        patch.setattr(native, "IS_USED", request.param)
         yield
-    batches._is_compiled.cache_clear()
 
 
 def same(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:

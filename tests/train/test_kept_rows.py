@@ -11,7 +11,7 @@ from restock import native
 from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.sampled_rows import FRESH, LOGGED, BatchValues, SampledRows, keep_rows
 
-compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
+compiled = pytest.mark.skipif(not native.IS_USED, reason=f"native code is {native.state()}")
 CAPACITY = 50
 
 

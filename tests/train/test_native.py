@@ -15,7 +15,7 @@ from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.network import FlatParameters, Kernel, QNetwork, clone, update_path
 
-compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
+compiled = pytest.mark.skipif(not native.IS_USED, reason=f"native code is {native.state()}")
 OBSERVATION, ACTIONS = 7, 4
 SHAPES = [(3,), (16, 16), (40, 33, 18), (64, 32)]
 
@@ -143,8 +143,9 @@ def test_the_compiled_way_is_that_of_one_thread() -> None:
 )
 def test_the_usual_words_switch_it_off(value, used, monkeypatch):
     monkeypatch.setenv(native.SWITCH, value)
-    assert native.is_used() == used
-    assert native.state().startswith("in use") == used
+    probe = "from restock import native; print(native.IS_USED, native.state().startswith('in use'))"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.stdout.split() == [str(used)] * 2, done.stderr
 
 
 @pytest.mark.parametrize("way", ["asked for", "not compiled"])
@@ -159,7 +160,7 @@ from restock.cli import main
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
 
-assert not native.is_used()
+assert not native.IS_USED
 print(Learner(parse_config({{}}, where="test"), 7, 4).path, flush=True)
 main(["--version"])
 """

@@ -18,7 +18,7 @@ from restock.ingest.task.robot import Robot
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import pallet_half_m
 
-needs_native = pytest.mark.skipif(not native.IS_THERE, reason=native.state())
+needs_native = pytest.mark.skipif(not native.IS_USED, reason=native.state())
 TASK = load_profile("warehouse_amr").task
 KINDS = {"nominal": 0.2, "wheel_slip": 0.2, "blocked_aisle": 0.3, "near_collision": 0.3}
 
@@ -41,8 +41,8 @@ def environments() -> list[WarehouseVectorEnv]:
 def both(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """Return the ranges (8, beams) as compiled code finds them, and as MuJoCo casts them."""
     found = []
-    for switch in ("1", "0"):
-        monkeypatch.setenv(native.SWITCH, switch)
+    for used in (True, False):
+        monkeypatch.setattr(native, "IS_USED", used)
         found.append(env.simulation.cast(np.arange(8)))
     return found
 

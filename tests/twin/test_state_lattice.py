@@ -64,9 +64,9 @@ def test_time_is_left_by_distance_and_speed() -> None:
     assert with_gap(0.9, slow).time_s(pose) == pytest.approx(4 * with_gap(0.9).time_s(pose))
 
 
-@pytest.mark.parametrize(("layouts", "way"), [("default", "1"), ("generated:test", "0")])
+@pytest.mark.parametrize(("layouts", "way"), [("default", True), ("generated:test", False)])
 def test_the_clearance_of_near_points_is_exact(layouts, way, monkeypatch):
-    monkeypatch.setenv(native.SWITCH, way)
+    monkeypatch.setattr(native, "IS_USED", way and native.IS_USED)
     floor = open_floors(layouts)[-1]
     rng = np.random.default_rng(0)
     middle = rng.uniform((0.0, 0.0), (floor.width_m, floor.depth_m), (200, 2))

@@ -140,7 +140,7 @@ def update_path(device: str, threads: int = 1) -> UpdatePath:
     PyTorch's operations, as does a network that is not a plain `QNetwork`.
     """
     on_cpu = torch.device(device).type == "cpu"
-    return "native" if on_cpu and threads == 1 and native.is_used() else "autograd"
+    return "native" if on_cpu and threads == 1 and native.IS_USED else "autograd"
 
 
 def differentiable(

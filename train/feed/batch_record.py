@@ -106,7 +106,7 @@ class FeedRecord(Stateful):
         self.actions, self.greedy = actions, greedy
         self.labels, self.perturbations = labels, perturbations
         self.audit_share = audit_share
-        self._by_native = native.is_used()
+        self._by_native = native.IS_USED
         self._rng = np.random.default_rng([seed, 4])
         self._age_days = (
             np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -301,11 +301,8 @@ def gather_rows(rows: Tensor, index: Tensor, out: Tensor | None = None) -> Tenso
     """
     on_cpu = rows.device.type == index.device.type == "cpu" and not rows.requires_grad
     is_plain = rows.dtype == torch.float32 and rows.dim() == 2 and rows.is_contiguous()
-    if _is_compiled() and on_cpu and is_plain and index.is_contiguous():
+    if native.IS_USED and on_cpu and is_plain and index.is_contiguous():
         batch = rows.new_empty(len(index), rows.shape[1]) if out is None else out
         native.compiled.gather(rows.numpy(), index.numpy(), batch.numpy())
         return batch
     return torch.index_select(rows, 0, index, out=out)
-
-
-_is_compiled = cache(native.is_used)

@@ -327,7 +327,7 @@ def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64
     room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
     room = np.ascontiguousarray(room)
     racks = floor.rack_boxes
-    if native.is_used():
+    if native.IS_USED:
         boxes = racks.ravel(), own.ravel(), room.ravel()
         native.compiled.near_boxes(x.ravel(), y.ravel(), *boxes, len(x), within_m)
         return room

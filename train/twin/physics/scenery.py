@@ -347,7 +347,7 @@ class Lidar:
         rays = np.empty((len(ids), len(self._beam), 2))
         rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
         rays[..., 1] = sin[:, None] * self._beam[:, 0] + cos[:, None] * self._beam[:, 1]
-        if not native.is_used():
+        if not native.IS_USED:
             return self._cast(ids, place_m, rays)
         ranges = np.empty(rays.shape[:2])
         native.compiled.ranges(
