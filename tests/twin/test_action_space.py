@@ -8,7 +8,6 @@ from gymnasium.vector import AutoresetMode
 
 import restock  # noqa: F401 - registers the environment
 from restock.errors import ConfigError
-from restock.ingest.task.task import nearest_action, observe, reward
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 
@@ -58,30 +57,6 @@ def test_a_command_of_the_table_does_what_its_index_does() -> None:
         np.testing.assert_allclose(other[4]["action_residual"], 0, atol=1e-6)
         for left, right in zip(one[:4], other[:4], strict=True):
             np.testing.assert_allclose(left, right, atol=2e-4)  # float32 commands
-
-
-def test_any_command_is_seen_and_rewarded_as_its_nearest_action() -> None:
-    made = WarehouseVectorEnv(6, action="continuous")
-    made.reset(seed=1)
-    made.action_space.seed(2)
-    previous = np.zeros(6, np.int64)
-    for _ in range(20):
-        now = {name: column.copy() for name, column in made.signals.items()}
-        command = made.action_space.sample()
-        observation, earned, terminated, truncated, info = made.step(command)
-        after, going = info["signals"], ~(terminated | truncated)
-        np.testing.assert_allclose(after["command_speed_mps"], command[:, 0])
-        np.testing.assert_allclose(after["command_yaw_rate_radps"], command[:, 1])
-        action, residual = nearest_action(made.task, command[:, 0], command[:, 1])
-        np.testing.assert_array_equal(info["action"], action)
-        np.testing.assert_allclose(info["action_residual"], residual)
-        np.testing.assert_array_equal(
-            earned, reward(made.task, now, after, info["progress_m"], action, previous)
-        )
-        np.testing.assert_allclose(
-            observation[going], observe(made.task, after, now, action)[going], atol=1e-6
-        )
-        previous = np.where(going, action, 0)
 
 
 def test_a_command_that_is_no_number_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""What the twin says of exposures: where their causes are, and that the rules find them."""
+"""What the twin says of conditions and exposures: where their causes are, what rules find."""
 
 from typing import Any
 
@@ -42,10 +42,11 @@ def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
 
 
 @pytest.mark.long
-def test_rules_find_the_episodes_of_a_true_exposure() -> None:
-    """Compare true exposures, from what is there, with exposures found from what is sensed."""
+def test_what_is_true_lies_at_its_cause_and_rules_find_it() -> None:
+    """Compare what is there with the mission, and with what is sensed."""
     reported: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     true: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
+    conditions: dict[str, set[str]] = {kind: set() for kind in KINDS}
     for kind in KINDS:
         made = WarehouseVectorEnv(12)
         made.set_episodes([EpisodeSpec(kind, seed) for seed in range(12)])
@@ -58,6 +59,7 @@ def test_rules_find_the_episodes_of_a_true_exposure() -> None:
             steps.append({name: column.copy() for name, column in made.signals.items()})
             number.append(at)
             *_, info = made.step(driver.act(made, made.observation)[0])
+            conditions[kind] |= set(info["true_condition"][at >= 0].tolist())
             for env in np.flatnonzero(at >= 0).tolist():
                 for name in true_names(str(info["true_exposure"][env])):
                     true[name].add((kind, int(at[env])))
@@ -80,3 +82,6 @@ def test_rules_find_the_episodes_of_a_true_exposure() -> None:
         assert len(reported[name] & true[name]) >= 0.8 * len(reported[name])
     # Who stands on the plan cannot be told from a pallet.
     assert {kind for kind, _ in reported["plan_blocked"]} <= {"blocked_aisle", "near_collision"}
+    for name in ("wheel_slip", "blocked_aisle"):
+        assert [kind for kind in KINDS if name in conditions[kind]] == [name]
+    assert {"near_collision", "recovery"} <= conditions["near_collision"]

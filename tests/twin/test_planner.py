@@ -86,16 +86,3 @@ def test_a_person_in_the_aisle_is_no_block() -> None:
     look = np.array([0]), pose, hits, np.ones((1, 9), np.bool_), np.ones(1), np.zeros(1, np.bool_)
     for _ in range(10):
         assert not finder.update(*look)
-
-
-def test_a_wall_of_returns_is_a_block_after_three_looks() -> None:
-    finder = BlockFinder([FLOOR], 1)
-    area = FLOOR.segments[0].area
-    pose = np.array([[area.x_min, area.center[1], 0.0]])
-    across = np.linspace(-0.7, 0.7, 9)
-    hits = np.stack([np.full(9, area.x_min + 1.0), area.center[1] + across], axis=-1)[None]
-    look = np.array([0]), pose, hits, np.ones((1, 9), np.bool_), np.ones(1), np.zeros(1, np.bool_)
-    looks = [finder.update(*look) for _ in range(3)]
-    assert [bool(blocks) for blocks in looks] == [False, False, True]
-    (robot, (segment, _)) = looks[2][0]
-    assert (robot, segment) == (0, 0)

@@ -22,6 +22,7 @@ from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Zone
 from restock.ingest.propose.footprint import parse_footprint
+from restock.ingest.store.transitions import replaced
 from restock.toml import Checked, read_toml, typed
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.render import FLOOR_PIXELS, MAP_GOAL, MAP_WALL, ROBOT
@@ -286,25 +287,25 @@ def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
     assert block.sum() / per_m**2 == pytest.approx(5.6 * 3.6, rel=0.05)
 
 
+def along(rows: pa.Table, poses: np.ndarray, rows_a_pose: int = 1) -> pa.Table:
+    """Return rows at these poses (N, 3), and then at the last."""
+    at = np.minimum(np.arange(len(rows)) // rows_a_pose, len(poses) - 1)
+    names = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
+    return replaced(rows, dict(zip(names, poses[at].T, strict=True)))
+
+
 def test_a_store_gives_the_floor_of_its_recording(tmp_path):
     bag = write_bag(tmp_path / "bag", poses=lap()[:60], grid=OccupancyGrid(hall(), CELL_M))
     recordings = []
     for recording, part in ((1, slice(0, 60)), (2, slice(60, 200))):
-        poses = lap()[part]
         rows = recording_transitions(recording, episodes=8)
-        at = np.minimum(np.arange(len(rows)) // 2, len(poses) - 1)
-        for name, values in zip(("pose_x_m", "pose_y_m", "pose_yaw_rad"), poses.T, strict=True):
-            column = rows.column_names.index(name)
-            kind = rows.schema.field(name)
-            rows = rows.set_column(column, kind, pa.array(values[at], kind.type))
-        recordings.append(rows)
-    there = str(bag)
+        recordings.append(along(rows, lap()[part], rows_a_pose=2))
     store = write_store(tmp_path / "store", recordings)
     gone = survey(store)
     assert gone.by == "corridor"
     assert "no longer exists" in gone.notes[0]
     manifests = DeltaTable(str(store / "recordings"))
-    manifests.update(updates={"source_file": f"'{there}'"})
+    manifests.update(updates={"source_file": f"'{bag}'"})
     made = survey(store)
     assert made.by == "map"
     # Missions go where any of the drives on this map was.
@@ -314,13 +315,8 @@ def test_a_store_gives_the_floor_of_its_recording(tmp_path):
 
 def lapped(recording: int, away_m: float) -> pa.Table:
     """Return the rows of a drive around the hall, in a frame shifted by this much."""
-    poses, rows = lap(), with_clear_view(recording_transitions(recording, episodes=8))
-    poses[:, 0] += away_m
-    at = np.minimum(np.arange(len(rows)), len(poses) - 1)
-    for name, values in zip(("pose_x_m", "pose_y_m", "pose_yaw_rad"), poses.T, strict=True):
-        kind = rows.schema.field(name)
-        rows = rows.set_column(rows.column_names.index(name), kind, pa.array(values[at], kind.type))
-    return rows
+    rows = with_clear_view(recording_transitions(recording, episodes=8))
+    return along(rows, lap() + np.array([away_m, 0.0, 0.0]))
 
 
 def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path, capsys):
