@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from deltalake import write_deltalake
 
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.version import FORMAT
 from support.stores import TASK, manifest, recording_transitions, views_over
 
@@ -67,7 +68,9 @@ def drives(
             for _ in range(recordings):
                 number += 1
                 drive = _drive(robot, number, week, episodes, seed)
-                made.append((drive, _tagged(manifest(drive), robot)))
+                tags = {"robot": robot.name, "site": robot.site}
+                known = {name: value for name, value in tags.items() if value}
+                made.append((drive, manifest(drive, tags=known)))
     return made
 
 
@@ -115,15 +118,4 @@ def _drive(robot: SyntheticRobot, number: int, week: int, episodes: int, seed: i
         "conditions": [["wheel_slip"] if slip else [] for slip in slips],
         "clearance_m": clearance.min(1),
     }
-    for name, column in values.items():
-        place = table.schema.get_field_index(name)
-        table = table.set_column(
-            place, table.schema[place], pa.array(column, table.schema[place].type)
-        )
-    return table
-
-
-def _tagged(row: pa.Table, robot: SyntheticRobot) -> pa.Table:
-    tags = [(key, value) for key, value in (("robot", robot.name), ("site", robot.site)) if value]
-    place = row.schema.get_field_index("tags")
-    return row.set_column(place, row.schema[place], pa.array([tags], row.schema[place].type))
+    return replaced(table, values)

@@ -83,32 +83,32 @@ def sb3_envs(count: int, **arguments: Any) -> Any:
     return DummyVecEnv([lambda: gymnasium.make("restock/Warehouse-v0", **arguments)] * count)
 
 
+def sb3_model(algorithm: str, env: Any, buffer: dict[str, Any], **options: Any) -> Any:
+    """Return an algorithm of Stable-Baselines3 with a mixture as its buffer, by these settings."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    from restock.train.libraries.sb3_buffer import MixtureReplayBuffer
+
+    mixture = {"replay_buffer_class": MixtureReplayBuffer, "replay_buffer_kwargs": buffer}
+    return getattr(sb3, algorithm)("MlpPolicy", env, seed=0, device="cpu", **mixture, **options)
+
+
 def trained_sb3(folder: Path, steps: int = 520) -> TrainedBuffer:
     """Return a DQN after 40 updates on logs and some hundred environment steps."""
-    sb3 = pytest.importorskip("stable_baselines3")
-    from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
+    pytest.importorskip("stable_baselines3")
+    from restock.train.libraries.sb3_buffer import dqn_critic
 
     store = make_store(folder)
     panel = make_panel(store, folder / "panel", n_step=3)
-    model = sb3.DQN(
-        "MlpPolicy",
+    fed = {"panel": panel.path, "run": folder / "run", "logs_share": 0.5, "n_step": 3}
+    model = sb3_model(
+        "DQN",
         sb3_envs(2),
-        replay_buffer_class=MixtureReplayBuffer,
-        replay_buffer_kwargs={
-            "panel": panel.path,
-            "run": folder / "run",
-            "logs_share": 0.5,
-            "n_step": 3,
-            "audit_share": 0.2,
-            "log_every": 60,
-        },
+        {**fed, "audit_share": 0.2, "log_every": 60},
         buffer_size=1000,
         learning_starts=40,
         train_freq=4,
         batch_size=64,
         policy_kwargs={"net_arch": [32]},
-        seed=0,
-        device="cpu",
     )
     buffer = model.replay_buffer
     buffer.critic = dqn_critic(model)

@@ -15,6 +15,7 @@ import pyarrow as pa
 from deltalake import write_deltalake
 
 from restock.ingest.store.summary import summarised
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.version import FORMAT
 from restock.ingest.task.conditions import labels_version, primary, shipped
 from restock.ingest.task.schema import STEP_BITS, recording_schema, transition_schema
@@ -168,9 +169,7 @@ def with_clear_view(table: pa.Table, task: Task = TASK) -> pa.Table:
     observation = np.array(table["observation"].to_pylist(), np.float32)
     clear = [name.startswith("clearance_") for name in task.observation_names]
     observation[:, clear] = 1.0
-    kind = table.schema.field("observation").type
-    column = pa.array(list(observation), kind)
-    return table.set_column(table.column_names.index("observation"), "observation", column)
+    return replaced(table, {"observation": list(observation)})
 
 
 def write_store(
@@ -216,12 +215,7 @@ def views_over(
 def one(recording: int, ingest: str = "a", seed: int = 0) -> tuple[pa.Table, pa.Table]:
     """Return a recording's manifest row and transitions."""
     rows = recording_transitions(recording, ingest=ingest, seed=seed)
-    row = manifest(rows).to_pylist()[0]
-    row["ingested_at"] = datetime(2026, 1, 1, tzinfo=UTC)
-    for field in recording_schema():
-        empty = [] if pa.types.is_list(field.type) else "" if pa.types.is_string(field.type) else 0
-        row.setdefault(field.name, empty)
-    return pa.Table.from_pylist([row], schema=recording_schema()), rows
+    return manifest(rows), rows
 
 
 def summarised_once(manifest: pa.Table, rows: pa.Table) -> pa.Table:

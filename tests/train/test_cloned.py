@@ -11,6 +11,7 @@ from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
+from restock.ingest.store.transitions import replaced
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.fitted_q import cloned_probabilities
 from restock.train.evaluation import policies
@@ -39,13 +40,8 @@ def driven_by_a_rule(recording: int, who: str, *, chance: bool = False) -> pa.Ta
     action = np.where(observation[:, 0] > 0, 1, 2)
     if chance:
         action = rng.integers(ACTIONS, size=len(table))
-    seen = pa.FixedSizeListArray.from_arrays(pa.array(observation.ravel()), TASK.observation_size)
-    columns = {"observation": seen, "action": action, "behaviour_policy": [who] * len(table)}
-    for name, column in columns.items():
-        place = table.schema.get_field_index(name)
-        field = table.schema.field(place)
-        table = table.set_column(place, field, pa.array(column).cast(field.type))
-    return table
+    columns = {"observation": list(observation), "action": action, "behaviour_policy": who}
+    return replaced(table, columns)
 
 
 @pytest.fixture(scope="module")

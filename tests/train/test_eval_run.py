@@ -10,6 +10,7 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.files import write_table
+from restock.ingest.store.transitions import replaced
 from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.run.kept_evaluations import add_evaluation, read_evaluations, shown_evaluation
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -77,12 +78,9 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, capsys):
         assert main([*line, "--policies", policy, "--seed", str(seed)]) == 0
         assert read_evaluations(run).num_rows == rows
     kept = read_evaluations(run)
-    place = kept.schema.get_field_index("layouts")
-    other = kept.slice(0, 1).set_column(place, "layouts", pa.array(["elsewhere"]))
-    place = other.schema.get_field_index("version")
-    newer = other.set_column(place, "version", pa.array(["a@9"]))
-    add_evaluation(run, other.cast(kept.schema))
-    add_evaluation(run, newer.cast(kept.schema))
+    other = replaced(kept.slice(0, 1), {"layouts": "elsewhere"})
+    add_evaluation(run, other)
+    add_evaluation(run, replaced(other, {"version": "a@9"}))
     assert read_evaluations(run).num_rows == 5
     shown, said = shown_evaluation(run)
     assert shown["version"].to_pylist() == ["a@9"]

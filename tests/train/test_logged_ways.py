@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +15,7 @@ from restock.arrays import F64
 from restock.cli import main
 from restock.cli.start.decisions import no_ways
 from restock.cli.start.stages import Settings
+from restock.ingest.store.transitions import replaced
 from restock.replay.panel.panel import Panel
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
@@ -76,11 +76,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
             columns[own] = rows_toward(goal + away_m, places)
         names = ("pose_x_m", "pose_y_m", "pose_yaw_rad", "waypoint_far_x_m", "waypoint_far_y_m")
         names += ("route_remaining_m", "goal_distance_m")
-        for name, column in zip(names, columns.T, strict=True):
-            place = table.schema.get_field_index(name)
-            field = table.schema.field(place)
-            table = table.set_column(place, field, pa.array(column).cast(field.type))
-        tables.append(table)
+        tables.append(replaced(table, dict(zip(names, columns.T, strict=True))))
     return panel_of(write_store(folder / "store", tables, task=TASK), MIXTURE, folder / "panel")
 
 

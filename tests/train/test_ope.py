@@ -6,7 +6,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.kept_run import QUICK, kept_network, kept_run
@@ -16,6 +15,7 @@ from support.stores import recording_transitions, write_store
 from restock.cli import main
 from restock.errors import RunError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
@@ -29,18 +29,12 @@ NETWORK = NetworkConfig(hidden=(16,))
 CONFIG = OpeConfig(model=QUICK)
 
 
-def with_probability(table: pa.Table, probability: float) -> pa.Table:
-    """Return the same rows with the action's probability logged."""
-    place = table.schema.get_field_index("action_probability")
-    column = pa.array(np.full(len(table), probability, np.float32))
-    return table.set_column(place, table.schema.field(place), column)
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("ope") / "store"
-    tables = [with_probability(recording_transitions(1, task=TASK), 0.25)]
-    return write_store(path, [*tables, recording_transitions(2, task=TASK)], task=TASK)
+    known, cloned = (recording_transitions(recording, task=TASK) for recording in (1, 2))
+    known = replaced(known, {"action_probability": np.full(len(known), 0.25)})
+    return write_store(path, [known, cloned], task=TASK)
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +79,7 @@ def test_without_a_panel_half_the_episodes_are_evaluated_on(store: Path) -> None
 def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
     table = recording_transitions(1)
     stops = table["terminated"].to_numpy() & (table["episode_index"].to_numpy() % 3 == 0)
-    reward = pa.array(np.where(stops, np.float32(-6), table["reward"].to_numpy()))
-    place = table.schema.get_field_index("reward")
-    table = table.set_column(place, table.schema.field(place), reward)
+    table = replaced(table, {"reward": np.where(stops, -6.0, table["reward"].to_numpy())})
     with Store(write_store(tmp_path / "store", [table])) as opened:
         ids = opened.sql("SELECT transition_id FROM transitions").fetchnumpy()["transition_id"]
         steps = read_steps(opened.connection, np.asarray(ids, np.int64))

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.library_buffers import TASK, make_panel, make_store, run_tables, sb3_envs
+from support.library_buffers import TASK, make_panel, make_store, run_tables, sb3_envs, sb3_model
 
 from restock.errors import MixtureError, PanelError
 from restock.replay.panel.panel import Panel
 
-sb3 = pytest.importorskip("stable_baselines3")
+pytest.importorskip("stable_baselines3")
 
-from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, logged_commands  # noqa: E402
+from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, logged_commands
 
 
 @pytest.fixture(scope="module")
@@ -67,23 +67,15 @@ def test_fresh_rows_are_what_the_environment_gave(tmp_path: Path) -> None:
 @pytest.mark.parametrize("given", ["table", "store"])
 def test_sac_trains_on_the_continuous_face_with_logs(panel, store, tmp_path, given):
     commands = logged_commands(panel.path, store) if given == "store" else None
-    model = sb3.SAC(
-        "MlpPolicy",
+    fed = {"panel": panel.path, "run": tmp_path / "run", "commands": commands, "n_step": 3}
+    model = sb3_model(
+        "SAC",
         sb3_envs(1, action="continuous"),
-        replay_buffer_class=MixtureReplayBuffer,
-        replay_buffer_kwargs={
-            "panel": panel.path,
-            "run": tmp_path / "run",
-            "commands": commands,
-            "n_step": 3,
-            "audit_share": 1.0,
-        },
+        {**fed, "audit_share": 1.0},
         buffer_size=500,
         learning_starts=20,
         batch_size=32,
         policy_kwargs={"net_arch": [16]},
-        seed=0,
-        device="cpu",
     )
     model.learn(60)
     model.replay_buffer.close()
@@ -92,14 +84,10 @@ def test_sac_trains_on_the_continuous_face_with_logs(panel, store, tmp_path, giv
     assert (batch.actions.abs() <= 1).all()
     rows = model.replay_buffer._log_actions
     space = model.action_space
-    if given == "table":  # scaled back they are the task's actions
-        physical = space.low + (rows + 1) / 2 * (space.high - space.low)
-        index = panel.rows[:, panel.columns["action"]][:, 0].astype(int)
-        np.testing.assert_allclose(physical, np.array(TASK.actions)[index], atol=1e-6)
-    else:
-        inside = np.clip(commands, space.low, space.high)
-        physical = space.low + (rows + 1) / 2 * (space.high - space.low)
-        np.testing.assert_allclose(physical, inside, atol=1e-6)
+    physical = space.low + (rows + 1) / 2 * (space.high - space.low)
+    index = panel.rows[:, panel.columns["action"]][:, 0].astype(int)
+    driven = np.array(TASK.actions)[index] if commands is None else commands
+    np.testing.assert_allclose(physical, np.clip(driven, space.low, space.high), atol=1e-6)
     audit = run_tables(tmp_path / "run")["audit"]
     assert {row["source"] for row in audit} == {"logs", "fresh"}
     assert all(row["td"] is None for row in audit)  # SAC keeps it to itself

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from support.library_buffers import make_panel, make_store, run_tables
+from support.library_buffers import make_panel, make_store, run_tables, sb3_model
 
 from restock.errors import RunError
 
@@ -15,7 +15,7 @@ sb3 = pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
-from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic  # noqa: E402
+from restock.train.libraries.sb3_buffer import dqn_critic  # noqa: E402
 
 BATCH = 32
 # Of an observation's bytes its episodes and steps: a seed's episodes come again when it is loaded.
@@ -55,22 +55,15 @@ def place() -> Places:
 def saved(tmp_path: Path, place: Places) -> Any:
     """Return a DQN in the middle of an episode, saved with its buffer."""
     panel = make_panel(make_store(tmp_path), tmp_path / "panel", n_step=3)
-    model = sb3.DQN(
-        "MlpPolicy",
+    fed = {"panel": str(panel.path), "run": str(tmp_path / "run"), "n_step": 3, "log_every": 10}
+    model = sb3_model(
+        "DQN",
         DummyVecEnv([lambda: Seen(place)]),
-        replay_buffer_class=MixtureReplayBuffer,
-        replay_buffer_kwargs={
-            "panel": str(panel.path),
-            "run": str(tmp_path / "run"),
-            "n_step": 3,
-            "log_every": 10,
-        },
+        fed,
         buffer_size=1000,
         learning_starts=20,
         batch_size=BATCH,
         policy_kwargs={"net_arch": [16]},
-        seed=0,
-        device="cpu",
     )
     model.replay_buffer.critic = dqn_critic(model)
     model.learn(104)

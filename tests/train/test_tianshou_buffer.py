@@ -96,19 +96,17 @@ def test_a_blown_up_step_is_not_learnt_from() -> None:
     assert set(buffer.sample_indices(200).tolist()) == {0, 1, 2}
 
 
-def _add(buffer: Any, steps: int, invalid: int = -1) -> None:
-    size = TASK.observation_size
+def _add(buffer: Any, steps: int, invalid: int = -1, action: object = 1) -> None:
     for step in range(steps):
-        seen = np.full((1, size), step, np.float32)
-        info = np.array([{"invalid": step == invalid}])
+        seen = np.full((1, TASK.observation_size), step, np.float32)
         row = batch_of(
             obs=seen,
-            act=np.array([1]),
+            act=np.array([action]),
             rew=np.array([0.5]),
             terminated=np.array([False]),
             truncated=np.array([step == invalid]),
             obs_next=seen + 1,
-            info=info,
+            info=np.array([{"invalid": step == invalid}]),
         )
         buffer.add(row, buffer_ids=[0])
 
@@ -127,17 +125,7 @@ def test_without_logs_and_without_steps_there_is_nothing_to_draw() -> None:
 def test_commands_of_logs_stand_beside_continuous_fresh_ones(panel: Panel) -> None:
     commands = np.linspace(-1, 1, 2 * len(panel)).reshape(-1, 2)
     buffer = buffer_of(50, 1, panel=panel, logs_share=0.5, commands=commands)
-    seen = np.zeros((1, TASK.observation_size), np.float32)
-    row = batch_of(
-        obs=seen,
-        act=np.array([[0.25, -0.5]]),
-        rew=np.array([0.0]),
-        terminated=np.array([False]),
-        truncated=np.array([False]),
-        obs_next=seen,
-        info=np.array([{}]),
-    )
-    buffer.add(row, buffer_ids=[0])
+    _add(buffer, 1, action=[0.25, -0.5])
     batch, index = buffer.sample(8)
     np.testing.assert_allclose(batch.act[4:], [[0.25, -0.5]] * 4)
     np.testing.assert_allclose(batch.act[:4], commands[index[:4] - 50], rtol=1e-6)
