@@ -1,4 +1,7 @@
-"""A profile of one's own goes with its rows: store, panel and run carry its text."""
+"""A profile of one's own goes with its rows: store, panel and run carry its text.
+
+Its conditions over custom signals label logs, not the twin, which has no such signals.
+"""
 
 import json
 from pathlib import Path
@@ -25,6 +28,12 @@ OWN = """
 [[condition]]
 file = "creeping.sql"
 
+[[condition]]
+name = "sagging"
+timing = "pre"
+priority = 30
+sql = "battery_v < 26.395"
+
 [signals.battery_v]
 topic = "/diagnostics"
 type = "diagnostic_msgs/msg/DiagnosticArray"
@@ -37,11 +46,12 @@ CREEPING = """-- timing: pre
 abs(wheel_speed_mps) < 0.3
 """
 TINY = [
-    *("schedule.env_steps=200", "schedule.offline_updates=5", "schedule.warmup_env_steps=40"),
-    *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=200"),
+    *("schedule.env_steps=400", "schedule.offline_updates=5", "schedule.warmup_env_steps=40"),
+    *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=400"),
     *("record.trackers=[]", "network.hidden=[8]", "replay.batch_size=16"),
     "env.conditions={nominal=1.0}",
 ]
+FLAGS = [word for text in TINY for word in ("--set", text)]
 TUESDAY, MONDAY = str(ROOT / "sample_logs/amr_tuesday"), str(ROOT / "sample_logs/amr_monday.mcap")
 
 
@@ -61,9 +71,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("carried")
     ingest(folder, "mine", TUESDAY, folder / "store")
     assert main(["mix", str(folder / "store"), "--out", str(folder / "panel")]) == 0
-    tiny = [word for text in TINY for word in ("--set", text)]
     given = ["--panel", str(folder / "panel"), "--out", str(folder / "run")]
-    assert main(["train", *given, *tiny]) == 0
+    assert main(["train", *given, *FLAGS]) == 0
     return folder
 
 
@@ -79,7 +88,8 @@ def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
         rows = store.sql("SELECT profile_toml, profile_hash FROM recordings").fetchall()
     carried = parse_profile(rows[0][0], where="test")
     assert (carried.name, carried.hash) == ("mine", rows[0][1])
-    assert [c.sql for c in carried.own_conditions] == ["abs(wheel_speed_mps) < 0.3"]
+    rules = ["abs(wheel_speed_mps) < 0.3", "battery_v < 26.395"]
+    assert [c.sql for c in carried.own_conditions] == rules
     assert profile_of_panel(Panel.open(folder / "panel")) == carried
     run = Run.open(folder / "run")
     assert profile_of_run(run) == carried
@@ -90,11 +100,32 @@ def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, capsys):
     drive = ["eval", str(folder / "run"), "--episodes", "1", "--perturbations", "none"]
     assert main([*drive, "--policies", "agent", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["results"]
-    resumed = prepare_resumed(folder / "run", ["schedule.env_steps=210"])
+    assert main(["report", str(folder / "run")]) == 0
+    page = (folder / "run" / "report.html").read_text()
+    assert "Conditions of the logs that the twin cannot show" in page
+    assert "battery_v" in page
+    resumed = prepare_resumed(folder / "run", ["schedule.env_steps=410"])
     assert resumed.profile.name == "mine"
     # The run's config names the profile as the panel does: its settings make the same run again.
     again = prepare_new(folder / "again", folder / "panel", None, [*TINY, "profile=mine"])
     assert again.profile == resumed.profile
+
+
+def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, capsys):
+    """What the twin's own signals say is evaluated there; logs keep their stored labels."""
+    line = ["train", "--panel", str(folder / "panel"), "--out", str(folder / "dry"), *FLAGS]
+    assert main([*line, "--dry-run"]) == 0
+    said = capsys.readouterr()
+    assert said.err.count("condition 'sagging' is not evaluated in the twin") == 1
+    assert json.loads(said.out)["not_evaluated"] == {"sagging": ["battery_v"]}
+    assert not (folder / "dry").exists()
+    run = Run.open(folder / "run")
+    assert run.document["not_evaluated"] == {"sagging": ["battery_v"]}
+    labels = {name for names in run.table("episodes")["conditions"].to_pylist() for name in names}
+    assert "creeping" in labels
+    assert "sagging" not in labels
+    observed = run.table("conditions").to_pylist()
+    assert {row["source"] for row in observed if row["condition"] == "sagging"} == {"logs"}
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,17 @@ def test_a_damaged_or_foreign_file_gives_one_clear_error(tmp_path: Path, content
         checkpoint.load(path)
 
 
+@pytest.mark.parametrize("at", [0.3, 0.7])
+def test_a_flipped_bit_is_found_and_its_remedy_said(tmp_path: Path, at: float) -> None:
+    path = tmp_path / "latest.safetensors"
+    checkpoint.save(path, {"weight": torch.arange(100.0)})
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=r"is damaged.*\n.*restore it from a copy, or train again"):
+        checkpoint.load(path)
+
+
 def test_checkpoint_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "latest.safetensors"
     save_file({}, path, metadata={"format": "restock-checkpoint/1", "state": "{}"})

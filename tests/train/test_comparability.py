@@ -82,23 +82,23 @@ def test_the_rarest_stratum_halved_is_found() -> None:
     assert (raw.first, raw.second) == (pytest.approx(0.001), pytest.approx(0.0005))
 
 
-def test_another_mix_of_conditions_in_the_twin_is_found() -> None:
-    found = failing(feed(1), feed(2, slip=0.5))
-    assert "mix" in {check.name for check in found}
-    assert "share of fresh/wheel_slip" in {check.name for check in found}
+FEW = {f"episodes of logs/{name}" for name in ("nominal", "wheel_slip", "rare")}
 
 
-def test_weights_that_undo_a_boost_are_found() -> None:
-    found = failing(feed(1, runs=5), feed(2, runs=5, weight=(1, 0.2, 1, 1, 1)))
-    assert {check.name for check in found} >= {"mix after weights"}
-    assert not [check for check in found if "after weights" not in check.name]
-
-
-def test_a_stratum_fed_from_few_episodes_is_found() -> None:
-    found = failing(feed(1, runs=5), feed(2, runs=5, log_episodes=40))
-    assert {check.name for check in found} == {
-        f"episodes of logs/{name}" for name in ("nominal", "wheel_slip", "rare")
-    }
+@pytest.mark.parametrize(
+    ("planted", "least", "most"),
+    [
+        ({"slip": 0.5}, {"mix", "share of fresh/wheel_slip"}, None),
+        ({"weight": (1, 0.2, 1, 1, 1)}, {"mix after weights"}, None),  # which undo a boost
+        ({"log_episodes": 40}, FEW, FEW),
+    ],
+    ids=str,
+)
+def test_what_is_planted_is_found(planted, least, most) -> None:
+    names = {check.name for check in failing(feed(1, runs=5), feed(2, runs=5, **planted))}
+    assert names >= least
+    assert most is None or names <= most
+    assert "weight" not in planted or all("after weights" in name for name in names)
 
 
 def test_a_shift_within_the_run_that_the_whole_hides_is_found() -> None:

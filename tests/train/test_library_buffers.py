@@ -9,7 +9,6 @@ import torch
 from support.library_buffers import TrainedBuffer, trained_sb3, trained_tianshou
 from support.long import one_in
 
-from restock import cli
 from restock.replay.store.store import Store
 from restock.train.feed.batch_record import STOPPED, NotFinite
 
@@ -41,6 +40,7 @@ def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
     assert logs == trained.offline_updates * size + online * size // 2
     assert logs + fresh == size * feed.batches
     assert sum(row["updates"] for row in tables["progress"]) == feed.batches
+    assert all(row["td_abs_mean"] > 0 for row in tables["strata"] if row["drawn_rows"])
 
 
 def test_a_nonfinite_network_stops_and_names_the_rows(tmp_path):
@@ -105,11 +105,6 @@ def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> No
             assert row["weight"] == 1
 
 
-def test_td_errors_by_condition_are_recorded(trained: TrainedBuffer) -> None:
-    rows = [row for row in trained.tables["strata"] if row["drawn_rows"]]
-    assert all(row["td_abs_mean"] > 0 for row in rows)
-
-
 def test_ended_episodes_are_labelled(trained: TrainedBuffer) -> None:
     ended, fresh = trained.tables["episodes"], trained.feed.fresh
     assert len(ended) >= 2  # two environments, 250 steps each, 240 at most an episode
@@ -121,9 +116,3 @@ def test_ended_episodes_are_labelled(trained: TrainedBuffer) -> None:
         conditions = {fresh.conditions[code] for code in codes} - {"nominal"}
         assert conditions <= set(row["conditions"])
     assert trained.feed.labels.unlabelled_episodes == 0
-
-
-def test_the_run_can_be_queried(trained: TrainedBuffer, capsys: pytest.CaptureFixture[str]) -> None:
-    query = "SELECT source, sum(drawn_rows)::INT AS rows FROM strata GROUP BY ALL ORDER BY ALL"
-    assert cli.main(["sql", str(trained.run), query]) == 0
-    assert "logs" in capsys.readouterr().out

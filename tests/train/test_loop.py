@@ -24,7 +24,7 @@ from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EvaluationBuffer, fixed_episodes
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.feed.batches import LogTerms
-from restock.train.feed.logs import Coded, Logs
+from restock.train.feed.logs import Coded
 from restock.train.loop import nothing_to_do, train
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
@@ -75,11 +75,6 @@ def test_run_drives_for_half_of_its_time(tmp_path: Path, monkeypatch: pytest.Mon
     assert live.learner.gradient_steps < 10**6
     # The evaluation after it is in the budget too.
     assert live.progress.planned_env_steps < 10**6
-
-
-def one_stratum(shelf: Logs, **changes: Any) -> Logs:
-    """Return the same logs with one stratum of other rows."""
-    return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
 
 
 class AtOnce(Executor):
@@ -347,7 +342,8 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
     """Offline on rows that only drive forward: without it, "back" is worth what chance says."""
     shelf = logs(400)
     forward = np.flatnonzero(shelf.rows[:, -3].numpy() == 1)
-    shelf = one_stratum(shelf, stratum_rows=[forward], shares=np.ones(1))
+    alone = {"strata": ["nominal"], "timings": ["pre"], "stratum_rows": [forward]}
+    shelf = dataclasses.replace(shelf, **alone, shares=np.ones(1))
     cells = torch.zeros(CELLS - 1, TASK.observation_size)
     cells[torch.arange(CELLS - 1), torch.arange(CELLS - 1)] = 1
     gaps = []

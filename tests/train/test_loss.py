@@ -1,7 +1,7 @@
 """The loss against hand arithmetic."""
 
 import pytest
-from torch import Tensor, int64, stack, tensor, zeros
+from torch import tensor
 
 from restock.train.dqn.algorithm import conservative_penalty, dqn_loss, margin_penalty, td_target
 
@@ -24,26 +24,6 @@ def test_double_dqn_selects_online_and_evaluates_with_target() -> None:
     assert td_target(reward, discount, slow, online, lower=True).tolist() == [2.0]
     assert td_target(reward, discount, slow, online / 9, lower=True).tolist() == [1.5]
     assert td_target(reward, discount, slow).tolist() == [3.0]  # 1 + 0.5 * 4
-
-
-def huber(error: Tensor, delta: float = 1.0) -> Tensor:
-    """Return the loss of each error alone: of one action value against a target of 0."""
-    action, target = zeros(1, dtype=int64), zeros(1)
-    losses = [dqn_loss(one.reshape(1, 1), action, target, huber_delta=delta) for one in error]
-    return stack([loss.value for loss in losses])
-
-
-def test_huber_is_quadratic_then_linear() -> None:
-    error = tensor([0.0, 0.5, -1.0, 3.0, -3.0])
-    assert huber(error).tolist() == pytest.approx([0.0, 0.125, 0.5, 2.5, 2.5])
-    assert huber(tensor([3.0]), delta=2.0).tolist() == pytest.approx([4.0])  # 2 * (3 - 1)
-
-
-def test_huber_bounds_the_gradient() -> None:
-    error = tensor([0.3, 5.0, -50.0], requires_grad=True)
-    huber(error).sum().backward()
-    assert error.grad is not None
-    assert error.grad.tolist() == pytest.approx([0.3, 1.0, -1.0])
 
 
 def test_loss_by_hand() -> None:

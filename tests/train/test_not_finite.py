@@ -9,7 +9,6 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from support.kept_run import TASK
-from support.long import one_in
 from support.stores import recording_transitions
 from support.toy_run import assert_same_run, config, logs, run_to_end, session
 
@@ -141,22 +140,3 @@ def test_nonfinite_network_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
     train(again)
     again.close()
     assert_same_run(run_to_end(tmp_path / "whole", settings), again)
-
-
-@pytest.mark.parametrize("at", one_in(2, [0.3, 0.7]))
-def test_a_damaged_checkpoint_is_refused_by_name(panel, tmp_path, capsys, at):
-    out = tmp_path / "run"
-    assert main(["train", "--panel", str(panel), "--out", str(out), *TINY]) == 0
-    run = Run.open(out)
-    for file, argv in (
-        (run.latest, ["train", "--resume", str(out), "--env-steps", "120"]),
-        (run.best, ["eval", str(out), "--episodes", "1"]),
-    ):
-        content = bytearray(file.read_bytes())
-        content[int(at * len(content))] ^= 1
-        file.write_bytes(content)
-        capsys.readouterr()
-        assert main(argv) == 2
-        said = capsys.readouterr().err
-        assert f"{file}: is damaged" in said
-        assert "restore it from a copy, or train again" in said

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,25 +15,41 @@ from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.algorithm import DQN
-from restock.train.dqn.config import LossConfig, NetworkConfig
+from restock.train.dqn.config import LossConfig, NetworkConfig, parse_config
+from restock.train.dqn.learner import greedy_actions
 from restock.train.evaluation.onnx_policy import OnnxPolicy, to_onnx
+from restock.train.evaluation.policies import make_learner
 
 onnx = pytest.importorskip("onnx")
 runtime = pytest.importorskip("onnxruntime")
 TASK = load_profile("warehouse_amr").task
 
 
-@pytest.mark.parametrize("settings", [{}, {"layer_norm": False}], ids=str)
-def test_values_are_those_of_torch(settings: dict[str, object]) -> None:
-    config = msgspec.convert({"hidden": [32, 24], **settings}, NetworkConfig)
-    network = DQN(LossConfig()).make_network(config, 11, 5, torch.Generator().manual_seed(3))
-    session = runtime.InferenceSession(to_onnx(network).SerializeToString())
-    observation = np.random.default_rng(0).normal(size=(64, 11)).astype(np.float32)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"network": {"layer_norm": False}},
+        {"teacher": {"source": "planner", "margin": 0.05}},
+        {"teacher": {"source": "logs", "ratio": 0.9}},
+    ],
+    ids=str,
+)
+def test_values_and_actions_are_those_of_torch(settings: dict[str, Any]) -> None:
+    network = {"hidden": [32, 24], **settings.get("network", {})}
+    policy = make_learner(parse_config({**settings, "network": network}, where="test"), TASK).policy
+    session = runtime.InferenceSession(to_onnx(policy).SerializeToString())
+    rng, known = np.random.default_rng(0), TASK.observation_names.index("nav_known")
+    observation = rng.normal(size=(512, TASK.observation_size)).astype(np.float32)
+    observation[:, known] = rng.random(512) < 0.7  # whether navigation proposes anything
+    observation[observation[:, known] == 0, known:] = 0
     values, action = session.run(["values", "action"], {"observation": observation})
     with torch.no_grad():
-        expected = network(torch.from_numpy(observation)).numpy()
+        expected = policy(torch.from_numpy(observation)).numpy()
+    filtered = np.isinf(expected).mean()
+    assert 0 < filtered < 1 if "ratio" in settings.get("teacher", {}) else filtered == 0
     np.testing.assert_allclose(values, expected, atol=1e-5)
-    np.testing.assert_array_equal(action, expected.argmax(axis=1))
+    np.testing.assert_array_equal(action, greedy_actions(policy, observation))
 
 
 @pytest.fixture(scope="module")

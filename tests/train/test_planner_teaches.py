@@ -11,28 +11,24 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.paths import ROOT
-from support.toy_run import assert_same_run, config, run_to_end, session
-from torch import Tensor, tensor
+from torch import tensor
 
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import nearest_action, proposal_reader
-from restock.train.dqn.behaviour import ProposalNetwork, make_policy, plausible_actions
+from restock.train.dqn.behaviour import plausible_actions
 from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.dqn.learner import Learner, greedy_actions
+from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.policies import load_agent, make_learner, save_agent, write_mean
-from restock.train.loop import train
 from restock.train.prepare import prepare_new
-from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 TASK = load_profile("warehouse_amr").task
 KNOWN = TASK.observation_names.index("nav_known")
-BY_PLANNER = {"teacher": {"source": "planner"}}
 
 
 def observed(command: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -111,22 +107,6 @@ def test_with_constant_values_it_drives_as_the_planner_does() -> None:
     assert len(set(taken)) > 3
 
 
-def test_onnx_deviates_where_torch_does() -> None:
-    pytest.importorskip("onnx")
-    runtime = pytest.importorskip("onnxruntime")
-    from restock.train.evaluation.onnx_policy import to_onnx
-
-    policy = learner(0.3).policy
-    file = runtime.InferenceSession(to_onnx(policy).SerializeToString())
-    rng = np.random.default_rng(0)
-    observation = observed(rng.uniform(-1, 1, (512, 2)), rng.random(512) < 0.7)
-    values, action = file.run(["values", "action"], {"observation": observation})
-    with torch.no_grad():
-        expected: Tensor = policy(torch.from_numpy(observation))
-    np.testing.assert_allclose(values, expected.numpy(), atol=1e-5)
-    np.testing.assert_array_equal(action, greedy_actions(policy, observation))
-
-
 def kept(path, seed, **teacher):
     """Write a run with a policy of random weights; return the policy."""
     document = {"teacher": teacher, "network": {"hidden": [16]}, "seed": seed}
@@ -189,43 +169,6 @@ def test_runs_without_a_mean_are_refused(tmp_path: Path, capsys, teacher, why: s
     assert main(words) == 2
     assert why in capsys.readouterr().err
     assert not (tmp_path / "mean").exists()
-
-
-def test_a_stopped_run_ends_as_a_whole_one(tmp_path: Path) -> None:
-    settings = config(**BY_PLANNER, schedule={"env_steps": 800})
-    whole = run_to_end(tmp_path / "whole", settings)
-    stopped = session(tmp_path / "stopped", settings)
-    requested = iter(range(130))
-    with pytest.raises(Exception, match="restock train --resume"):
-        train(stopped, stop=lambda: next(requested, None) is None)
-    stopped.close()
-    resumed = session(tmp_path / "stopped", settings, resume=True)
-    train(resumed)
-    resumed.close()
-    assert_same_run(whole, resumed)
-    kept = make_policy(settings, whole.learner.network.observation_size, 3)
-    kept.load_state_dict(checkpoint.load(whole.run.best)["network"])
-    assert isinstance(kept, ProposalNetwork)
-    assert torch.equal(kept.lead, whole.learner.policy.lead)
-    assert kept.lead.abs().max() == pytest.approx(0.2)
-
-
-@pytest.mark.parametrize(
-    ("settings", "where"),
-    [
-        ({"source": "planner", "ratio": 0.5}, "teacher.ratio"),
-        ({"source": "planner", "policies": ["teleop"]}, "teacher.policies"),
-        ({"source": "operator", "margin": 0.5}, "teacher.margin"),
-        ({"source": "none", "margin": 0.5}, "teacher.margin"),
-    ],
-)
-def test_settings_without_effect_are_refused(
-    settings: dict[str, object], where: str, tmp_path: Path
-) -> None:
-    given = parse_config({"teacher": settings}, where="test")
-    with pytest.raises(ConfigError) as refused:
-        prepare_new(tmp_path / "run", None, given)
-    assert refused.value.where == where
 
 
 def test_a_robot_whose_proposals_are_not_read_is_refused(tmp_path: Path) -> None:

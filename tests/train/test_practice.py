@@ -48,9 +48,6 @@ def at(env_steps: int) -> dict[str, int]:
     return {"env_steps": env_steps, "gradient_steps": 0}
 
 
-# -- shares ---------------------------------------------------------------------------------------
-
-
 @st.composite
 def floor_of(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float]:
     """Two sets of weights, and a floor that leaves room for all."""
@@ -135,15 +132,9 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
     assert sum(natural.values()) == pytest.approx(1.0)
 
 
-# -- refused by name ------------------------------------------------------------------------------
-
-
 def test_success_of_a_task_without_a_goal_is_refused() -> None:
     with pytest.raises(ConfigError, match="the task has no goal"):
         Practice(PracticeConfig(rule="success"), ARMS, goal=False)
-
-
-# -- in a run -------------------------------------------------------------------------------------
 
 
 PRACTICE = {"rule": "success"}
@@ -156,9 +147,6 @@ def test_a_run_of_other_arms_is_not_resumed(tmp_path: Path) -> None:
     one = {"conditions": {"nominal": 1.0, "wheel_slip": 0.0}}
     with pytest.raises(RunError, match="practised nominal, wheel_slip; now there are nominal"):
         session(tmp_path / "run", config(practice=PRACTICE, env=one), resume=True)
-
-
-# -- the warehouse --------------------------------------------------------------------------------
 
 
 def test_warehouse_draws_missions_of_the_requested_arms() -> None:
@@ -187,6 +175,3 @@ def test_an_order_is_an_arm_and_says_so() -> None:
     twin.set_mission_shares([0, 1])
     _, info = twin.reset(seed=1)
     assert (info["episode_condition"][0], info["mission_arm"][0]) == ("near_collision", 1)
-
-
-# -- the gate -------------------------------------------------------------------------------------

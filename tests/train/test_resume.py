@@ -73,6 +73,7 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
         None,
         Walker,
     ),
+    "navigation's proposals": ({"teacher": {"source": "planner"}}, None, lambda: None),
     "practice": ({"practice": {"rule": "success"}}, None, lambda: None),
     "shares of logged rows": (
         {"replay": {"logs_share": None}},

@@ -36,6 +36,12 @@ name = "dueling"
 settings = { network.layer_norm = false }
 """
 
+TWICE = f"""measures = []{SMALL}
+[[arms]]
+name = "again"
+baseline = "dueling"
+treatment = "method"
+"""
 TWO = "[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
 PRIMARY = "primary = { arm = 'b', measure = 'auc_rare' }"
 
@@ -118,28 +124,21 @@ treatment = "method"
     ]
 
 
-def study_of_two_comparisons(tmp_path: Path) -> Path:
-    """Write s.toml; its folder of results, in which all was trained and evaluated before."""
-    arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
-    (tmp_path / "s.toml").write_text(f"measures = []{SMALL}{arm}")
-    out = tmp_path / "out"
-    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, out)
-    for job in plan.jobs:  # all were trained and evaluated before
-        job.path.mkdir(parents=True)
-        job.done.write_text(plan.fingerprint(job))
-    return out
-
-
-def test_a_changed_study_says_what_is_different(tmp_path: Path, capsys) -> None:
-    study, out = tmp_path / "s.toml", tmp_path / "o"
-    arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
-    text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
-    study.write_text(text)
-    plan = StudyPlan(load_study(study), tmp_path, out)
+def trained_before(tmp_path: Path, text: str) -> Path:
+    """Write s.toml; return its folder of results, in which all was trained and evaluated."""
+    (tmp_path / "s.toml").write_text(text)
+    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
     for job in plan.jobs:
         job.path.mkdir(parents=True)
         job.done.write_text(plan.fingerprint(job))
-    moved = out.rename(tmp_path / "moved")
+    return tmp_path / "out"
+
+
+def test_a_changed_study_says_what_is_different(tmp_path: Path, capsys) -> None:
+    study = tmp_path / "s.toml"
+    arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
+    text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
+    moved = trained_before(tmp_path, text).rename(tmp_path / "moved")
     line = ["train", str(study), "--out", str(moved), "--dry-run", "--json"]
     assert main(line) == 0
     assert all(row["done"] for row in json.loads(capsys.readouterr().out))
@@ -153,7 +152,7 @@ def test_a_changed_study_says_what_is_different(tmp_path: Path, capsys) -> None:
 
 
 def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
-    out = study_of_two_comparisons(tmp_path)
+    out = trained_before(tmp_path, TWICE)
     dueling = Difference("config.network.layer_norm", "algorithm", True, False)
 
     def compared(first, second, *, treatment):
@@ -167,15 +166,9 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     assert main(["train", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
     assert requested == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
     first, second = json.loads(capsys.readouterr().out)["comparisons"]
-    assert (first["arm"], first["baseline"], first["treatment"]) == (
-        "dueling",
-        "plain",
-        "algorithm",
-    )
-    assert (second["arm"], second["baseline"], second["treatment"]) == (
-        *("again", "dueling"),
-        "method",
-    )
+    keys = ("arm", "baseline", "treatment")
+    assert [first[key] for key in keys] == ["dueling", "plain", "algorithm"]
+    assert [second[key] for key in keys] == ["again", "dueling", "method"]
     page = (out / "study.md").read_text()
     assert "differ in config.network.layer_norm, which treatment algorithm does not" in page
     assert "## again against dueling" in page
@@ -183,7 +176,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
 
 
 def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypatch) -> None:
-    out = study_of_two_comparisons(tmp_path)
+    out = trained_before(tmp_path, TWICE)
 
     def compared(first, second, *, treatment):
         if treatment == "algorithm":
@@ -271,17 +264,14 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     [
         ("arms = []", "arms must be two or more"),
         ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "but the study has no store"),
-        ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "`baseline`"),
-        (
-            '[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "c"',
-            "'c' is not one of the arms",
-        ),
+        (f"baseline = 'c'\n{TWO}", "`baseline`"),
+        (f"{TWO}baseline = 'c'", "'c' is not one of the arms"),
         (
             '[[arms]]\nname = "a"\ntreatment = "method"\n[[arms]]\nname = "b"',
             "'a' is the first, the study's baseline: it cannot have a treatment",
         ),
-        ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "without repetition"),
-        ('[settings]\nseed = 3\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "must not set seed"),
+        (f"seeds = [1, 1]\n{TWO}", "without repetition"),
+        (f"[settings]\nseed = 3\n{TWO}", "must not set seed"),
         (f"{TWO}[evaluation]\nperturbations = []", "perturbations: names nothing"),
         (f"measures = ['auc']\n{TWO}", "measure 'auc' must be auc_WHAT or success_WHAT"),
         (f"seeds = [-1, 1]\n{TWO}", "seeds must be from 0 to 2147483647, got -1"),

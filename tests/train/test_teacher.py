@@ -21,13 +21,9 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Mirror
 from restock.replay.sampling.ring import FreshRing
 from restock.state import restored, saved
-from restock.train.dqn.algorithm import td_target
 from restock.train.dqn.behaviour import (
     UNKNOWN,
-    FilteredNetwork,
     Labelled,
-    imitation_loss,
-    make_policy,
     plausible_actions,
 )
 from restock.train.dqn.config import TeacherConfig, parse_config
@@ -35,16 +31,10 @@ from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.feed.teacher import Imitation, TeacherFailed, open_teacher
 from restock.train.loop import train
 from restock.train.prepare import prepare_new, prepare_resumed
-from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 STOP, FORWARD, BACK = range(3)
-
-
-def of(probability: list[list[float]]) -> Tensor:
-    """Logits of which G is the softmax."""
-    return tensor(probability).log() + 2.5
 
 
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1))
@@ -57,24 +47,6 @@ def test_plausible_is_what_the_ratio_says_of_the_probabilities(ratio: float, see
     assert bool(((probability >= ratio * largest) == found)[~near].all())
     assert bool(found.any(dim=1).all())
     assert bool(found.gather(1, probability.argmax(dim=1, keepdim=True)).all())
-
-
-def test_the_target_looks_among_the_plausible_alone() -> None:
-    reward, discount = tensor([1.0, 0.0]), tensor([0.5, 0.0])
-    slow = tensor([[4.0, 2.0, 8.0], [9.0, 9.0, 9.0]])
-    online = tensor([[1.0, 3.0, 5.0], [0.0, 1.0, 2.0]])
-    plausible = tensor([[0, 0, -torch.inf], [-torch.inf, 0, -torch.inf]])
-    # Online's best is action 2, which is not plausible; of the others it is 1, worth 2 to slow.
-    assert td_target(reward, discount, slow, online, plausible).tolist() == [1 + 0.5 * 2, 0.0]
-    assert td_target(reward, discount, slow, preference=plausible).tolist() == [1 + 0.5 * 4, 0.0]
-
-
-def test_imitation_is_cross_entropy_over_answered_states() -> None:
-    logits = of([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8], [0.2, 0.2, 0.6]])
-    action = tensor([0, UNKNOWN, 2])
-    expected = -(np.log(0.5) + np.log(0.6)) / 2
-    assert float(imitation_loss(logits, action)) == pytest.approx(expected)
-    assert float(imitation_loss(logits, torch.full((3,), UNKNOWN))) == 0
 
 
 def learner(path: Any = None, **sections: dict[str, Any]) -> Learner:
@@ -330,24 +302,6 @@ def test_logs_without_a_row_to_clone_are_refused(parts, message, tmp_path):
         session(tmp_path / "a", settings, **parts)
 
 
-def test_onnx_is_torch(taught: Any) -> None:
-    pytest.importorskip("onnx")
-    runtime = pytest.importorskip("onnxruntime")
-    from restock.train.evaluation.onnx_policy import to_onnx
-
-    policy = taught.learner.policy
-    assert isinstance(policy, FilteredNetwork)
-    file = runtime.InferenceSession(to_onnx(policy).SerializeToString())
-    rng = np.random.default_rng(0)
-    observation = rng.normal(size=(256, TASK.observation_size)).astype(np.float32)
-    values, action = file.run(["values", "action"], {"observation": observation})
-    with torch.no_grad():
-        expected = policy(torch.from_numpy(observation)).numpy()
-    assert 0 < np.isinf(expected).mean() < 1
-    np.testing.assert_allclose(values, expected, atol=1e-5)
-    np.testing.assert_array_equal(action, expected.argmax(axis=1))
-
-
 def test_the_record_says_what_the_filter_did(taught: Any) -> None:
     rows = taught.run.table("teacher").to_pylist()
     assert {(row["source"], row["condition"]) for row in rows} >= {
@@ -365,14 +319,6 @@ def test_the_record_says_what_the_filter_did(taught: Any) -> None:
     assert all(row["agreement"] == row["chosen_agreement"] == 1 for row in fresh)  # "on" it said
     near = [row["loss"] for row in rows if row["condition"] == "near_goal"]
     assert near[-1] < near[0]
-
-
-def test_a_kept_policy_comes_back_with_its_filter(taught: Any) -> None:
-    weights = checkpoint.load(taught.run.best)["network"]
-    policy = make_policy(taught.config, TASK.observation_size, len(TASK.actions))
-    policy.load_state_dict(weights)
-    assert isinstance(policy, FilteredNetwork)
-    assert float(policy.ratio) == 0.5
 
 
 def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from support.long import one_in
 from support.paths import ROOT
-from support.stores import recording_transitions
+from support.stores import START_NS, recording_transitions
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
@@ -34,7 +34,7 @@ TINY = [
     *("--set", "record.audit_share=0.2"),
 ]
 
-
+BEGAN_NS = START_NS + 264 * 86_400 * 10**9 + 43_200 * 10**9
 MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n")
 
 
@@ -50,10 +50,12 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory, panel: Path) -> Path:
-    """Return a small run on that panel."""
+    """Return a small run on that panel, 264 days later."""
     path = tmp_path_factory.mktemp("runs") / "a"
     argv = ["train", "--panel", str(panel), "--out", str(path), "--env-steps", "400", *TINY]
-    assert main(argv) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("restock.train.prepare.now_ns", lambda: BEGAN_NS)
+        assert main(argv) == 0
     return path
 
 
@@ -62,6 +64,8 @@ def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
     header = json.loads((panel / "panel.json").read_text())
     assert document["panel"]["id"] == header["id"]
     assert document["panel"]["store"] == header["store"]  # by which `restock compare` knows it
+    assert document["created_ns"] == BEGAN_NS
+    assert document["panel"]["newest_ns"] == header["newest_ns"]
     assert document["task_hash"] == load_profile("warehouse_amr").task.hash
     assert document["target"] == {"rule": "polyak", "tau": 0.005, "effective_lag_updates": 200.0}
     assert document["seeds"]["run"] == 0
@@ -83,6 +87,15 @@ def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> N
     assert shares == {"offline": 1.0, "online": 0.5}
     audit = pq.read_table(trained / "audit.parquet").to_pylist()
     assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
+
+
+def test_logs_of_264_days_are_264_days_old(trained: Path) -> None:
+    """When the run began, not beside the newest of their store."""
+    audit = pq.read_table(trained / "audit.parquet").to_pylist()
+    assert all(264 < row["age_days"] < 265 for row in audit if row["source"] == "logs")
+    days = pq.read_table(trained / "ages.parquet", filters=[("unit", "=", "days")]).to_pylist()
+    assert {row["bucket"] for row in days} == {8}  # 256 to 511 days
+    assert all(264 < row["p50"] < 265 for row in days)
 
 
 def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys):
