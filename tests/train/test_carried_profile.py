@@ -39,7 +39,6 @@ topic = "/diagnostics"
 type = "diagnostic_msgs/msg/DiagnosticArray"
 path = "status[name=battery].values[key=voltage].value"
 unit = "V"
-values = {"not known" = -1.0}
 """
 CREEPING = """-- timing: pre
 -- priority: 35

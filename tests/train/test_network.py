@@ -1,9 +1,9 @@
-"""The Q network: what LayerNorm does to its features."""
+"""The Q network: what LayerNorm does to its features, and what a clone is without."""
 
 import pytest
 import torch
 
-from restock.train.dqn.network import QNetwork
+from restock.train.dqn.network import QNetwork, clone
 
 
 @pytest.mark.parametrize("layer_norm", [True, False])
@@ -16,3 +16,9 @@ def test_layer_norm_makes_features_independent_of_scale(layer_norm: bool) -> Non
         network.body[0].weight.mul_(100)
         network.body[0].bias.mul_(100)
     assert torch.allclose(network(observation), before, atol=1e-3) == layer_norm
+
+
+def test_a_clone_takes_no_gradients() -> None:
+    network = QNetwork(5, 3, hidden=(8,))
+    assert all(parameter.requires_grad for parameter in network.parameters())
+    assert not any(parameter.requires_grad for parameter in clone(network).parameters())

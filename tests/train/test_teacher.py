@@ -21,11 +21,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Mirror
 from restock.replay.sampling.ring import FreshRing
 from restock.state import restored, saved
-from restock.train.dqn.behaviour import (
-    UNKNOWN,
-    Labelled,
-    plausible_actions,
-)
+from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
 from restock.train.dqn.config import TeacherConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.feed.teacher import Imitation, TeacherFailed, open_teacher
@@ -47,6 +43,13 @@ def test_plausible_is_what_the_ratio_says_of_the_probabilities(ratio: float, see
     assert bool(((probability >= ratio * largest) == found)[~near].all())
     assert bool(found.any(dim=1).all())
     assert bool(found.gather(1, probability.argmax(dim=1, keepdim=True)).all())
+
+
+def test_imitation_is_cross_entropy_over_answered_states() -> None:
+    logits = tensor([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8], [0.2, 0.2, 0.6]]).log() + 2.5
+    expected = -(np.log(0.5) + np.log(0.6)) / 2
+    assert float(imitation_loss(logits, tensor([0, UNKNOWN, 2]))) == pytest.approx(expected)
+    assert float(imitation_loss(logits, torch.full((3,), UNKNOWN))) == 0
 
 
 def learner(path: Any = None, **sections: dict[str, Any]) -> Learner:
