@@ -56,11 +56,18 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
         return store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
 
 
-def test_terms_are_paid_by_the_step_that_a_transition_leads_to(plain, tmp_path):
-    with ingested(tmp_path, TERMS) as store:
-        rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
+    with ingested(tmp_path_factory.mktemp("own"), TERMS + ENTRIES) as store:
+        return store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+
+
+def test_terms_are_paid_by_the_step_that_a_transition_leads_to(plain, rows):
     differ = {name for name in rows.column_names if not rows[name].equals(plain[name])}
-    assert differ - {"ingest_id", "source_file"} == {"reward", "task_hash", "profile_hash"}
+    assert differ - {"ingest_id", "source_file"} == {
+        *("reward", "task_hash", "profile_hash"),
+        *("observation", "next_observation"),  # which the entries end
+    }
     paid = rows["reward"].to_numpy() - plain["reward"].to_numpy()
     step, speed, near, turn = (
         rows[name].to_numpy()
@@ -74,9 +81,7 @@ def test_terms_are_paid_by_the_step_that_a_transition_leads_to(plain, tmp_path):
     assert len(np.unique(expected.round(1))) > 3
 
 
-def test_entries_of_ones_own_end_the_observation(plain, tmp_path):
-    with ingested(tmp_path, ENTRIES) as store:
-        rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+def test_entries_of_ones_own_end_the_observation(plain, rows):
     observed, following, shipped = (
         np.stack(table[name].to_numpy())
         for table, name in (
@@ -98,7 +103,7 @@ def test_entries_of_ones_own_end_the_observation(plain, tmp_path):
     np.testing.assert_array_equal(observed[inside + 1], following[inside])
     # The goal is that of the episode, in its last observation, too.
     ends = np.flatnonzero(rows["terminated"].to_numpy() & ~rows["bumped"].to_numpy())
-    assert (following[ends, -1] <= load_profile(tmp_path / "own.toml").task.goal_radius_m).any()
+    assert (following[ends, -1] <= load_profile("warehouse_amr").task.goal_radius_m).any()
 
 
 def test_a_term_on_a_custom_signal_is_paid_on_logs_alone(plain, tmp_path):
