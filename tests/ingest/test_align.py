@@ -1,6 +1,5 @@
 """One clock, causal holds with maximum ages, and clocks that jump."""
 
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import START_NS, Drive, columns, typed_topics, write_topics
+from support.ingested import answered
 
 from restock.cli import main
 from restock.errors import RecordingError
@@ -130,11 +130,10 @@ def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str,
     return found
 
 
-def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
+def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path):
     topics = logged_at(Drive(8.0), lambda time, place: 0 if place % 40 == 1 else time)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
-    assert main(["ingest", str(bag), "--dry-run", "--json"]) == 3
-    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    (row,) = answered("ingest", bag, "--dry-run", codes=(3,))["recordings"]
     assert row["transitions"] > 25
     assert any(loss.startswith("/odom: left out, as their stamps") for loss in row["losses"])
     assert any("the alignment clock was set" in note for note in row["notes"])

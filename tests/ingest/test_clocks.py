@@ -1,15 +1,15 @@
 """Clocks compared, and log time mapped at another pace: rows pair what belonged together."""
 
 import itertools
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.bag_samples import write_mcap
 from support.driven_robot import LATENCY_NS, SPEED_MPS, START_NS, Drive, write_bag
-from support.ingested import ingested
+from support.ingested import answered, ingested
 
 from restock.cli import main
 from restock.errors import RecordingError
@@ -71,8 +71,7 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
     assert "2 backsteps, 1 repeated stamp, 1 zero stamp, 1 left out" in line
     assert "0.002" in line[: line.index("backsteps")]
     question = "SELECT unnest(clocks, recursive := true) FROM recordings"
-    assert main(["sql", str(store), question, "--json"]) == 0
-    rows = {row["topic"]: row for row in json.loads(capsys.readouterr().out)}
+    rows = {row["topic"]: row for row in answered("sql", store, question)}
     odom = rows["/odom"]
     assert (odom["messages"], odom["offset_ns"], odom["stamped"]) == (300, 2_000_000, True)
     assert (odom["backsteps"], odom["duplicates"], odom["zero_stamps"]) == (2, 1, 1)
@@ -81,13 +80,10 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
     assert rows["/cmd_vel"]["offset_ns"] is None
 
 
-def test_messages_logged_out_of_order_are_counted(tmp_path, capsys):
-    from support.bag_samples import write_mcap
-
+def test_messages_logged_out_of_order_are_counted(tmp_path):
     # Its messages step back in log time once; see bag_samples.
-    assert main(["info", str(write_mcap(tmp_path / "a.mcap")), "--clocks", "--json"]) == 0
-    topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
-    assert topics["/odom"]["clock"]["log_backsteps"] == 1
+    (said,) = answered("info", write_mcap(tmp_path / "a.mcap"), "--clocks")["recordings"]
+    assert said["topics"]["/odom"]["clock"]["log_backsteps"] == 1
 
 
 DAY = 1_700_000_000 * NS

@@ -1,20 +1,20 @@
 """Who drove, by whose command was in force: a multiplexer's inputs, a button, our own node."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.driven_robot import START_NS, Drive, columns, typed_topics, without, write_topics
-from support.ingested import ingested, proposed
+from support.ingested import answered, ingested, proposed
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
-from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.steps.episodes import steps_of
 
 TWIST = "geometry_msgs/msg/Twist"
 NAV, TELEOP, OUT, JOY = "/cmd_vel_nav", "/teleop_cmd_vel", "/cmd_vel", "/joy"
@@ -106,6 +106,14 @@ def policies(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
         return [((stamp - START_NS) * 1e-9, policy) for stamp, policy in rows.fetchall()]
 
 
+def drivers(topics: dict[str, tuple[str, TopicColumns]], text: str) -> list[tuple[float, str]]:
+    """Seconds from the start and who drove, of each step by the text of a profile."""
+    profile = parse_profile(text, where="p")
+    steps = steps_of(profile, {name: one for name, (_, one) in topics.items()})
+    at_s = ((steps.signals["stamp_ns"] - START_NS) * 1e-9).tolist()
+    return list(zip(at_s, steps.policy, strict=True))
+
+
 def test_the_source_whose_command_is_in_force_is_who_drove(plain, tmp_path, capsys):
     bag = write_topics(taken_over(), tmp_path / "bag")
     rows = policies(bag, profile_of(plain, tmp_path, SOURCES), tmp_path / "s")
@@ -118,35 +126,32 @@ def test_the_source_whose_command_is_in_force_is_who_drove(plain, tmp_path, caps
     assert "whose command it equals: navigation, teleop" in capsys.readouterr().out
 
 
-def test_a_button_says_it_where_no_source_has_the_command(plain, tmp_path):
+def test_a_button_says_it_where_no_source_has_the_command(plain):
     topics = taken_over()
     del topics[TELEOP], topics[NAV]
-    bag = write_topics(topics, tmp_path / "bag")
-    rows = policies(bag, profile_of(plain, tmp_path, PRESSED), tmp_path / "s")
+    rows = drivers(topics, plain + PRESSED)
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"unknown"}
 
 
-def test_no_later_command_says_who_drives_now(plain, tmp_path):
+def test_no_later_command_says_who_drives_now(plain):
     """What sources say after a moment changes nobody before it."""
     topics, late = taken_over(), START_NS + 5 * 10**9
-    bag = write_topics(topics, tmp_path / "bag")
-    profile = profile_of(plain, tmp_path, SOURCES)
-    before = policies(bag, profile, tmp_path / "s")
+    before = drivers(topics, plain + SOURCES)
     for name in (NAV, TELEOP):
         columns_ = topics[name][1]
         columns_.fields["linear.x"][columns_.log_time_ns > late] = 0.9
-    other = policies(write_topics(topics, tmp_path / "other"), profile, tmp_path / "t")
+    other = drivers(topics, plain + SOURCES)
     assert [p for s, p in before if s < 4.9] == [p for s, p in other if s < 4.9]
     assert {p for s, p in other if s > 5.2} == {"unknown"}
 
 
-def test_a_recording_without_sources_has_unknown_drivers(plain, tmp_path):
-    topics, profile = taken_over(), profile_of(plain, tmp_path, SOURCES)
-    assert load_profile(profile).hash != parse_profile(plain, where="p").hash
+def test_a_recording_without_sources_has_unknown_drivers(plain):
+    hashes = {parse_profile(text, where="p").hash for text in (plain + SOURCES, plain)}
+    assert len(hashes) == 2
+    topics = taken_over()
     del topics[NAV], topics[TELEOP], topics[JOY]
-    lone = write_topics(topics, tmp_path / "lone")
-    assert {policy for _, policy in policies(lone, profile, tmp_path / "s")} == {"unknown"}
+    assert {policy for _, policy in drivers(topics, plain + SOURCES)} == {"unknown"}
 
 
 MUX, STEP = "/chosen", np.array([0.025, 0.06])
@@ -176,28 +181,24 @@ def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.4])
-def test_a_source_is_followed_through_a_smoother(plain, limit, tmp_path):
+def test_a_source_is_followed_through_a_smoother(plain, limit):
     """No smoothed command equals one of any source."""
-    bag = write_topics(smoothed(limit), tmp_path / "bag")
-    profile = profile_of(plain, tmp_path, SOURCES + THROUGH)
-    assert load_profile(profile).inputs.command.topic == OUT
-    rows = policies(bag, profile, tmp_path / "s")
+    rows = drivers(smoothed(limit), plain + SOURCES + THROUGH)
     assert len(rows) > 50
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
-def test_a_source_is_unknown_where_the_multiplexer_was_silent(plain, tmp_path):
-    topics, profile = smoothed(), profile_of(plain, tmp_path, SOURCES + THROUGH)
+def test_a_source_is_unknown_where_the_multiplexer_was_silent(plain):
+    topics, text = smoothed(), plain + SOURCES + THROUGH
     chosen = topics[MUX][1]
     silent = (chosen.log_time_ns >= START_NS + 8 * NS) & (chosen.log_time_ns <= START_NS + 10 * NS)
     some = topics | {MUX: (TWIST, without(chosen, ~silent))}
-    rows = policies(write_topics(some, tmp_path / "some"), profile, tmp_path / "s")
+    rows = drivers(some, text)
     assert {policy for s, policy in rows if 8.6 < s < 9.8} == {"unknown"}
     assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
     del topics[MUX]
-    rows = policies(write_topics(topics, tmp_path / "none"), profile, tmp_path / "t")
-    assert {policy for _, policy in rows} == {"unknown"}
+    assert {policy for _, policy in drivers(topics, text)} == {"unknown"}
 
 
 CHAIN = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\nfields = {}\n"
@@ -301,14 +302,12 @@ def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
     assert proposed(bag, tmp_path / "p.toml").command_sources == {}
 
 
-def test_what_a_policy_would_have_driven_does_not_drive(tmp_path, capsys):
+def test_what_a_policy_would_have_driven_does_not_drive(tmp_path):
     """In shadow it publishes twists beside the command, more of them."""
     bag, file = write_topics(in_shadow(), tmp_path / "bag"), tmp_path / "p.toml"
     profile = proposed(bag, file)
     assert profile.inputs.command.topic == "/cmd_vel"
     assert profile.inputs.nav_command is None
     assert profile.command_sources == {}
-    capsys.readouterr()
-    assert main(["profile", "new", str(bag), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["commands"] == []
+    assert answered("profile", "new", bag)["commands"] == []
     assert not any(line.startswith("# [signals.restock") for line in file.read_text().splitlines())

@@ -1,6 +1,5 @@
 """Recordings whose signals contradict each other: what is found, repaired, or kept and said."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from support.driven_robot import (
     without,
     write_topics,
 )
-from support.ingested import ingested, proposed, steps_in
+from support.ingested import answered, ingested, proposed, steps_in
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
@@ -270,11 +269,9 @@ def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
     assert main([*ingest, "--verbose"]) == 3
     assert capsys.readouterr().out.count("contradicts itself: /odom") == 1
     query = "SELECT kind, topic, repaired FROM (SELECT unnest(findings, recursive := true)"
-    assert main(["sql", str(store), f"{query} FROM recordings)", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
+    (row,) = answered("sql", store, f"{query} FROM recordings)")
     assert row == {"kind": "sources", "topic": "/odom", "repaired": False}
-    main(["audit", str(store), "--json"])
-    said = json.loads(capsys.readouterr().out)["audits"]
+    said = answered("audit", store, codes=(0, 1, 3))["audits"]
     (audit,) = [each for each in said if each["audit"] == "contradictions"]
     assert (audit["status"], audit["rows"]) == ("warn", 1)
 

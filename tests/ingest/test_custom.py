@@ -1,6 +1,5 @@
 """Custom signals: from any field to a column of the table, and into conditions and queries."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake.schema import ArrayType, Field
 from support.driven_robot import Drive, columns
+from support.ingested import answered
 from support.paths import ROOT, sample_transitions
 from support.profile_texts import WAREHOUSE as TEXT
 from support.ragged import nested, ragged
@@ -158,7 +158,7 @@ def test_a_value_that_is_no_number_names_the_key():
         steps_with(signal("s", "a"), {"a": np.zeros((1, 3))}, [0.0])
 
 
-def test_check_says_what_the_topic_offers_instead(tmp_path, capsys):
+def test_check_says_what_the_topic_offers_instead(tmp_path):
     profile = tmp_path / "p.toml"
     joints = {"topic": "/joint_states", "kind": "sensor_msgs/msg/JointState"}
     profile.write_text(
@@ -170,8 +170,7 @@ def test_check_says_what_the_topic_offers_instead(tmp_path, capsys):
             signal("e", "data", topic="/bumpr", kind="std_msgs/msg/Bool"),
         )
     )
-    assert main(["profile", "check", str(profile), str(SAMPLE), "--json"]) == 2
-    said = json.loads(capsys.readouterr().out)
+    said = answered("profile", "check", profile, SAMPLE, codes=(2,))
     assert said["outcome"] is None
     assert [problem.split(":")[0] for problem in said["problems"]] == [
         "/bumper holds std_msgs/msg/Bool, not std_msgs/msg/Float64 (signals.d)",
@@ -208,33 +207,27 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "store"
 
 
-def ask(store: Path, question: str, capsys: pytest.CaptureFixture[str]) -> list[dict]:
-    capsys.readouterr()
-    assert main(["sql", str(store), question, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_they_are_columns_of_the_table_with_units(store, capsys):
-    (row,) = ask(
+def test_they_are_columns_of_the_table_with_units(store):
+    (row,) = answered(
+        "sql",
         store,
         "SELECT count(*) AS rows, count(left_radps) AS left, count(beams_m) AS beams,"
         " min(len(beams_m)) AS fewest, min(battery_v) AS battery,"
         " corr(left_radps, wheel_speed_mps) AS follows FROM transitions",
-        capsys,
     )
     assert row["rows"] == row["beams"] == ROWS
     assert 0.8 * ROWS < row["left"] <= ROWS  # every 2 s: unknown at some ticks after a pause
     assert row["fewest"] == 2
     assert 20 < row["battery"] < 30
     assert row["follows"] > 0.5
-    docs = ask(store, "FROM columns WHERE view = 'transitions'", capsys)
+    docs = answered("sql", store, "FROM columns WHERE view = 'transitions'")
     said = {doc["column_name"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
     assert said["left_radps"] == ("DOUBLE", "rad/s", "velocity[left_wheel_joint] of /joint_states")
     assert said["beams_m"] == ("FLOAT[]", "m", "some beams")
     (file,) = (store / "transitions").glob("*/*.parquet")
     field = pq.read_schema(file).field("left_radps")
     assert field.metadata[b"unit"] == b"rad/s"
-    rows = ask(store, "SELECT unnest(signals, recursive := true) FROM recordings", capsys)
+    rows = answered("sql", store, "SELECT unnest(signals, recursive := true) FROM recordings")
     said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
     assert said == [
         ("left_radps", "rad/s", "number", 83),
@@ -243,21 +236,21 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
     ]
 
 
-def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, capsys):
+def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path):
     """Stored signals are enough: no recording is read, and the audit names the old labels."""
     by_hand = "SELECT count(*) AS n FROM transitions WHERE left_radps > {} AND battery_v > 20"
     labelled = "SELECT count(*) AS n FROM transitions WHERE primary_condition = 'fast_wheel'"
-    (before,), (five,) = ask(store, labelled, capsys), ask(store, by_hand.format(5), capsys)
+    (before,), (five,) = answered("sql", store, labelled), answered("sql", store, by_hand.format(5))
     assert before == five
     assert before["n"] > 0
     changed = tmp_path / "changed.toml"
     changed.write_text(with_signals(*OWN, FAST.format(7)))
     assert main(["store", "label", str(store), "--profile", str(changed)]) == 0
-    (after,), (seven,) = ask(store, labelled, capsys), ask(store, by_hand.format(7), capsys)
+    (after,), (seven,) = answered("sql", store, labelled), answered("sql", store, by_hand.format(7))
     assert after == seven
     assert 0 < after["n"] < before["n"]
-    (versions,) = ask(store, "SELECT count(DISTINCT labels_version) AS n FROM transitions", capsys)
-    assert versions["n"] == 1
+    versions = "SELECT count(DISTINCT labels_version) AS n FROM transitions"
+    assert answered("sql", store, versions) == [{"n": 1}]
 
 
 def test_a_condition_on_an_unstored_signal_needs_an_ingest(store, tmp_path, capsys):
@@ -281,7 +274,7 @@ def test_another_meaning_of_a_stores_column_is_refused(store, tmp_path, capsys):
     said = capsys.readouterr().err
     assert "its column `left_radps` is a number in rad/s, and `signals.left_radps`" in said
     assert "rename the signal" in said
-    assert ask(store, "SELECT count(*) AS n FROM transitions", capsys) == [{"n": ROWS}]
+    assert answered("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": ROWS}]
 
 
 def test_a_vector_has_one_length_and_others_are_null_and_counted():

@@ -1,6 +1,5 @@
 """Robots that record Foxglove's message types, and ROS's, as JSON or protobuf: what is proposed."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +19,24 @@ from support.foxglove_robot import (
     pose,
     write_robot,
 )
-from support.ingested import steps_in
+from support.ingested import answered, steps_in
 
-from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.drives import robot_traits
 
 
-def proposed(path: Path, capsys: Any) -> str:
+def proposed(path: Path) -> str:
     """Return the proposal's TOML, which is usable."""
-    assert main(["profile", "new", str(path), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = answered("profile", "new", path)
     assert said["problems"] == []
     return str(said["toml"])
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
-def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, capsys, encoding):
+def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encoding):
     path = write_robot(tmp_path / "run.mcap", encoding, drive())
-    profile = parse_profile(proposed(path, capsys), where="p")
+    profile = parse_profile(proposed(path), where="p")
     steps = steps_in(path, profile)
     assert {name: source.topic for name, source in profile.inputs.items()} == {
         "command": "/cmd_vel",
@@ -65,12 +62,12 @@ def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, capsy
     assert str(traits.lidar) == f"lidar laser, {BEAMS} beams"
 
 
-def test_a_lidar_is_where_the_pose_in_its_scans_says(tmp_path, capsys):
+def test_a_lidar_is_where_the_pose_in_its_scans_says(tmp_path):
     messages = drive(8.0)
     for _, topic, _, values in messages:
         if "scan" in topic:
             values["pose"] = pose(0.4, 0.0, np.pi)
-    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
+    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages))
     body = parse_profile(toml, where="p").task.body
     assert body.lidar_x_m == pytest.approx(0.4)
     assert abs(body.lidar_yaw_rad) == pytest.approx(np.pi, abs=1e-3)
@@ -78,12 +75,12 @@ def test_a_lidar_is_where_the_pose_in_its_scans_says(tmp_path, capsys):
     assert "by the pose in its scans" in toml
 
 
-def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, capsys):
+def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path):
     messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
     for time_s in np.arange(0, 20, 0.2).tolist():
         messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
     path = write_robot(tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda one: one[0]))
-    toml = proposed(path, capsys)
+    toml = proposed(path)
     assert "Fixes of 0.02 m, mostly" in toml
     assert parse_profile(toml, where="p").inputs.pose.topic == "/gps/fix"
     steps = steps_in(path, toml)
@@ -94,7 +91,7 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, capsys):
     assert np.allclose(np.hypot(x, y - radius), radius, atol=0.02)
 
 
-def test_goals_and_plans_are_not_taken_for_poses(tmp_path, capsys):
+def test_goals_and_plans_are_not_taken_for_poses(tmp_path):
     at = {"timestamp": 0.0, "frame_id": "map"}
     plan = {**at, "poses": [pose(), pose(2.0, 2.0)]}
     messages: list[Message] = [
@@ -102,14 +99,14 @@ def test_goals_and_plans_are_not_taken_for_poses(tmp_path, capsys):
         (0.0, "/plan", "foxglove.PosesInFrame", plan),
         *drive(),
     ]
-    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages), capsys)
+    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages))
     inputs = parse_profile(toml, where="p").inputs
     topics = inputs.goal.topic, inputs.plan.topic, inputs.pose.topic
     assert topics == ("/goal_pose", "/plan", "/pose")
 
 
 @pytest.mark.parametrize(("encoding", "together"), [("json", True), ("protobuf", False)])
-def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, capsys, encoding, together):
+def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, encoding, together):
     def between(time_s: float, parent: str, child: str, at: tuple[float, ...]) -> dict[str, Any]:
         where = pose(*at)
         return {
@@ -129,7 +126,7 @@ def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, capsys, encoding
         else:
             messages += [(time_s, "/moves", "foxglove.FrameTransform", one) for one in links]
     path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
-    profile = parse_profile(proposed(path, capsys), where="p")
+    profile = parse_profile(proposed(path), where="p")
     steps = steps_in(path, profile)
     assert profile.inputs.pose is None
     assert (profile.frames.fixed, profile.frames.base) == ("map", "base_link")

@@ -18,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from support.bag_samples import write_bag, write_channels, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
+from support.ingested import answered
 from support.long import one_in
 
 from restock.cli import main
@@ -391,8 +392,7 @@ def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, cap
         (steps,) = opened.sql("SELECT DISTINCT source_file FROM transitions").fetchall()
     assert steps == (visible(given),) == (recordings[0]["source_file"],)
     assert visible(given) in printed.out
-    assert main(["ingest", given, "--dry-run", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    (row,) = answered("ingest", given, "--dry-run")["recordings"]
     assert row["path"] == given
 
 

@@ -1,12 +1,12 @@
 """`restock store label`: changed conditions over stored signals, in one commit."""
 
-import json
 import shutil
 from pathlib import Path
 
 import pytest
 from deltalake import DeltaTable
 from support.driven_robot import Drive, write_bag
+from support.ingested import answered
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
@@ -62,16 +62,14 @@ def test_the_same_conditions_over_the_store_give_the_same_labels(store):
     assert {v for (v,) in rows(store, "labels_version")} == {labels_version(conditions)}
 
 
-def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, capsys):
+def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path):
     others = "* EXCLUDE (primary_condition, conditions, labels_version, ingest_id)"
     before = rows(store, others)
     changed = tmp_path / "changed.toml"
     changed.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
     files = len(DeltaTable(str(store / "transitions")).file_uris())
     version = DeltaTable(str(store / "transitions")).version()
-    capsys.readouterr()
-    assert main(["store", "label", str(store), "--profile", str(changed), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = answered("store", "label", store, "--profile", changed)
     assert said["version"] == version + 1  # one commit for both recordings
     assert [row["changed"] for row in said["recordings"]] == [6, 6]
     assert len(DeltaTable(str(store / "transitions")).file_uris()) == files
@@ -83,8 +81,7 @@ def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, caps
     with Store(store) as opened:
         assert "1.95" in next(c.sql for c in opened.conditions() if c.name == "soon")
         assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(2,)]
-    assert main(["store", "label", str(store), "--profile", str(changed), "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
+    again = answered("store", "label", store, "--profile", changed)
     assert again["version"] is None
     assert [row["changed"] for row in again["recordings"]] == [0, 0]
 

@@ -1,10 +1,10 @@
 """Profiles: what ships, what a stranger's file may get wrong, and where each error points."""
 
-import json
 import pickle
 
 import pytest
 from support.driven_robot import Drive, typed_topics, write_bag, write_topics
+from support.ingested import answered
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
@@ -144,22 +144,20 @@ def test_a_proposed_profile_reads_its_recording(bag, tmp_path, capsys):
     assert profile.task.control_period_s == 0.2
     assert profile.clock.steps == "command"
     assert (0.4, 0.0) in profile.task.actions  # what the robot was told
-    assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = answered("profile", "check", file, bag)
     assert said["problems"] == []
     assert said["outcome"]["transitions"] == 29
     assert {one["input"] for one in said["inputs"]} >= {"command", "pose", "scan", "plan"}
 
 
-def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
+def test_a_proposal_says_what_no_topic_fills(tmp_path):
     class Blind(Drive):
         def topics(self):
             gone = ("/odom", "/plan", "/imu", "/amcl_pose")
             return {name: one for name, one in super().topics().items() if name not in gone}
 
     bag = write_bag(Blind(), tmp_path / "bag")
-    assert main(["profile", "new", str(bag), "--json"]) == 3
-    said = json.loads(capsys.readouterr().out)
+    said = answered("profile", "new", bag, codes=(3,))
     assert said["missing"] == ["pose"]
     out = said["toml"]
     assert 'source = "hindsight"' in out
@@ -168,7 +166,7 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     assert parse_profile(out + named, where="p").inputs.pose.fields["yaw_rad"] == "FIELD"
 
 
-def test_a_profile_is_never_overwritten(bag, tmp_path, capsys):
+def test_a_profile_is_never_overwritten(bag, tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text("mine")
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 2

@@ -26,6 +26,7 @@ from support.driven_robot import (
     write_bag,
     write_topics,
 )
+from support.ingested import answered
 from support.paths import ROOT, SHARED, sample_transitions
 
 from restock.cli import main
@@ -438,14 +439,13 @@ def test_a_proposal_is_of_its_robot(name, tmp_path):
         ),
     ],
 )
-def test_a_recording_of_no_wheels_is_named_once(topics, said, tmp_path, capsys):
+def test_a_recording_of_no_wheels_is_named_once(topics, said, tmp_path):
     bag = write_topics(topics, tmp_path / "bag")
     code, document = asked("new", bag)
     (problem,) = document["problems"]
     assert code == 3
     assert f"this looks like {said}" in problem
-    assert main(["start", str(bag), "--out", str(tmp_path / "out"), "--json"]) == 3
-    stopped = json.loads(capsys.readouterr().out)["stopped"]
+    stopped = answered("start", bag, "--out", tmp_path / "out", codes=(3,))["stopped"]
     assert stopped["remedies"] == ["give recordings of a robot on wheels"]
     assert not (tmp_path / "out" / "profile.toml").exists()
 

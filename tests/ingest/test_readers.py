@@ -19,6 +19,7 @@ from support.bag_samples import (
     write_bag,
     write_mcap,
 )
+from support.ingested import answered
 from support.paths import SHARED
 
 from restock.cli import main
@@ -528,15 +529,13 @@ def test_offered_qos_is_named_whatever_version_wrote_it(text):
     assert offered(text) == OFFERED[text]
 
 
-def test_it_says_that_damage_is_unseen_until_messages_are_read(folder, capsys):
+def test_it_says_that_damage_is_unseen_until_messages_are_read(folder):
     path = folder / "one.mcap"
     content = bytearray(path.read_bytes())
     content[len(content) // 4] ^= 0xFF  # within the messages of a chunk
     path.write_bytes(content)
-    assert main(["info", str(path), "--json"]) == 0
-    (entry,) = json.loads(capsys.readouterr().out)["recordings"]
+    (entry,) = answered("info", path)["recordings"]
     assert (entry["integrity"], entry["damage"]) == (None, [])
-    assert main(["info", str(path), "--clocks", "--json"]) == 3
-    (entry,) = json.loads(capsys.readouterr().out)["recordings"]
+    (entry,) = answered("info", path, "--clocks", codes=(3,))["recordings"]
     assert entry["integrity"] == "damaged"
     assert "is lost" in entry["damage"][0]

@@ -1,7 +1,6 @@
 """Recordings are taken out of a store, all that are named or none; versions before keep them."""
 
 import datetime as dt
-import json
 import os
 import time
 from dataclasses import replace
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from support.ingested import answered
 from support.long import one_in
 from support.stores import one, shown
 
@@ -180,10 +180,8 @@ def test_the_command_says_what_it_removed(tmp_path, capsys):
     version = StoreWriter(place).path.open_table(TRANSITIONS).version() - 1
     assert f"{place}@{version}" in said
     assert shown(place) == expected((1, "a"))
-    assert main(["sql", f"{place}@{version}", "FROM recordings", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)) == 3
-    assert main(["store", "remove", place, name_of(1), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    assert len(answered("sql", f"{place}@{version}", "FROM recordings")) == 3
+    document = answered("store", "remove", place, name_of(1))
     assert document["recordings"][0]["source_file"] == "logs/1.mcap"
     assert (document["left"], document["dry_run"]) == (0, False)
     assert main(["store", "remove", place]) == 2  # names no recording

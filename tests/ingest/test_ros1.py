@@ -1,6 +1,5 @@
 """ROS 1 bags: an index that does not fit its chunks, and topics of two types."""
 
-import json
 import struct
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from support.ingested import answered
 
 from restock.cli import main
 from restock.errors import RecordingError
@@ -201,14 +201,13 @@ def test_both_types_of_transforms_are_read(tmp_path, capsys, kinds):
     assert "not read" not in said
 
 
-def test_what_another_type_makes_unreadable_is_counted_and_said(tmp_path, capsys):
+def test_what_another_type_makes_unreadable_is_counted_and_said(tmp_path):
     path = two_types(tmp_path / "run.bag", ("std_msgs/msg/Int32", "std_msgs/msg/Float32"))
     with open_recording(path) as recording:
         assert len(recording.read({"/both": ["data"]})["/both"]) == EACH
         (lost,) = recording.lost_messages
         assert lost.messages == EACH
         assert "std_msgs/msg/Float32" in lost.reason
-    assert main(["info", str(path), "--json"]) == 0
-    (entry,) = json.loads(capsys.readouterr().out)["recordings"]
+    (entry,) = answered("info", path)["recordings"]
     (note,) = entry["notes"]
     assert note.endswith("30 of std_msgs/msg/Float32: only those of std_msgs/msg/Int32 are read")

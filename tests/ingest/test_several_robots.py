@@ -1,12 +1,11 @@
 """Several robots in one recording: `restock profile new --robot` says whose profile it is."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.driven_robot import Drive, transforms, typed_topics, write_topics
-from support.ingested import ingested, proposed
+from support.ingested import answered, ingested, proposed
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
@@ -33,9 +32,8 @@ def write_fleet(folder: Path, own: str = "") -> Path:
         (["--robot", "/robot2/"], "/robot2", "/robot1"),
     ],
 )
-def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_path, capsys):
-    assert main(["profile", "new", str(write_fleet(tmp_path)), *flags, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_path):
+    document = answered("profile", "new", write_fleet(tmp_path), *flags)
     profile = parse_profile(document["toml"], where="proposed")
     # Of one name, the audit stale_labels would take two robots' profiles for versions of one.
     assert profile.name == ("fleet" if not flags else f"fleet_{robot.strip('/')}")

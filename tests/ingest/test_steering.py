@@ -1,16 +1,15 @@
 """Robots that nothing describes: whether they steer as a car, by how they turned."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.driven_robot import columns, write_topics
+from support.ingested import answered
 from support.long import one_in
 from twin.test_robot_drives import CAR, OUTLINE
 
-from restock.cli import main
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.propose.robot_choice import DriveEvidence, drive_evidence
 from restock.ingest.steps.frames import PoseSeries
@@ -93,11 +92,11 @@ def bag(folder: Path, *, pivots: bool) -> Path:
     )
 
 
-def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path, capsys):
+def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path):
     file = tmp_path / "car.toml"
     source = bag(tmp_path / "bag", pivots=False)
-    assert main(["profile", "new", str(source), "--out", str(file), "--json"]) == 0
-    advice = {one["key"]: one["text"] for one in json.loads(capsys.readouterr().out)["advice"]}
+    said = answered("profile", "new", source, "--out", file)["advice"]
+    advice = {one["key"]: one["text"] for one in said}
     assert "STEERS LIKE A CAR: commanded to turn on the spot, by 6.3" in advice["robot.drive"]
     assert "# CONFIRM THAT IT STEERS LIKE A CAR" in file.read_text()
     assert "angular.z is read as a yaw rate" in advice["inputs.command"]

@@ -1,6 +1,5 @@
 """Tags: whose drive a recording is, by who says so, and what becomes of it in a store."""
 
-import json
 import shutil
 import sqlite3
 from pathlib import Path
@@ -11,7 +10,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.driven_robot import Drive, write_bag
-from support.ingested import queried
+from support.ingested import answered, queried
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -40,15 +39,16 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bag"
 
 
-def ingest_with(bag: Path, store: Path, *options: str) -> int:
-    profile = str(bag.parent / "amr.toml")
-    return main(["ingest", str(bag), "--store", str(store), "--profile", profile, *options])
+def ingest_with(bag: Path, store: Path, *options: str) -> Any:
+    """Return what is said of the bag."""
+    profile = bag.parent / "amr.toml"
+    (row,) = answered("ingest", bag, "--store", store, "--profile", profile, *options)["recordings"]
+    return row
 
 
-def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, capsys):
+def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path):
     store = tmp_path / "store"
-    assert ingest_with(bag, store, "--tag", "robot=amr-07", "--tag", "line=b = c", "--json") == 0
-    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    row = ingest_with(bag, store, "--tag", "robot=amr-07", "--tag", "line=b = c")
     tags = {"robot": "amr-07", "line": "b = c"}
     assert (row["status"], row["tags"]) == ("written", tags)
     for view in ("recordings", "transitions", "episodes"):
@@ -58,7 +58,7 @@ def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, capsys):
 
 def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
     store = tmp_path / "store"
-    assert ingest_with(bag, store) == 0
+    ingest_with(bag, store)
     pairs = {
         "transitions": ["stamp", "logged", "pose_stamp"],
         "recordings": ["start_stamp", "end_stamp"],
@@ -75,13 +75,11 @@ def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
         assert logged.fetchall() == episode.fetchall()
 
 
-def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
+def test_new_tags_alone_change_no_row(bag, tmp_path):
     store, others = tmp_path / "store", "FROM (SELECT * EXCLUDE (ingest_id, tags, robot, site)"
-    assert ingest_with(bag, store, "--tag", "site=oslo") == 0
+    ingest_with(bag, store, "--tag", "site=oslo")
     rows = queried(store, f"{others} FROM transitions) ORDER BY transition_id")
-    capsys.readouterr()
-    assert ingest_with(bag, store, "--tag", "robot=amr-07", "--json") == 0
-    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    row = ingest_with(bag, store, "--tag", "robot=amr-07")
     assert (row["status"], row["version"]) == ("tagged", 2)
     assert row["tags"] == {"robot": "amr-07", "site": "oslo"}
     assert row["notes"] == [
@@ -89,12 +87,10 @@ def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
     ]
     assert queried(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
     assert queried(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
-    capsys.readouterr()
-    assert ingest_with(bag, store) == 0  # who says nothing changes nothing
-    assert "unchanged" in capsys.readouterr().out
-    assert ingest_with(bag, store, "--force") == 0
+    assert ingest_with(bag, store)["status"] == "unchanged"  # who says nothing changes nothing
+    ingest_with(bag, store, "--force")
     assert queried(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
-    assert ingest_with(bag, store, "--tag", "site=") == 0
+    ingest_with(bag, store, "--tag", "site=")
     assert queried(store, "SELECT robot, site, tags FROM recordings") == [
         ("amr-07", None, {"robot": "amr-07"})
     ]
@@ -102,7 +98,7 @@ def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
 
 def test_relabelling_keeps_the_tags(bag, tmp_path):
     store = tmp_path / "store"
-    assert ingest_with(bag, store, "--tag", "robot=amr-07") == 0
+    ingest_with(bag, store, "--tag", "robot=amr-07")
     other = tmp_path / "other.toml"
     other.write_text(WAREHOUSE + '\n[[condition]]\nname = "never"\ntiming = "pre"\nsql = "false"\n')
     assert main(["store", "label", str(store), "--profile", str(other)]) == 0
@@ -126,7 +122,7 @@ def test_tags_of_another_form_are_refused(texts, says):
 
 
 def test_a_wrong_tag_writes_nothing(bag, tmp_path, capsys):
-    assert ingest_with(bag, tmp_path / "store", "--tag", "robot") == 2
+    assert main(["ingest", str(bag), "--store", str(tmp_path / "store"), "--tag", "robot"]) == 2
     assert "such as --tag robot=amr-07" in capsys.readouterr().err
     assert not (tmp_path / "store").exists()
 
@@ -342,9 +338,7 @@ def test_an_ingest_by_the_path_writes_all_or_nothing(driven, tmp_path, capsys, m
     assert main(["ingest", "monday", *options]) == 0
     # A copy under another path is the same recording: it does not take the tags along.
     copy = shutil.copytree(driven, tmp_path / "old" / "amr-08" / "monday")
-    capsys.readouterr()
-    assert main(["ingest", "monday", str(copy), *options, "--json"]) == 0
-    kept, copied = json.loads(capsys.readouterr().out)["recordings"]
+    kept, copied = answered("ingest", "monday", copy, *options)["recordings"]
     assert [kept["status"], copied["status"]] == ["unchanged", "unchanged"]
     assert copied["notes"] == [
         "the same recording as monday, whose tags it keeps: robot=07, site=oslo"
