@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
+from support.ingested import ingested
 from support.profile_texts import WAREHOUSE
-from support.profile_texts import WAREHOUSE as TEXT
 from support.step_tables import changed, steps
 from support.stores import recording_transitions, write_store
 
@@ -477,7 +477,7 @@ def test_probabilities_stand_beside_how_often_they_are_true(tmp_path):
 
 
 LISTED = 'exposures = ["closing_traffic", "plan_blocked", "slippery_floor"]'
-assert LISTED in TEXT
+assert LISTED in WAREHOUSE
 FAR_OUT = """
 [[condition]]
 name = "far_out"
@@ -523,9 +523,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a store of one drive, beside the profile `amr.toml` of its rows."""
     folder = tmp_path_factory.mktemp("exposures")
     bag, profile = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "a"), folder / "amr.toml"
-    profile.write_text(TEXT.replace(LISTED, 'exposures = ["closing_traffic"]') + FAR_OUT)
-    command = ["ingest", str(bag), "--profile", str(profile), "--store", str(folder / "store")]
-    assert main(command) == 0
+    profile.write_text(WAREHOUSE.replace(LISTED, 'exposures = ["closing_traffic"]') + FAR_OUT)
+    ingested(bag, profile, folder / "store").close()
     return folder / "store"
 
 

@@ -15,7 +15,7 @@ from restock.ingest.live.observer import LiveObserver
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.signal_paths import conventions_of
-from restock.ingest.steps.episodes import Steps
+from restock.ingest.steps.episodes import Steps, steps_of
 
 SECONDS, TURN_RADPS = 6.0, 0.4
 Topics = dict[str, tuple[str, TopicColumns]]
@@ -49,12 +49,13 @@ def drive(**unknown: Any) -> Topics:
     return topics
 
 
-def steps_of(topics: Topics, folder: Path, profile: str = WAREHOUSE) -> Steps:
-    return steps_in(write_topics(topics, folder / "bag", storage="mcap"), profile)
+def found_in(topics: Topics) -> Steps:
+    return steps_of(load_profile("warehouse_amr"), {name: one for name, (_, one) in topics.items()})
 
 
 def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
-    steps = steps_of(drive(angular_velocity=slice(None)), tmp_path)
+    topics = drive(angular_velocity=slice(None))
+    steps = found_in(topics)
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(TURN_RADPS)
     assert steps.signals["accel_x_mps2"] == pytest.approx(0.3)
     reported = (
@@ -63,15 +64,16 @@ def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
     )
     assert reported in steps.notes
     assert set(steps.problem) == {""}
-    result = ingest(tmp_path / "bag", load_profile("warehouse_amr"), store=None)
+    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    result = ingest(bag, load_profile("warehouse_amr"), store=None)
     stand_ins = {item["input"]: item["instead"] for item in result.manifest["stand_ins"]}
     assert stand_ins["imu"] == "gyro yaw rate taken from the wheels"
 
 
-def test_only_what_is_unknown_is_left_out(tmp_path: Path) -> None:
+def test_only_what_is_unknown_is_left_out() -> None:
     """The gyroscope fails half way; there is no accelerometer."""
     half = slice(150, None)
-    steps = steps_of(drive(angular_velocity=half, linear_acceleration=slice(None)), tmp_path)
+    steps = found_in(drive(angular_velocity=half, linear_acceleration=slice(None)))
     gyro = steps.signals["gyro_yaw_rate_radps"]
     measured = np.arange(len(gyro)) < len(gyro) // 2 + 1
     assert gyro[measured][:-1] == pytest.approx(0.1)
@@ -80,19 +82,19 @@ def test_only_what_is_unknown_is_left_out(tmp_path: Path) -> None:
     assert any("150 of 300 messages of /imu have no estimate of angular" in n for n in steps.notes)
 
 
-def test_a_known_covariance_changes_nothing(tmp_path: Path) -> None:
-    steps = steps_of(drive(angular_velocity=slice(0)), tmp_path)
+def test_a_known_covariance_changes_nothing() -> None:
+    steps = found_in(drive(angular_velocity=slice(0)))
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(0.1)
     assert not [note for note in steps.notes if "estimate" in note]
 
 
-def test_odometry_without_speeds_makes_no_rows(tmp_path: Path) -> None:
+def test_odometry_without_speeds_makes_no_rows() -> None:
     topics = drive()
     fields = topics["/odom"][1].fields
     unknown = np.zeros((len(topics["/odom"][1]), 36))
     unknown[:, 0] = -1
     fields["twist.covariance"] = unknown
-    steps = steps_of(topics, tmp_path)
+    steps = found_in(topics)
     assert set(steps.problem) == {"wheels: no estimate"}
 
 
@@ -124,7 +126,7 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
         f'path = "{path}"\nunit = "1"\nmax_age_s = 0.5\n{more}\n'
         for name, (topic, kind, path, more) in wanted.items()
     )
-    steps = steps_of(topics, tmp_path, text)
+    steps = steps_in(write_topics(topics, tmp_path / "bag", storage="mcap"), text)
     found = {name: steps.custom.table[name].to_pylist() for name in wanted}
     assert set(found["gyro"]) == {None}
     assert found["share"][:15] == pytest.approx([0.8] * 15, abs=1e-6)
@@ -140,7 +142,7 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
     assert "signals.voltage" not in notes
 
 
-def test_a_scan_of_a_wall_that_is_too_close_is_near(tmp_path: Path) -> None:
+def test_a_scan_of_a_wall_that_is_too_close_is_near() -> None:
     """The same drive with what is nearer than .3 m measured, and as -inf."""
     tenth = np.arange(0, SECONDS, 0.1)
     found = []
@@ -150,7 +152,7 @@ def test_a_scan_of_a_wall_that_is_too_close_is_near(tmp_path: Path) -> None:
         ranges[50] = -np.inf if name == "reported" else 0.0  # covered: it knows of nothing
         topics = drive()
         topics["/scan"] = ("sensor_msgs/msg/LaserScan", columns(tenth, scans(ranges)))
-        found.append(steps_of(topics, tmp_path / name))
+        found.append(found_in(topics))
     measured, reported = found
     usable = np.array(measured.problem) == ""
     assert reported.problem == measured.problem

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake.schema import ArrayType, Field
 from support.driven_robot import Drive, columns
-from support.ingested import answered
+from support.ingested import answered, ingested
 from support.paths import ROOT, sample_transitions
 from support.profile_texts import WAREHOUSE as TEXT
 from support.ragged import nested, ragged
@@ -202,8 +202,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the sample bag with custom signals, and a condition on them."""
     folder = tmp_path_factory.mktemp("custom")
     (folder / "p.toml").write_text(with_signals(*OWN, FAST.format(5)))
-    command = ["ingest", str(SAMPLE), "--store", str(folder / "store")]
-    assert main([*command, "--profile", str(folder / "p.toml")]) == 0
+    ingested(SAMPLE, folder / "p.toml", folder / "store").close()
     return folder / "store"
 
 

@@ -24,13 +24,10 @@ RADIUS_M = TASK.goal_radius_m
 class Unguided(Drive):
     """Without goals and plans: 6 m out, 6 s of standing, 4 m on."""
 
+    drop = ("/goal_pose", "/plan", "/behaviour_policy")
+
     def x_at(self, time_s):
         return 1.0 + 0.5 * (np.minimum(time_s, 12.0) + np.maximum(time_s - 18.0, 0.0))
-
-    def topics(self):
-        topics = super().topics()
-        del topics["/goal_pose"], topics["/plan"], topics["/behaviour_policy"]
-        return topics
 
 
 class Turntable(Unguided):

@@ -11,10 +11,9 @@ from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import Condition, labels_version
+from restock.ingest.task.conditions import Condition
 from restock.replay.store.store import Store
 
 # Looks ahead: at the last transition of an episode, at a step that is no row of the store.
@@ -45,21 +44,6 @@ def rows(path: Path, columns: str = "*") -> list[tuple]:
     with Store(path) as opened:
         query = f"SELECT {columns} FROM transitions ORDER BY transition_id"
         return opened.sql(query).fetchall()
-
-
-def test_the_same_conditions_over_the_store_give_the_same_labels(store):
-    """Also at the last transition of each episode, which looks at a step that is no row."""
-    before = rows(store, "primary_condition, conditions")
-    assert any(name == "soon" for name, _ in before)
-    profile = load_profile(store.parent / "amr.toml")
-    # One more condition that never holds: another version, the same labels otherwise.
-    conditions = [*profile.conditions, Condition("never", "pre", "false")]
-    outcomes, version = relabel_store(StoreWriter(store), lambda name: conditions)
-    found = {outcome.source_file: outcome.changed for outcome in outcomes}
-    assert set(found.values()) == {0}
-    assert version is not None
-    assert rows(store, "primary_condition, conditions") == before
-    assert {v for (v,) in rows(store, "labels_version")} == {labels_version(conditions)}
 
 
 def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path):

@@ -19,7 +19,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.steps.aligned_inputs import align_inputs
-from restock.ingest.steps.episodes import Steps
+from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.task.surroundings import MovedMap, outline_reach, with_unseen
 from restock.replay.trace.moment import seen_of
@@ -159,11 +159,14 @@ def test_what_no_beam_ended_in_is_as_near_as_what_is_beside_it(given):
             assert found[sector] == min(one for one in known if one is not None)
 
 
-def test_two_lidars_at_corners_see_what_one_in_the_middle_sees(tmp_path):
+def test_two_lidars_at_corners_see_what_one_in_the_middle_sees():
     """And neither alone does."""
-    two = Corridor().bag(tmp_path / "two")
-    one = Corridor(mounted=(("/scan", (0.0, 0.0, 0.0)),), field_rad=2 * np.pi).bag(tmp_path / "one")
-    expected, found = (sectors_of(steps_in(*of)) for of in ((one, WAREHOUSE), (two, two_lidars())))
+
+    def seen_in(drive: Corridor, text: str) -> Any:
+        return sectors_of(steps_of(parse_profile(text, where="p"), drive.topics()))
+
+    one = Corridor(mounted=(("/scan", (0.0, 0.0, 0.0)),), field_rad=2 * np.pi)
+    expected, found = seen_in(one, WAREHOUSE), seen_in(Corridor(), two_lidars())
     assert found.shape == expected.shape
     assert len(found) > 10
     apart_m = np.abs(found - expected)
@@ -176,7 +179,7 @@ def test_two_lidars_at_corners_see_what_one_in_the_middle_sees(tmp_path):
         alone = alone.replace("/scan_front", topic)
         alone = alone.replace(f"[{FRONT[0]}, {FRONT[1]}]", f"[{place[0]}, {place[1]}]")
         alone = alone.replace(f"lidar_yaw_rad = {FRONT[2]}", f"lidar_yaw_rad = {place[2]}")
-        seen = sectors_of(steps_in(two, alone))
+        seen = seen_in(Corridor(), alone)
         assert (np.abs(seen - expected) < 0.05).mean() < 0.9
 
 
@@ -188,7 +191,7 @@ def test_a_tick_without_one_of_the_lidars_is_dropped_by_its_name(tmp_path):
             early = rear.log_time_ns < rear.log_time_ns[0] + 2 * 10**9
             return found | {"/scan_rear": without(rear, early)}
 
-    steps = steps_in(Silenced().bag(tmp_path / "bag"), two_lidars())
+    steps = steps_of(parse_profile(two_lidars(), where="p"), Silenced().topics())
     reasons = Counter(steps.problem)
     assert reasons["scan_2: stale"] > 10
     assert reasons[""] > 5

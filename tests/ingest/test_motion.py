@@ -10,7 +10,6 @@ from support.driven_robot import SPEED_MPS, Drive, write_bag
 from support.ingested import answered, ingested, proposed
 
 from restock.cli import main
-from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.steps.frames import PoseSeries, motion_at
 
 NS = 10**9
@@ -74,16 +73,15 @@ def test_poses_that_arrive_together_are_no_speed():
     assert found.forward_mps == pytest.approx(np.full(130, 0.4), abs=0.2)
 
 
-class Relocalised(Drive):
+class NoOdometry(Drive):
+    drop = ("/odom", "/goal_pose", "/plan")
+
+
+class Relocalised(NoOdometry):
     """Its localiser finds it .38 m further on, after 3 s."""
 
     def x_at(self, time_s: Any) -> Any:
         return super().x_at(time_s) + 0.38 * (time_s > 3.0)
-
-    def topics(self) -> dict[str, TopicColumns]:
-        topics = super().topics()
-        del topics["/odom"], topics["/goal_pose"], topics["/plan"]
-        return topics
 
 
 def test_a_jump_that_no_robot_drives_is_counted_as_one(tmp_path, capsys):
@@ -94,13 +92,6 @@ def test_a_jump_that_no_robot_drives_is_counted_as_one(tmp_path, capsys):
     with ingested(bag, file, tmp_path / "s") as store:
         assert store.sql(query).fetchall() == [(pytest.approx(SPEED_MPS), True)]
     assert "wheels: a pose jump within" in capsys.readouterr().out
-
-
-class NoOdometry(Drive):
-    def topics(self) -> dict[str, TopicColumns]:
-        topics = super().topics()
-        del topics["/odom"], topics["/goal_pose"], topics["/plan"]
-        return topics
 
 
 def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):

@@ -50,8 +50,7 @@ share = "natural"
 class BlindDrive(Drive):
     """The same drive of a robot that has no lidar."""
 
-    def topics(self) -> Mapping[str, TopicColumns]:
-        return {name: topic for name, topic in super().topics().items() if name != "/scan"}
+    drop = ("/scan",)
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from support.ingested import ingested
 from support.policy_files import changed_policy
 from support.ros_graph import VOLATILE, Durability, Graph, QoS, Returned, message_class
 from support.twin_robot import TwinRobot, follower_onnx
 
-from restock.cli import main, run_node
+from restock.cli import run_node
 from restock.ingest.live.node import (
     ACTION,
     LIMITER,
@@ -24,7 +25,6 @@ from restock.ingest.live.node import (
 )
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.task.robot import STOP, Limiter
-from restock.replay.store.store import Store
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.recording.bag_writer import stamp
 
@@ -325,9 +325,7 @@ def test_in_shadow_it_commands_nothing(policy, tmp_path, capsys):
     profile = tmp_path / "with_node.toml"
     assert run_node([str(policy), "--write-profile", str(profile)]) == 0
     bag = graph.write(tmp_path / "bag")
-    line = ["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "store")]
-    assert main(line) == 0
-    with Store(tmp_path / "store") as store:
+    with ingested(bag, profile, tmp_path / "store") as store:
         rows, agreement, limited, policies = store.sql(
             "SELECT count(*), avg((shadow_action = action)::INT),"
             " count(*) FILTER (list_contains(exposures, 'limited') != (limiter_rule > 0)),"
@@ -367,8 +365,7 @@ def test_a_takeover_silences_it_and_its_rows_are_the_operators(policy, tmp_path)
     for name, left_out in (("told", ()), ("by the button", ("/behaviour_policy",))):
         some = Graph(sent=[one for one in graph.sent if one[1] not in left_out])
         bag, at = some.write(tmp_path / name), tmp_path / f"{name} store"
-        assert main(["ingest", str(bag), "--profile", str(profile), "--store", str(at)]) == 0
-        with Store(at) as store:
+        with ingested(bag, profile, at) as store:
             rows[name] = store.sql(
                 "SELECT behaviour_policy, count(*) FROM transitions GROUP BY 1 ORDER BY 1"
             ).fetchall()

@@ -26,23 +26,21 @@ from support.driven_robot import (
     write_bag,
     write_topics,
 )
-from support.ingested import answered
+from support.ingested import answered, ingested
 from support.paths import ROOT, SHARED, sample_transitions
+from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.propose.clock_choice import drivable
-from restock.ingest.propose.commands import (
-    Commands,
-)
+from restock.ingest.propose.commands import Commands
 from restock.ingest.propose.proposal_lines import actions_of
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import RobotProposal
 from restock.ingest.steps.align import NS
 from restock.ingest.task.task import Body, Task
-from restock.replay.store.store import Store
 from restock.train.twin.physics.simulation import blocks_of
 from restock.train.twin.survey.poses import candidate_poses
 
@@ -163,9 +161,10 @@ class Shuttle(Drive):
 class Utm(Drive):
     """Its poses are UTM coordinates; it has neither goal nor plan."""
 
+    drop = ("/goal_pose", "/plan")
+
     def topics(self):
         topics = super().topics()
-        del topics["/goal_pose"], topics["/plan"]
         for axis, far_m in (("x", 4.5e5), ("y", 5.2e6)):
             topics["/amcl_pose"].fields[f"pose.pose.position.{axis}"] += far_m
         return topics
@@ -317,14 +316,7 @@ ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], A
         without_gyro(), (), topics_of("imu"), (None,),
         ["messages of /imu have no estimate of angular_velocity"],
     ),
-    "poses in UTM": (
-        Utm(3.0), (), lambda p: p.origin_m,
-        pytest.approx((4.5e5 + 1 + 0.5 * 1.5, 5.2e6 + 1), abs=1), [],
-    ),
     # Commands: their speeds, how long each holds, and the clock.
-    "back as fast as ahead": (
-        Shuttle(8.0), (), lambda p: reverse(p.task.actions), [(-0.5, 0.0)], [],
-    ),
     "back slowly": (
         Shuttle(8.0, back_mps=0.1), (), lambda p: reverse(p.task.actions), [(-0.1, 0.0)], [],
     ),
@@ -505,8 +497,7 @@ def test_ingest_names_a_lidar_that_nothing_places(tmp_path):
 
     ahead = "[inputs.scan]\nlidar_at_m = [0.0, 0.0]\nlidar_yaw_rad = 0.0"
     shipped = load_profile("warehouse_amr")
-    text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
-    points_ahead = parse_profile(text.replace("[inputs.scan]", ahead), where="p")
+    points_ahead = parse_profile(WAREHOUSE.replace("[inputs.scan]", ahead), where="p")
     leading = transforms(TENTHS, ("odom", "base_link"), ("base_link", "/laser"))
     for number, (topics, profile, named) in enumerate(
         [
@@ -526,9 +517,8 @@ def test_ingest_names_a_lidar_that_nothing_places(tmp_path):
 def test_poses_in_utm_coordinates_are_stored_to_the_millimetre(tmp_path):
     recording, store = write_bag(Utm(8.0), tmp_path / "bag"), tmp_path / "store"
     _, profile, file = proposed(recording)
-    assert main(["ingest", str(recording), "--profile", str(file), "--store", str(store)]) == 0
     query = "SELECT pose_x_m, pose_y_m FROM transitions ORDER BY stamp_ns"
-    with Store(store) as rows:
+    with ingested(recording, file, store) as rows:
         found = rows.sql(query).fetchnumpy()
     x, y = found["pose_x_m"].astype(float), found["pose_y_m"].astype(float)
     driven = 1 + 0.5 * np.arange(len(x)) * 0.2

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,7 @@ class Drive:
     goals: list[tuple[float, float, float]] = field(default_factory=lambda: [(0.0, *GOAL)])
     policies: list[tuple[float, str]] = field(default_factory=lambda: [(0.0, "planner")])
     truth: str | None = None
+    drop: ClassVar[tuple[str, ...]] = ()  # topics that it lacks
     proposals: str | None = None  # the topic of what navigation proposes, 5 ms ahead of commands
 
     def x_at(self, time_s: NDArray[Any]) -> NDArray[Any]:
@@ -121,7 +122,7 @@ class Drive:
         if self.proposals is not None:
             fields = {"linear.x": np.full(len(ticks), 0.3), "angular.z": np.full(len(ticks), 0.1)}
             found[self.proposals] = columns(ticks, fields, stamped=False)
-        return found
+        return {name: one for name, one in found.items() if name not in self.drop}
 
 
 def columns(
