@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -80,8 +81,7 @@ def write_bag(
     frame: str = "map",
     grid: OccupancyGrid | None = None,
     data: np.ndarray | None = None,
-    scanned: np.ndarray | None = None,  # cells (X, Y) that a lidar of 120 beams sees
-    scanned_from: np.ndarray | None = None,
+    scanned: bool = False,  # by a lidar of 120 beams, on a lap of the hall
     scans_late_s: float = 0.0,
     scan_frame: str = "laser",
     clockwise: bool = False,  # as a lidar that hangs upside down
@@ -97,10 +97,8 @@ def write_bag(
         topics["/map"] = topic("map", 1, fields)
     if poses is not None:
         topics["/amcl_pose"] = topic(frame, len(poses), at("pose.pose", poses))
-    if scanned is not None and poses is not None:
-        seen = [
-            seen_from(scanned, one) for one in (poses if scanned_from is None else scanned_from)
-        ]
+    if scanned:
+        seen = seen_on_lap()
         step = 2 * np.pi / (-120 if clockwise else 120)
         angles = {"angle_min": -60 * step, "angle_max": 60 * step, "angle_increment": step}
         given = angles | {"scan_time": 0.2, "range_min": 0.1, "range_max": 12.0}
@@ -110,16 +108,19 @@ def write_bag(
     return write_topics(typed_columns(topics), folder, storage="mcap")
 
 
-def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return ranges (120,) to occupied cells from a pose; 0 beyond 6 m, as a Neato reports."""
-    bearing = at[2] - np.pi + np.arange(120) * 2 * np.pi / 120
-    reach = np.arange(0.0, 6.0, 0.01)
-    x = at[0] + np.cos(bearing)[:, None] * reach
-    y = at[1] + np.sin(bearing)[:, None] * reach
-    cells = np.clip((np.stack([x, y]) / CELL_M).astype(int), 0, [[[179]], [[139]]])
-    hit = occupancy[cells[0], cells[1]] > 0
-    ranges = np.where(hit.any(axis=1), reach[hit.argmax(axis=1)], 0.0)
-    return ranges.astype(np.float32)
+@cache
+def seen_on_lap() -> list[np.ndarray]:
+    """Return ranges (120,) at each pose of a lap; 0 beyond 6 m, as a Neato reports."""
+    occupancy, reach, seen = hall(), np.arange(0.0, 6.0, 0.01), []
+    for at in lap():
+        bearing = at[2] - np.pi + np.arange(120) * 2 * np.pi / 120
+        x = at[0] + np.cos(bearing)[:, None] * reach
+        y = at[1] + np.sin(bearing)[:, None] * reach
+        cells = np.clip((np.stack([x, y]) / CELL_M).astype(int), 0, [[[179]], [[139]]])
+        hit = occupancy[cells[0], cells[1]] > 0
+        ranges = np.where(hit.any(axis=1), reach[hit.argmax(axis=1)], 0.0)
+        seen.append(ranges.astype(np.float32))
+    return seen
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
 )
 def test_scans_make_the_map_by_the_clock_that_fits(tmp_path, late_s, frame):
     known = OccupancyGrid(hall(), CELL_M)
-    scans: dict[str, Any] = {"scanned": hall(), "scans_late_s": late_s, "scan_frame": frame}
+    scans: dict[str, Any] = {"scanned": True, "scans_late_s": late_s, "scan_frame": frame}
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, **scans)
     made = survey(bag, by="scans", footprint=parse_footprint("0.4x0.4"))
     assert f"by {'log time' if late_s else 'header stamps'}" in made.source
@@ -138,7 +139,7 @@ def test_scans_make_the_map_by_the_clock_that_fits(tmp_path, late_s, frame):
 def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
     """Read the mounting from the profile, since no transform gives it."""
     known = OccupancyGrid(hall(), CELL_M)
-    bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=hall(), clockwise=True)
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=True, clockwise=True)
     hanging = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
     right, wrong = (
         survey(bag, by="scans", profile=parse_profile(one, where="p"))
@@ -195,7 +196,7 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
     room = np.zeros((240, 200), np.int8)
     room[[0, -1]] = room[:, [0, -1]] = 100
     elsewhere = OccupancyGrid(room, CELL_M, (-1.5, -1.5, 0.0))
-    bag = write_bag(tmp_path / "bag", poses=lap(), grid=elsewhere, scanned=hall())
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=elsewhere, scanned=True)
     floor = tmp_path / "floor.toml"
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(floor)]
     assert main(arguments) == 2
@@ -205,7 +206,7 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
     assert not floor.exists()
     assert main([*arguments, "--by", "map", "--footprint", "0.4x0.4"]) == 0  # it was asked for
     near = OccupancyGrid(hall(), CELL_M, (0.4, 0.4, 0.0))  # of a robot that is badly localised
-    made = survey(write_bag(tmp_path / "near", poses=lap(), grid=near, scanned=hall()))
+    made = survey(write_bag(tmp_path / "near", poses=lap(), grid=near, scanned=True))
     assert any("of the lidar's returns are on walls" in note for note in made.notes)
 
 
