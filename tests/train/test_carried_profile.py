@@ -23,6 +23,7 @@ from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_panel, profile_of_run
 
+AMR = load_profile("warehouse_amr")
 SHORTER = WAREHOUSE.replace("time_limit_steps = 240", "time_limit_steps = 60")  # another task
 OWN = """
 [[condition]]
@@ -96,7 +97,7 @@ def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
 
 
 def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, capsys):
-    drive = ["eval", str(folder / "run"), "--episodes", "1", "--perturbations", "none"]
+    drive = ["eval", str(folder / "run"), "--episodes", "nominal=1", "--perturbations", "none"]
     assert main([*drive, "--policies", "agent", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["results"]
     assert main(["report", str(folder / "run")]) == 0
@@ -141,7 +142,7 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, capsys):
     ],
 )
 def test_a_carried_text_may_do_no_more_than_a_profile_file(folder, text, problem):
-    whole = profile_toml(load_profile("warehouse_amr")).replace("condition = []\n", "")
+    whole = profile_toml(AMR).replace("condition = []\n", "")
     text = whole + text if "[[" in text else text + whole
     with pytest.raises(ConfigError, match=problem):
         parse_profile(text, where="a panel")
@@ -159,7 +160,5 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(folder, text, problem
 )
 def test_a_profile_comes_back_from_its_text_as_it_was(doc, age_s, values):
     signal = CustomSignal("/a", "a/msg/B", "data", "V", max_age_s=age_s, values=values, doc=doc)
-    profile = msgspec.structs.replace(
-        load_profile("warehouse_amr"), signals={"voltage_v": signal}, doc=doc
-    )
+    profile = msgspec.structs.replace(AMR, signals={"voltage_v": signal}, doc=doc)
     assert parse_profile(profile_toml(profile), where="test") == profile

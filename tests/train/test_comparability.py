@@ -5,17 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from restock.train.judge import comparability
 from restock.train.judge.comparability import Check, Feed, check_feeds, worst
 
+pytestmark = pytest.mark.usefixtures("few_resamples")
 CELLS = ["logs/nominal", "logs/wheel_slip", "logs/rare", "fresh/nominal", "fresh/wheel_slip"]
-
-
-@pytest.fixture(autouse=True)
-def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        comparability, "LIMITS", dataclasses.replace(comparability.LIMITS, resamples=300)
-    )
 
 
 def feed(

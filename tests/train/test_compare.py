@@ -12,6 +12,7 @@ from support.finished_runs import UPDATES, document, make_run
 from restock.cli import main
 from restock.train.run.run import Run
 
+pytestmark = pytest.mark.usefixtures("few_resamples")
 EXTRA = ("update_path", "next_value")
 
 

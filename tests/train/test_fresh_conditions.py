@@ -14,7 +14,7 @@ from restock.train.feed.fresh_labels import NEVER, WAITING, EpisodeLabels
 from restock.train.session import Session
 
 # Every batch is audited, so that the sums can be counted from the audited rows.
-EVERY_BATCH = {"record": {"audit_share": 1.0}}
+EVERY_BATCH = {"record": {"audit_share": 1.0}, "schedule": {"env_steps": 1000}}
 
 
 @pytest.fixture(scope="module")

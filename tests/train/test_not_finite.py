@@ -114,7 +114,7 @@ def test_a_fresh_row_is_named_by_its_episode_and_step(tmp_path: Path) -> None:
 
 
 def test_nonfinite_network_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
-    settings = config()
+    settings = config(schedule={"env_steps": 800})
     live = session(tmp_path / "run", settings)
     seen: list[str] = []
 

@@ -45,14 +45,14 @@ def panel(store: Path) -> Panel:
 def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel) -> None:
     fed = set(panel.meta["episode_id"].to_pylist())
     held = set(pq.read_table(panel.path / "evaluation_split.parquet")["episode_id"].to_pylist())
-    for logs in (None, str(store), str(panel.path)):
+    for logs in (None, str(panel.path), str(store)):
         dataset = load_ope_dataset(panel, TASK, logs)
         assert len(dataset.evaluation.condition) == len(held - fed)
         assert len(dataset.training.condition) == len(fed)
         rows = dataset.evaluation.rows
         seen = {tuple(row) for row in dataset.training.rows.observation[:, :3].tolist()}
         assert not seen & {tuple(row) for row in rows.observation[:, :3].tolist()}
-    assert "left out" in load_ope_dataset(panel, TASK, str(store)).notes[0]
+    assert "left out" in dataset.notes[0]
 
 
 def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ from restock.errors import RunError
 from restock.train.judge.compare import diff_runs
 from restock.train.run.run import Run
 
+pytestmark = pytest.mark.usefixtures("few_resamples")
+
 
 def test_what_moved_is_shown_where_compare_refuses(tmp_path, capsys):
     first = make_run(tmp_path / "a", document(0), success=0.2)

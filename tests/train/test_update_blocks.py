@@ -84,8 +84,9 @@ def test_updates_in_blocks_are_those_one_by_one(way: str, device: str, tmp_path:
 
 def test_a_run_in_blocks_is_the_run_one_by_one(tmp_path: Path) -> None:
     """Online too: the ring, the target's clock, the intervals and what is recorded."""
-    one = run_to_end(tmp_path / "one", config())
-    blocks = trained(in_blocks(tmp_path / "blocks", "cpu"))
+    short = {"schedule": {"env_steps": 800}}
+    one = run_to_end(tmp_path / "one", config(**short))
+    blocks = trained(in_blocks(tmp_path / "blocks", "cpu", **short))
     for name, value in one.learner.policy.state_dict().items():
         assert torch.equal(value, blocks.learner.policy.state_dict()[name]), name
     np.testing.assert_array_equal(one.ring.rows, blocks.ring.rows)
