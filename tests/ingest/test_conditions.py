@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
 from support.ingested import ingested
 from support.profile_texts import WAREHOUSE
-from support.step_tables import changed, steps
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
@@ -30,14 +29,48 @@ from restock.ingest.task.conditions import (
     shipped,
     too_near_to_call,
 )
+from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.task import STAND_IN_LIMITS, Noise
 from restock.replay.store.store import Store
 
 SHIPPED = list(shipped().values())
 
 
-def given_to(table: pa.Table, name: str) -> list[int]:
-    return np.flatnonzero(label(table, [shipped()[name]])[name]).tolist()
+def steps(count: int, **signals: object) -> pa.Table:
+    """Return an episode of a robot at .5 m/s with nothing near, but for these signals."""
+    usual = {
+        "stamp_ns": np.arange(count) * 200_000_000,
+        "pose_stamp_ns": np.arange(count) * 200_000_000,
+        "wheel_speed_mps": np.full(count, 0.5),
+        "localised_speed_mps": np.full(count, 0.5),
+        "clearance_m": np.full(count, 2.0),
+        "clearance_ahead_m": np.full(count, 2.0),
+        "plan_return_m": np.full(count, 4.0),
+        "plan_gap_m": np.full(count, 4.0),
+        "bumped": np.zeros(count, np.bool_),
+        "command_speed_mps": np.full(count, 0.5),
+        "waypoint_near_x_m": np.ones(count),
+        "waypoint_far_x_m": np.full(count, 2.2),
+    } | signals
+    columns = {
+        column.name: pa.array(usual.get(column.name, np.zeros(count))).cast(column.type, safe=False)
+        for column in SIGNAL_COLUMNS
+    }
+    index = np.arange(count)
+    return pa.table({"episode_index": np.zeros(count, np.int32), "step_index": index, **columns})
+
+
+def changed(value: float, usual: float, count: int, at: slice) -> np.ndarray:
+    """Return a column (N,) of one value, and of another at some steps."""
+    column = np.full(count, usual)
+    column[at] = value
+    return column
+
+
+def given_to(table: pa.Table, name: str, constants: dict[str, float] | None = None) -> list[int]:
+    """Return the rows that a shipped condition or exposure holds at, by constants of a robot."""
+    made = (shipped(constants) | shipped(constants, "exposure"))[name]
+    return np.flatnonzero(label(table, [made])[name]).tolist()
 
 
 def test_nothing_is_labelled_where_nothing_happens():
@@ -119,11 +152,6 @@ SMALL = {  # of a robot of .2 m/s that is .15 m wide, and decides ten times a se
 }
 
 
-def held_by(constants: dict[str, float], table: pa.Table, name: str) -> list[int]:
-    made = (shipped(constants) | shipped(constants, "exposure"))[name]
-    return np.flatnonzero(label(table, [made])[name]).tolist()
-
-
 def test_the_default_limits_are_those_of_the_stand_in():
     assert load_profile("warehouse_amr").task.condition_limits == STAND_IN_LIMITS
 
@@ -132,29 +160,29 @@ def test_how_near_is_near_follows_the_robot():
     table = steps(30, clearance_m=np.array([2.0] * 10 + [0.1] * 3 + [0.2] * 4 + [0.5] * 13))
     small = Noise().constants | SMALL
     assert given_to(table, "near_collision")
-    assert held_by(small, table, "near_collision") == held_by(small, table, "recovery") == []
+    assert given_to(table, "near_collision", small) == given_to(table, "recovery", small) == []
     nearer = steps(30, clearance_m=np.array([2.0] * 10 + [0.02] * 3 + [0.2] * 17))
-    assert {9, 10, 11} <= set(held_by(small, nearer, "near_collision")) <= set(range(8, 13))
-    assert held_by(small, nearer, "recovery")[-1] <= 13  # there is room again at .1 m
+    assert {9, 10, 11} <= set(given_to(nearer, "near_collision", small)) <= set(range(8, 13))
+    assert given_to(nearer, "recovery", small)[-1] <= 13  # there is room again at .1 m
 
 
 def test_slip_limit_follows_robot_and_localiser_noise():
     table = steps(60, wheel_speed_mps=changed(0.58, 0.5, 60, slice(20, 40)))
     assert given_to(table, "wheel_slip") == []
     small = Noise().constants | SMALL
-    assert set(range(20, 30)) <= set(held_by(small, table, "wheel_slip")) <= set(range(5, 40))
-    floor = held_by(small, table, "slippery_floor")
+    assert set(range(20, 30)) <= set(given_to(table, "wheel_slip", small)) <= set(range(5, 40))
+    floor = given_to(table, "slippery_floor", small)
     assert floor[0] >= 20  # not before
     assert set(range(30, 40)) <= set(floor) <= set(range(20, 55))
     noisy = Noise(localiser_m=0.05).constants | SMALL  # two such poses differ by as much
-    assert held_by(noisy, table, "wheel_slip") == held_by(noisy, table, "slippery_floor") == []
+    assert given_to(table, "wheel_slip", noisy) == given_to(table, "slippery_floor", noisy) == []
 
 
 def test_times_are_in_steps_of_the_robot():
     came = changed(0.3, 0.0, 40, slice(8, 9))
     for period_s, last in ((0.2, 16), (0.1, 26), (0.5, 11), (3.0, 9)):  # .8 s and 1 s, in steps
         task = Noise().constants | SMALL | {"control_period_s": period_s}
-        held = held_by(task, steps(40, came_nearer_m=came), "closing_traffic")
+        held = given_to(steps(40, came_nearer_m=came), "closing_traffic", task)
         assert held == list(range(8, last + 1))
 
 
@@ -164,7 +192,7 @@ def test_who_walks_up_is_seen_whatever_the_control_period(period_s: float):
     begins, ends = round(4 / period_s), round(6 / period_s)
     for walks_mps, seen in ((0.5, True), (0.1, False)):  # .1 m/s: the noise of two ranges
         came = changed(walks_mps * period_s, 0.0, 2 * ends, slice(begins, ends))
-        held = held_by(robot, steps(2 * ends, came_nearer_m=came), "closing_traffic")
+        held = given_to(steps(2 * ends, came_nearer_m=came), "closing_traffic", robot)
         if seen:
             assert begins <= held[0] <= begins + 0.5 / period_s
             assert set(range(held[0], ends)) <= set(held)
@@ -487,23 +515,19 @@ sql = "pose_x_m > 2"
 """
 
 
-def exposed(table: pa.Table, name: str) -> list[int]:
-    return np.flatnonzero(label(table, [shipped(kind="exposure")[name]])[name]).tolist()
-
-
 def test_each_situation_is_told_by_what_is_known_before_acting():
-    assert exposed(steps(20), "closing_traffic") == []
+    assert given_to(steps(20), "closing_traffic") == []
     someone = steps(20, came_nearer_m=changed(0.1, 0.0, 20, slice(8, 10)))
-    assert exposed(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
+    assert given_to(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
     noise = steps(20, came_nearer_m=np.full(20, 0.03))
-    assert exposed(noise, "closing_traffic") == []
+    assert given_to(noise, "closing_traffic") == []
     pallet = {"plan_return_m": changed(1.5, 4.0, 20, slice(5, 15))}
-    assert exposed(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
+    assert given_to(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
     walker = {"came_nearer_m": changed(0.15, 0.0, 20, slice(3, 5))}
-    assert exposed(steps(20, **pallet, **walker), "plan_blocked") == []
+    assert given_to(steps(20, **pallet, **walker), "plan_blocked") == []
     ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, 20, slice(10, 12)))
-    assert exposed(ice, "slippery_floor") == list(range(11, 17))
-    assert exposed(steps(20), "slippery_floor") == []
+    assert given_to(ice, "slippery_floor") == list(range(11, 17))
+    assert given_to(steps(20), "slippery_floor") == []
 
 
 def test_an_exposure_takes_no_row_from_a_condition():

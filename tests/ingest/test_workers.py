@@ -67,13 +67,14 @@ class _Dying(IngestJob):
 
 def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("restock.ingest.batch.IngestJob", _Dying)
-    monkeypatch.setattr("restock.ingest.batch._bundles", lambda paths, most: [[0, 1, 2], [3, 4]])
-    code = main(["ingest", str(bags), "--store", str(tmp_path / "s"), "--workers", "2", "--json"])
+    monkeypatch.setattr("restock.ingest.batch._bundles", lambda paths, most: [[0, 1], [2]])
+    drives = [str(bags / f"drive{number}") for number in range(3)]
+    code = main(["ingest", *drives, "--store", str(tmp_path / "s"), "--workers", "2", "--json"])
     out, err = capsys.readouterr()
     said = {Path(one["path"]).name: one["status"] for one in json.loads(out)["recordings"]}
     assert code == 3
     assert said.pop("drive1") == "failed"
-    assert list(said.values()) == ["written"] * 4
+    assert list(said.values()) == ["written"] * 2
     assert "drive1: the process that read it was killed (SIGKILL)" in err
 
 
