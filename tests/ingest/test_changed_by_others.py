@@ -122,7 +122,8 @@ def changed(store: Path, way: str) -> dict[str, int]:
     if way == "deleted":
         table.delete("step_index < 3")
     elif way == "updated":
-        table.update(updates={"behaviour_version": "'v2'"}, predicate="action = 2")
+        updates = {"behaviour_version": "'v2'", "reward": "-1.0", "zone": "'moved'"}
+        table.update(updates=updates, predicate="action = 2")  # which changes no number of rows
     else:
         gone = pa.table({"transition_id": one(1)[1]["transition_id"].slice(0, 5)})
         merging = table.merge(
@@ -137,33 +138,6 @@ def changed(store: Path, way: str) -> dict[str, int]:
             "merged": len(part) - 5 * (number == 0),
         }[way]
         for number, part in enumerate(rows)
-    }
-
-
-@pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
-def test_rows_changed_by_another_tool_are_read_and_joined(store, way):
-    expected = changed(store, way)
-    kinds = {
-        str(kind)
-        for file in DeltaTable(str(store / TRANSITIONS)).file_uris()
-        for kind in pq.read_schema(file).types
-    }
-    assert "string_view" in kinds
-    assert shown(store) == expected
-    writer = StoreWriter(store)
-    kept = writer.rows(f"{2:016x}", f"{2:016x}-a")
-    assert kept.schema.field("zone").type == pa.string()
-    assert len(kept) == expected[f"{2:016x}-a"]
-    writer.write(*one(3))
-    writer.write(*one(1, "b"))  # writes the others of its file again
-    compact(writer)
-    assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(kept)
-    with Store(store) as opened:
-        assert opened.changed_by_others == []
-    writer.remove_recordings({f"{3:016x}": f"{3:016x}-a"}, "remove")
-    assert shown(store) == {
-        f"{1:016x}-b": len(one(1, "b")[1]),
-        f"{2:016x}-a": expected[f"{2:016x}-a"],
     }
 
 
@@ -186,23 +160,38 @@ def same_as_rows(store: Path) -> None:
 
 
 @pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
-def test_summaries_never_outvote_the_rows(store, capsys, way):
-    """An update changes no number of rows."""
-    changed(store, way)
-    if way == "updated":
-        table = DeltaTable(str(store / TRANSITIONS))
-        table.update(updates={"reward": "-1.0", "zone": "'moved'"}, predicate="action = 2")
+def test_rows_changed_by_another_tool_count_and_are_joined(store, capsys, way):
+    """Summaries never outvote the rows."""
+    expected = changed(store, way)
+    kinds = {
+        str(kind)
+        for file in DeltaTable(str(store / TRANSITIONS)).file_uris()
+        for kind in pq.read_schema(file).types
+    }
+    assert "string_view" in kinds
+    assert shown(store) == expected
     same_as_rows(store)
     with Store(store) as opened:
         changes = len(opened.changed_by_others)
     assert changes == (1 if way == "merged" else 2)
     assert cli.main(["info", str(store), "--json"]) == 0
     assert f"not used: another tool may have changed {changes} recording" in capsys.readouterr().out
-    StoreWriter(store).write(*one(1, "b"))  # of a file that has another recording's, too
+    writer = StoreWriter(store)
+    kept = writer.rows(f"{2:016x}", f"{2:016x}-a")
+    assert kept.schema.field("zone").type == pa.string()
+    assert len(kept) == expected[f"{2:016x}-a"]
+    writer.write(*one(3))
+    writer.write(*one(1, "b"))  # writes the others of its file again
     same_as_rows(store)
-    assert compact(StoreWriter(store)).summaries == (0 if way == "merged" else 1)
+    assert compact(writer).summaries == (0 if way == "merged" else 1)
+    assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(kept)
     with Store(store) as opened:
         assert opened.changed_by_others == []
         assert "cells" in str(opened.sql("EXPLAIN FROM coverage").fetchall())
     same_as_rows(store)
     assert not compact(StoreWriter(store)).summaries
+    writer.remove_recordings({f"{3:016x}": f"{3:016x}-a"}, "remove")
+    assert shown(store) == {
+        f"{1:016x}-b": len(one(1, "b")[1]),
+        f"{2:016x}-a": expected[f"{2:016x}-a"],
+    }
