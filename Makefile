@@ -52,7 +52,7 @@ test-docs: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m 'docs and not slow'
 
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m 'not slow'
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m 'not slow'
 
 site: $(VENV)/.dev
 	$(BIN)/python docs/build.py build/pages
