@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -299,7 +300,9 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
     assert found.held_out[-1].after_m < 0.25 * found.held_out[-1].before_m
 
 
-def test_the_command_prints_json(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_json(known, capsys, monkeypatch) -> None:
+    of = "restock.train.twin.calibration.fit.FitConfig"
+    monkeypatch.setattr(of, partial(FitConfig, search_points=2))
     line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2"]
     assert cli.main([*line, "--segments", "8", "--json"]) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)

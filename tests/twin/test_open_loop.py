@@ -34,11 +34,8 @@ def slower(profile: Profile) -> Profile:
 
 
 LOGS = {
-    "sample log": (ROOT / "sample_logs" / "amr_monday.mcap", load_profile("warehouse_amr")),
-    "steady rate": (
-        ROOT / "sample_logs" / "amr_monday.mcap",
-        slower(load_profile("warehouse_amr")),
-    ),
+    "sample log": (ROOT / "sample_logs" / "amr_tuesday", load_profile("warehouse_amr")),
+    "steady rate": (ROOT / "sample_logs" / "amr_tuesday", slower(load_profile("warehouse_amr"))),
     "turtlebot3": (SHARED / "turtlebot3-sim-humble", load_profile("turtlebot3")),
 }
 

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
 import restock  # noqa: F401 - registers the environment
 from restock.errors import ConfigError, RunError
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import SIGNALS, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
@@ -20,6 +22,8 @@ from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation, find_perturbation
+
+BRIEF = msgspec.structs.replace(load_profile("warehouse_amr").task, time_limit_steps=30)
 
 
 def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:
@@ -125,7 +129,8 @@ def test_a_pickled_environment_is_fresh_with_the_same_settings(pickler: str) -> 
     np.testing.assert_array_equal(other.reset()[0], single.reset()[0])
 
 
-def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:
+def test_autoreset_keeps_the_final_observation() -> None:
+    env = WarehouseVectorEnv(8, task=BRIEF)
     env.reset(seed=4)
     ended = 0
     for _ in range(env.task.time_limit_steps):
@@ -204,7 +209,7 @@ def test_a_new_plan_makes_no_jump_in_progress() -> None:
 
 
 def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
-    made = WarehouseVectorEnv(2)
+    made = WarehouseVectorEnv(2, task=BRIEF)
     made.set_episodes([EpisodeSpec("nominal", seed) for seed in range(3)])
     _, info = made.reset(seed=0)
     assert info["episode_number"].tolist() == [0, 1]
