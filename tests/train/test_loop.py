@@ -313,13 +313,6 @@ def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path)
     assert files() == before
 
 
-def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
-    progress = undisturbed.progress
-    assert progress.online_from == 200
-    assert progress.online_updates == int((progress.env_steps - 200) * 0.25)
-    assert undisturbed.learner.gradient_steps == 60 + progress.online_updates
-
-
 def test_the_policy_that_is_kept_is_an_average_of_the_weights(monkeypatch):
     rows = logs().rows[:32].clone()
     for rate in (1.0, 0.25):

@@ -42,9 +42,6 @@ def evaluated(
             "bumps": 0,
             "time_s": 10.0,
             "return": float((index // 2 % 10) < 10 * success[condition]) + 0.001 * index,
-            "end_x_m": 0.0,
-            "end_y_m": 0.0,
-            "failure": None,
         }
         for policy in ("agent", "random")
         for perturbation in perturbations
