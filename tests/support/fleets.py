@@ -20,15 +20,14 @@ STEP_NS = 200_000_000
 
 @dataclass(frozen=True)
 class SyntheticRobot:
-    """A robot, and from which week (from 1) something about it changes."""
+    """A robot, and what about it changes from the third week on."""
 
     name: str | None
     site: str | None = "hall"
-    odometry_scale: float = 1.0  # metres driven a metre that the wheels report
     lidar_noise_m: float = 0.01
-    slips_per_step: float = 0.01
-    changes: Mapping[str, float] = field(default_factory=dict)  # factors; silent_sectors: how many
-    changes_in_week: int = 3
+    # Factors of odometry_scale (metres driven a metre that the wheels report), slips_per_step and
+    # lidar_noise_m; silent_sectors: how many.
+    changes: Mapping[str, float] = field(default_factory=dict)
     localiser: bool = True
     gyro: bool = True
 
@@ -87,13 +86,13 @@ def wander(
 def _drive(robot: SyntheticRobot, number: int, week: int, episodes: int, seed: int) -> pa.Table:
     table = recording_transitions(number, episodes=episodes, seed=seed)
     rows, rng = len(table), np.random.default_rng([seed, number, 7])
-    factor = robot.changes if week >= robot.changes_in_week else {}
+    factor = robot.changes if week >= 3 else {}
     wheel = 0.7 + wander(rng, rows, 0.08)
     yaw_rate = np.where(np.arange(rows) // 8 % 3 == 2, 0.9, 0.02) * rng.choice([-1, 1])
-    true_speed = wheel * robot.odometry_scale * factor.get("odometry_scale", 1.0)
+    true_speed = wheel * factor.get("odometry_scale", 1.0)
     localised = true_speed + wander(rng, rows, 0.03, 0.5)
     gyro = yaw_rate + rng.normal(0, 0.01, rows) + wander(rng, rows, 0.005)
-    slips = rng.random(rows) < robot.slips_per_step * factor.get("slips_per_step", 1.0)
+    slips = rng.random(rows) < 0.01 * factor.get("slips_per_step", 1.0)
     noise = robot.lidar_noise_m * factor.get("lidar_noise_m", 1.0)
     clearance = (
         1.5 + wander(rng, rows, 0.2, 0.999)[:, None] + rng.normal(0, noise, (rows, TASK.sectors))

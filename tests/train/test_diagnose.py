@@ -34,7 +34,7 @@ def make_run(
     path: Path, *, windows: int = 4, gap: float | Mapping[str, float] = 1.2, lag: float = 0.05,
     driven: float = 200.0,  # return of an episode
     clock: float = 1.0, q_abs_max: float = 10.0, shares: Mapping[str, float] | None = None,
-    quota_met: float = 1.0, agreement: Mapping[str, float] | None = None,
+    agreement: Mapping[str, float] | None = None,
     unexplained: Mapping[str, float] | None = None,
     explained: float | Mapping[str, float] | None = 0.8,
     strata: bool = True,  # named as the conditions are; else there is one of all rows
@@ -74,7 +74,7 @@ def make_run(
             if share:
                 fed = {"drawn_rows": round(share * 10_000), "td_abs_mean": replay_td}
                 append(run, "conditions", clocks, source="logs", condition=name, **fed)
-                stratum = {"stratum": name if strata else "all", "quota_share": share / quota_met}
+                stratum = {"stratum": name if strata else "all", "quota_share": share}
                 append(run, "strata", clocks, source="logs", **stratum, **fed)
         ends = {"target_q_lag": lag if ill else 0.05, "q_abs_max": q_abs_max if ill else 10.0}
         append(run, "progress", clocks, updates=500, **ends)

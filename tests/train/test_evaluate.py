@@ -21,10 +21,10 @@ from restock.train.twin.physics.episode import EpisodeSpec
 class Always:
     """Takes one action, always."""
 
-    version = "1"
+    name, version = "always", "1"
 
-    def __init__(self, action: int, name: str = "always") -> None:
-        self.action, self.name = action, name
+    def __init__(self, action: int) -> None:
+        self.action = action
 
     def act(self, env: Any, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.full(len(observation), self.action), np.ones(len(observation), np.float32)

@@ -1,9 +1,7 @@
 """Practice by arm: the rule's shares, what moves them, their record, and what is refused."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,27 +38,19 @@ def ended(kind: str, success: bool, count: int = 1, block: str = "none") -> list
     return [one] * count
 
 
-def practice(arms: Sequence[MissionArm] = ARMS, **given: Any) -> Practice:
-    return Practice(PracticeConfig(**given), arms)
+def practice(rule: str) -> Practice:
+    return Practice(PracticeConfig(rule=rule), ARMS)
 
 
 def at(env_steps: int) -> dict[str, int]:
     return {"env_steps": env_steps, "gradient_steps": 0}
 
 
-@st.composite
-def floor_of(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float]:
-    """Two sets of weights, and a floor that leaves room for all."""
-    count = draw(st.integers(1, 12))
-    some = st.lists(st.floats(0, 1), min_size=count, max_size=count)
-    first, second = (np.array(draw(some)) for _ in range(2))
-    floor = draw(st.floats(0, 1)) / count
-    return *(w + (0 if w.sum() > 1e-6 else 1) for w in (first, second)), floor  # type: ignore[return-value]
-
-
-@given(floor_of())
-def test_shares_sum_to_one_and_keep_their_floor(given: Any) -> None:
-    weights, _, floor = given
+@given(st.data())
+def test_shares_sum_to_one_and_keep_their_floor(data: st.DataObject) -> None:
+    weights = np.array(data.draw(st.lists(st.floats(0, 1), min_size=1, max_size=12)))
+    weights += 0 if weights.sum() > 1e-6 else 1
+    floor = data.draw(st.floats(0, 1)) / len(weights)  # which leaves room for all
     shares = with_floor(weights, floor)
     assert math.isclose(shares.sum(), 1.0)
     assert (shares >= floor - 1e-9).all()

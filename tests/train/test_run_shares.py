@@ -88,8 +88,8 @@ def panel(table: pa.Table, path: Path, text: str) -> Panel:
     return build_panel(table, parse_mixture(whole), path, task=TOY_TASK, conditions=CONDITIONS)
 
 
-def draws_of(panel: Panel, planned: PlannedDraws, batch_size: int = 64) -> LoggedSampler:
-    return Logs.of_panel(panel, planned).sampler(batch_size, None, 0)
+def draws_of(panel: Panel, planned: PlannedDraws) -> LoggedSampler:
+    return Logs.of_panel(panel, planned).sampler(64, None, 0)
 
 
 @pytest.mark.parametrize("within", ["without_replacement", "uniform", "per"])
