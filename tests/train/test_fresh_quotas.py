@@ -104,8 +104,6 @@ def test_stratum_without_fresh_rows_is_reported_as_short(tmp_path: Path) -> None
     assert strata.known.tolist() == [True, False]
 
 
-# -- runs on the corridor -----------------------------------------------------------------------
-
 QUOTAS = (
     "discount = 0.9\nmax_replays_per_row = 8\n"
     "[[strata]]\nname = 'nominal'\nunit = 'episode'\nshare = 0.5\n"
@@ -192,9 +190,6 @@ def test_a_stratum_without_rows_is_named_before_and_after(tmp_path: Path) -> Non
     (row,) = [row for row in audited(live.run.path) if row["source"] == "batch"]
     assert row["stratum"] == "wheel_slip"
     assert row["drawn_share"] < 0.5 * row["wanted_share"]
-
-
-# -- budgets in seconds -------------------------------------------------------------------------
 
 
 def test_a_budget_in_seconds_counts_the_evaluations(tmp_path: Path) -> None:

@@ -233,9 +233,6 @@ def test_turtlebot3_sim_humble(tmp_path: Path) -> None:
     assert not [row for row in gap.observations if row["component"].startswith("clearance_")]
 
 
-# -- the rule --------------------------------------------------------------------------------
-
-
 GOOD, BAD, OPEN = (
     ConfidenceInterval(0.1, 0.05, 0.15),
     ConfidenceInterval(0.4, 0.3, 0.5),

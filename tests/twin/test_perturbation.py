@@ -30,9 +30,6 @@ from restock.train.twin.physics.simulation import Simulation
 PAGE = ROOT / "docs" / "twin.md"
 
 
-# -- what they say ----------------------------------------------------------------------------
-
-
 def test_every_field_has_a_range_and_a_line_in_the_docs() -> None:
     fields = {field.name: field.default for field in msgspec.structs.fields(Perturbation)}
     assert fields.keys() - {"name"} == RANGES.keys()
@@ -63,9 +60,6 @@ def test_a_perturbation_is_a_name_a_file_or_a_table(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             find_perturbation(wrong, where="here")
-
-
-# -- in the twin ------------------------------------------------------------------------------
 
 
 def drive(steps: int = 6, **changed: float) -> list[dict[str, np.ndarray]]:
@@ -127,9 +121,6 @@ def test_localisation_drifts_as_an_autoregressive_walk() -> None:
         assert np.array_equal(walk, drawn)  # to the bit: episodes of earlier runs stay as they were
         walks.append(walk)
     assert 0.5 < np.var(walks) < 1.5
-
-
-# -- in recordings and stores -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
