@@ -10,6 +10,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import settings
 from support import s3_server as s3
+from support.shell import Shell
 from support.stores import recording_transitions, summarised_once, write_store
 
 # Times are not asserted: on a loaded machine the first example of a property may take long.
@@ -42,6 +43,12 @@ def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a store of the same three recordings."""
     path = tmp_path_factory.mktemp("replay") / "store"
     return write_store(path, [recording_transitions(index) for index in (1, 2, 3)])
+
+
+@pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
+    """Run verbs as a user does."""
+    return Shell(capsys)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 from support.paths import ROOT
+from support.shell import Shell
 
 from restock import cli, native
 from restock.errors import ExitCode
@@ -22,9 +23,8 @@ def restock(*args: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_verb_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([*command.split(), "--help"]) == 0
-    out = capsys.readouterr().out
+def test_every_verb_explains_itself(command: str, shell: Shell) -> None:
+    out = shell.out(*command.split(), "--help")
     assert f"restock {command}" in out
     assert len(out.split()) > 40
 
@@ -36,19 +36,19 @@ def test_every_verb_is_in_the_docs(command: str) -> None:
 
 
 @pytest.mark.parametrize("verb", RENAMED)
-def test_an_old_verb_is_answered_with_the_new_one(verb, capsys):
-    assert cli.main([verb, "store"]) == ExitCode.USAGE
-    said = capsys.readouterr().err
+def test_an_old_verb_is_answered_with_the_new_one(verb, shell):
+    said = shell.err(verb, "store")
     assert RENAMED[verb] in said
     named = re.findall(r"`restock (\w+)(?: (\w+))?", said)
     assert all(new in cli.VERBS and verb != new for new, _ in named)
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_removed_option_is_answered_with_the_new_way(option, capsys):
+def test_removed_option_is_answered_with_the_new_way(option, shell):
     command = option.rpartition(" ")[0] or "sql"
-    assert cli.main([*command.split(), "place", f"--{option.partition('--')[2]}=1"]) == 2
-    assert OPTIONS[option] in capsys.readouterr().err
+    assert OPTIONS[option] in shell.err(
+        *command.split(), "place", f"--{option.partition('--')[2]}=1"
+    )
 
 
 @pytest.mark.parametrize("words", [["store"], ["store", "none"], ["twin", "none"]], ids=" ".join)
@@ -100,37 +100,32 @@ def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str)
     assert done.returncode == 0
 
 
-def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(store_path, monkeypatch, capsys):
+def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(store_path, monkeypatch, shell):
     store = str(store_path)
     columns = "i AS number, range(30) AS numbers, '[a]' || chr(10) || 'b' AS text"
     query = f"SELECT {columns} FROM range(100) AS t(i)"
-    assert cli.main(["sql", store, query]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = shell.out("sql", store, query).splitlines()
     assert len(lines) == 2 + 100  # a header, a rule, and every row on one line
     assert lines[0].split() == ["number", "numbers", "text"]
     assert lines[-1].split()[0] == "99"
     assert lines[-1].endswith(r"[a]\nb")
     assert lines[-1].count(",") == 29
-    assert cli.main(["sql", store, f"FROM ({query}) LIMIT 2 \\G"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = shell.out("sql", store, f"FROM ({query}) LIMIT 2 \\G").splitlines()
     assert [line.split()[0] for line in lines] == ["row", "number", "numbers", "text"] * 2
 
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    assert cli.main(["sql", store, query]) == 0
-    shown, said = capsys.readouterr()
+    shown, said = shell.printed("sql", store, query)
     assert [line.split()[0] for line in shown.splitlines()[2:]] == [str(n) for n in range(40)]
     assert "100 rows, 40 shown" in said
-    assert cli.main(["sql", store, f"FROM ({query}) LIMIT 1 \\G"]) == 0
-    assert "… 30 in all" in capsys.readouterr().out
+    assert "… 30 in all" in shell.out("sql", store, f"FROM ({query}) LIMIT 1 \\G")
 
 
-def test_a_terminal_leaves_out_columns_in_the_middle(store_path, monkeypatch, capsys):
+def test_a_terminal_leaves_out_columns_in_the_middle(store_path, monkeypatch, shell):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "40")
     named = ", ".join(f"{number} AS c_{number}" for number in range(1, 20))
     query = f"SELECT NULL AS first, {named}, {{'a': [1, NULL]}} AS last"
-    assert cli.main(["sql", str(store_path), query]) == 0
-    out, err = capsys.readouterr()
+    out, err = shell.printed("sql", store_path, query)
     header, _, row = out.splitlines()
     assert max(map(len, out.splitlines())) <= 40
     assert header.split()[0] == "first"
@@ -153,10 +148,9 @@ def test_a_terminal_leaves_out_columns_in_the_middle(store_path, monkeypatch, ca
     ],
     ids=" ".join,
 )
-def test_an_option_that_would_do_nothing_is_refused(words, capsys):
-    assert cli.main(words) == 2
+def test_an_option_that_would_do_nothing_is_refused(words, shell):
     *_, last = (word for word in words if word.startswith("--"))
-    assert last in capsys.readouterr().err
+    assert last in shell.err(*words)
 
 
 @pytest.mark.parametrize(
@@ -169,17 +163,15 @@ def test_an_option_that_would_do_nothing_is_refused(words, capsys):
     ],
     ids=" ".join,
 )
-def test_an_empty_path_is_not_the_working_directory(words, tmp_path, monkeypatch, capsys):
+def test_an_empty_path_is_not_the_working_directory(words, tmp_path, monkeypatch, shell):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(words) == 2
-    assert "variable of the shell not set" in capsys.readouterr().err
+    assert "variable of the shell not set" in shell.err(*words)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("more", ["info", "ingest --store s", "sql FROM", "mix --out p"])
-def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(more, capsys):
+def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(more, shell):
     verb, *words = more.split()
-    assert cli.main([verb, "s3://AKIA:hu/sh@bucket/logs", *words]) == 2
-    said = "".join(capsys.readouterr())
+    said = "".join(shell.printed(verb, "s3://AKIA:hu/sh@bucket/logs", *words, code=2))
     assert "***:***@bucket/logs" in said
     assert "hu/sh" not in said

@@ -1,11 +1,11 @@
 """`restock coverage drift`: names what changed, as text, JSON and a page."""
 
-import json
 from pathlib import Path
 
 import pytest
 from support.fleets import SyntheticRobot, fleet_store
 from support.page_scripts import Page
+from support.shell import Shell
 
 from restock import cli
 
@@ -19,18 +19,16 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fleet_store(tmp_path_factory.mktemp("fleet") / "store", robots, recordings=3)
 
 
-def test_it_names_the_worn_wheel(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["coverage", "drift", str(store)]) == 0
-    out = capsys.readouterr().out
+def test_it_names_the_worn_wheel(store: Path, shell: Shell) -> None:
+    out = shell.out("coverage", "drift", store)
     assert "amr-2: wheels: odometry_scale 0.9" in out
     assert "since 2026-03-16 (2 of 2 weeks)" in out
     assert cli.main(["coverage", "drift", str(store), "--exit-code"]) == 1
 
 
-def test_the_page_says_the_same_and_trusts_no_name(store, tmp_path, capsys):
+def test_the_page_says_the_same_and_trusts_no_name(store, tmp_path, shell):
     page = tmp_path / "pages" / "coverage.html"
-    assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json("coverage", "drift", store)
     assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
     assert {row["robot"] for row in document["findings"] if row["part"] == "wheels"} == {"amr-2"}
     assert {row["against"] for row in document["tests"]} == {"own reference", "other robots"}
@@ -40,13 +38,11 @@ def test_the_page_says_the_same_and_trusts_no_name(store, tmp_path, capsys):
     assert HOSTILE in read.text
 
 
-def test_a_fleet_with_nothing_to_compare_says_so(tmp_path, capsys):
+def test_a_fleet_with_nothing_to_compare_says_so(tmp_path, shell):
     store = fleet_store(tmp_path / "store", [SyntheticRobot(None)], weeks=1, episodes=2)
     page = tmp_path / "coverage.html"
     assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
-    capsys.readouterr()
-    assert cli.main(["coverage", "drift", str(store), "--exit-code"]) == 0
-    out = capsys.readouterr().out
+    out = shell.out("coverage", "drift", store, "--exit-code")
     assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
     assert "--tag robot=NAME" in out
@@ -57,14 +53,12 @@ def test_a_fleet_with_nothing_to_compare_says_so(tmp_path, capsys):
         assert "no change that matters" not in text.lower()
 
 
-def test_no_change_is_said_with_its_number_of_tests(tmp_path, capsys):
+def test_no_change_is_said_with_its_number_of_tests(tmp_path, shell):
     store = fleet_store(tmp_path / "store", [SyntheticRobot("amr-1")], recordings=3)
-    assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json("coverage", "drift", store)
     own = [row for row in document["tests"] if row["against"] == "own reference"]
     tests = sum(row["p"] is not None for row in own)
     assert document["findings"] == []
     assert document["tested"] == tests > 0
-    assert cli.main(["coverage", "drift", str(store)]) == 0
     said = f"No change that matters was found in {tests} tests against the robots' own references"
-    assert said in capsys.readouterr().out
+    assert said in shell.out("coverage", "drift", store)

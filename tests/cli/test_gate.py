@@ -6,9 +6,9 @@ from xml.etree import ElementTree
 
 import pytest
 from support.kept_run import kept_run
+from support.shell import Shell
 from support.stores import recording_transitions, write_store
 
-from restock.cli import main
 from restock.train.run.run import Run, kept_policy
 
 
@@ -20,17 +20,15 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: write_store(folder / name, some) for name, some in found.items()}
 
 
-def check(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, dict[str, str]]:
-    """Return the exit code, and each check's status."""
-    code = main(["audit", *map(str, args), "--json"])
-    checks = json.loads(capsys.readouterr().out)["audits"]
-    return code, {f"{one['part']}.{one['audit']}": one["status"] for one in checks}
+def check(shell: Shell, *words: object) -> dict[str, str]:
+    """Return each check's status, of which some fail."""
+    checks = shell.json("audit", *words, code=1)["audits"]
+    return {f"{one['part']}.{one['audit']}": one["status"] for one in checks}
 
 
-def test_what_was_lost_since_the_last_store_fails(stores, tmp_path, capsys):
+def test_what_was_lost_since_the_last_store_fails(stores, tmp_path, shell):
     junit = tmp_path / "check.xml"
-    code, found = check(capsys, stores["one"], "--against", stores["both"], "--junit", junit)
-    assert code == 1
+    found = check(shell, stores["one"], "--against", stores["both"], "--junit", junit)
     assert found["diff.recordings_lost"] == "fail"
     assert found["diff.episodes_lost"] == "pass"
     root = ElementTree.parse(junit).getroot()
@@ -40,31 +38,27 @@ def test_what_was_lost_since_the_last_store_fails(stores, tmp_path, capsys):
     failed = [case.get("name") for case in suites["diff"] if case.find("failure") is not None]
     assert failed == ["recordings_lost"]
 
-    code, found = check(capsys, stores["both"], "--against", stores["one"])
+    found = check(shell, stores["both"], "--against", stores["one"])
     assert found["diff.recordings_new"] == "info"
     assert "fail" not in {status for name, status in found.items() if name.startswith("diff")}
 
 
-def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(stores, tmp_path, capsys):
-    code, found = check(capsys, stores["one"], "--against", tmp_path / "gone")
-    assert code == 1
+def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(stores, tmp_path, shell):
+    found = check(shell, stores["one"], "--against", tmp_path / "gone")
     assert found["diff.comparable"] == "fail"
-    assert main(["audit", str(tmp_path / "gone")]) == 2
-    assert "no such store" in capsys.readouterr().err
-    assert main(["audit", str(stores["one"]), "--baseline", "released"]) == 2
-    assert "give the run after the store" in capsys.readouterr().err
-    assert main(["audit", str(stores["one"]), str(tmp_path)]) == 2
-    assert "is not a panel or a run" in capsys.readouterr().err
+    assert "no such store" in shell.err("audit", tmp_path / "gone")
+    assert "give the run after the store" in shell.err(
+        "audit", stores["one"], "--baseline", "released"
+    )
+    assert "is not a panel or a run" in shell.err("audit", stores["one"], tmp_path)
 
 
 @pytest.mark.parametrize(
     ("verb", "option"), [("audit", "--junit"), *(("coverage", "--out"), ("report", "--out"))]
 )
-def test_a_folder_as_output_file_is_refused_early(verb, option, tmp_path, capsys):
+def test_a_folder_as_output_file_is_refused_early(verb, option, tmp_path, shell):
     """Before it is even looked whether there is a store."""
-    capsys.readouterr()
-    assert main([*verb.split(), str(tmp_path / "gone"), option, str(tmp_path)]) == 2
-    error = capsys.readouterr().err
+    error = shell.err(*verb.split(), tmp_path / "gone", option, tmp_path)
     assert error.startswith(f"restock: {option}: {tmp_path} is a folder")
     assert ".tmp" not in error
 
@@ -82,11 +76,11 @@ def gated(run: Path, verdict: str = "not worse", **changes: object) -> None:
     (run / "gate" / "gate.json").write_text(json.dumps(document | changes))
 
 
-def test_a_run_must_have_passed_its_gate_against_the_baseline(stores, tmp_path, capsys):
+def test_a_run_must_have_passed_its_gate_against_the_baseline(stores, tmp_path, shell):
     run = kept_run(tmp_path / "run")
 
     def statuses() -> dict[str, str]:
-        _, found = check(capsys, stores["both"], run, "--baseline", "planner")
+        found = check(shell, stores["both"], run, "--baseline", "planner")
         return {name: status for name, status in found.items() if name.startswith("gate.")}
 
     refused = {"gate.comparable": "fail"}

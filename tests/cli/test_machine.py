@@ -1,44 +1,38 @@
 """`restock info` without a recording: this machine, its packages, a store."""
 
-import json
 import re
 import sys
 from importlib import metadata
 from typing import Any
 
 import pytest
+from support.shell import Shell
 
-from restock.cli import main
 from restock.cli.data import info
 from restock.errors import ConfigError
 from restock.process import import_extra, install_command
 
 
-def reported(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    code = main(["info", *arguments, "--json"])
-    found = json.loads(capsys.readouterr().out)["findings"]
-    return code, {one["name"]: one for one in found}
+def reported(shell: Shell, *arguments: object, code: int = 0) -> dict[str, Any]:
+    return {one["name"]: one for one in shell.json("info", *arguments, code=code)["findings"]}
 
 
-def test_a_machine_on_which_the_tests_run_is_well(store_path, capsys):
-    code, found = reported(capsys, str(store_path))
-    assert code == 0
+def test_a_machine_on_which_the_tests_run_is_well(store_path, shell):
+    found = reported(shell, store_path)
     assert " transitions of 3 recordings in 3 Parquet files" in found["rows"]["what"]
-    code, found = reported(capsys)
-    assert code == 0
+    found = reported(shell)
     assert found["duckdb"]["what"] == metadata.version("duckdb")
     assert found["torch"]["state"] == "ok"
     assert not {"ruff", "mypy", "pytest"} & set(found)  # what developers need is no extra
 
 
-def test_what_is_missing_or_too_old_is_named_with_its_remedy(monkeypatch, capsys):
+def test_what_is_missing_or_too_old_is_named_with_its_remedy(monkeypatch, shell):
     wanted = [
         *("duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"),
         "of-another-machine>=1; platform_machine == 'pdp11'",
     ]
     monkeypatch.setattr(info, "requires", lambda _: wanted)
-    code, found = reported(capsys)
-    assert code == 2
+    found = reported(shell, code=2)
     assert found["duckdb"]["state"] == "wrong"
     assert ">=99 is needed" in found["duckdb"]["what"]
     assert found["no-such-package"]["state"] == "wrong"

@@ -1,6 +1,5 @@
 """A fleet's night: a line for each recording, and one total, whose figures are those of --json."""
 
-import json
 from collections import Counter
 from pathlib import Path
 
@@ -28,11 +27,9 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, capsys):
-    assert main(["ingest", str(bags), "--dry-run", "--json"]) == 3
-    rows, dropped, labels = totals(json.loads(capsys.readouterr().out)["recordings"])
-    assert main(["ingest", str(bags), "--store", str(tmp_path / "s")]) == 3
-    out, err = capsys.readouterr()
+def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, shell):
+    rows, dropped, labels = totals(shell.json("ingest", bags, "--dry-run", code=3)["recordings"])
+    out, err = shell.printed("ingest", bags, "--store", tmp_path / "s", code=3)
     *lines, total = out.splitlines()
     assert [line.split(":")[0] for line in lines] == [f"written   drive{n}" for n in range(3)]
     assert err.startswith("restock: refused   cut: ")
@@ -43,31 +40,25 @@ def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, capsys):
     assert f"{dropped:,} ticks dropped" in parts
     assert all(f"{name} {number:,}" in total for name, number in labels.items())
 
-    assert main(["ingest", str(bags), "--store", str(tmp_path / "s"), "--salvage"]) == 3
-    out = capsys.readouterr().out
+    out = shell.out("ingest", bags, "--store", tmp_path / "s", "--salvage", code=3)
     assert "cut: " in out
     assert "total: 4 recordings (written 1, unchanged 3); " in out
     words = ["ingest", str(bags), "--store", str(tmp_path / "other"), "--profile", "turtlebot3"]
-    assert main(words) == 2
-    assert "; 3 gives no transition with the profile 'turtlebot3'; " in capsys.readouterr().out
+    assert "; 3 gives no transition with the profile 'turtlebot3'; " in shell.out(*words, code=2)
     assert "lost data 1" in out.splitlines()[-1]
 
 
-def test_one_recording_and_verbose_say_everything(bags, tmp_path, capsys):
-    main(["ingest", str(bags / "drive0"), "--dry-run"])
-    one = capsys.readouterr().out
+def test_one_recording_and_verbose_say_everything(bags, shell):
+    one = shell.out("ingest", bags / "drive0", "--dry-run")
     assert "episodes ended by: " in one
-    main(["ingest", str(bags), "--dry-run", "--verbose"])
-    every = capsys.readouterr()
-    assert one in every.out
-    assert "--salvage" in every.err
+    out, err = shell.printed("ingest", bags, "--dry-run", "--verbose", code=3)
+    assert one in out
+    assert "--salvage" in err
 
 
-def test_info_of_a_folder_ends_with_its_totals(bags, capsys):
-    assert main(["info", str(bags), "--json"]) == 2
-    found = json.loads(capsys.readouterr().out)["recordings"]
-    assert main(["info", str(bags)]) == 2
-    total, topics = capsys.readouterr().out.splitlines()[-2:]
+def test_info_of_a_folder_ends_with_its_totals(bags, shell):
+    found = shell.json("info", bags, code=2)["recordings"]
+    total, topics = shell.out("info", bags, code=2).splitlines()[-2:]
     assert total.startswith("total: 4 recordings; ")
     assert f"; {sum(one['messages'] for one in found):,} messages; 0 damaged; 1 refused" in total
     assert set.intersection(*(set(one["topics"]) for one in found)) == set(
@@ -76,12 +67,10 @@ def test_info_of_a_folder_ends_with_its_totals(bags, capsys):
 
 
 @pytest.mark.skipif(not (SHARED / "fleet-neato").is_dir(), reason="no fleet-neato")
-def test_eleven_recordings_of_strangers_are_twelve_lines(tmp_path, capsys):
+def test_eleven_recordings_of_strangers_are_twelve_lines(tmp_path, shell):
     fleet, profile = SHARED / "fleet-neato", tmp_path / "neato.toml"
     main(["profile", "new", str(fleet), "--out", str(profile)])
-    capsys.readouterr()
     words = ["ingest", str(fleet), "--profile", str(profile), "--store", str(tmp_path / "s")]
-    assert main(words) == 3
-    out, err = capsys.readouterr()
+    out, err = shell.printed(*words, code=3)
     assert len(out.splitlines()) + len(err.splitlines()) == len(recordings_in(fleet)) + 1
     assert "2023-replayed/mac_take_2_bag: 159 rows, 0.8 min, repeats another" in out

@@ -41,16 +41,14 @@ def test_training_records_no_success(run: Path) -> None:
 
 
 @pytest.mark.long
-def test_eval_report_card_and_compare_say_no_goal(run, capsys):
+def test_eval_report_card_and_compare_say_no_goal(run, shell):
     evaluate = ["eval", str(run), "--episodes", "1", "--perturbations", "none"]
-    assert cli.main([*evaluate, "--policies", "agent,planner", "--json"]) == 0
-    results = json.loads(capsys.readouterr().out)["results"]
+    results = shell.json(*evaluate, "--policies", "agent,planner")["results"]
     assert results
     for row in results:
         assert (row["success"], row["success_low"], row["success_high"]) == (None, None, None)
         assert row["return"] is not None
-    assert cli.main([*evaluate, "--policies", "agent"]) == 0
-    shown = capsys.readouterr().out
+    shown = shell.out(*evaluate, "--policies", "agent")
     assert "no goal" in shown
     assert "0.00 [" not in shown
 
@@ -60,13 +58,9 @@ def test_eval_report_card_and_compare_say_no_goal(run, capsys):
     assert "success is not defined" in page
     assert not re.search(r"(?i)success[^.<]{0,40}\b\d+\s?%", page.split("<main")[-1])
     assert "Wilson" not in page
-    capsys.readouterr()
-    assert cli.main(["report", str(run), "--card"]) == 0
-    assert "The task has no goal" in capsys.readouterr().out
+    assert "The task has no goal" in shell.out("report", run, "--card")
 
-    assert cli.main(["compare", str(run), str(run), "--json"]) == 0
-    for row in json.loads(capsys.readouterr().out)["outcomes"]:
+    for row in shell.json("compare", run, run)["outcomes"]:
         assert (row["success"], row["difference"]) == ([None, None], None)
         assert row["no_interval"] == "the task has no goal: compare the returns"
-    assert cli.main(["compare", str(run), str(run)]) == 0
-    assert "no goal" in capsys.readouterr().out
+    assert "no goal" in shell.out("compare", run, run)

@@ -4,12 +4,10 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 from support.paths import ROOT
 
-from restock import cli
 from restock.cli import output
 
 ROWS = [
@@ -37,7 +35,7 @@ def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(monkeypatch, capsy
     assert max(map(len, bare.splitlines())) <= 72
 
 
-def test_a_long_recording_shows_how_far_it_is(monkeypatch, capsys, tmp_path):
+def test_a_long_recording_shows_how_far_it_is(monkeypatch, shell):
     """On stderr, if that is a terminal: what is read of a recording, and of how much."""
     reported: list[tuple[str, int, int]] = []
     original = output.Advance.part
@@ -49,8 +47,7 @@ def test_a_long_recording_shows_how_far_it_is(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(output.Advance, "part", part)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     sample = ROOT / "sample_logs" / "amr_tuesday"
-    assert cli.main(["ingest", str(sample), "--dry-run", "--json"]) == 0
-    out = capsys.readouterr().out
+    out = shell.out("ingest", sample, "--dry-run", "--json")
     assert json.loads(out)["recordings"][0]["status"] == "dry run"
     by_stage = {}
     for doing, done, whole in reported:
@@ -67,7 +64,7 @@ def test_a_long_recording_shows_how_far_it_is(monkeypatch, capsys, tmp_path):
         assert 0.9 * whole[-1] <= done[-1] <= whole[-1]
 
 
-def test_a_bar_leaves_what_goes_into_a_file_alone(tmp_path: Path) -> None:
+def test_a_bar_leaves_what_goes_into_a_file_alone() -> None:
     """A terminal that shows a bar, while stdout is a file: what is printed meanwhile is data."""
     import pty
 

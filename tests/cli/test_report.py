@@ -13,12 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 import vl_convert
 from support.page_scripts import Page, charts_of
-from support.panels import panel_of
+from support.panels import EVERY, NO_SPLIT, panel_of
 from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
 from restock.errors import RunError
-from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.look.blocks import ask, statements
@@ -51,10 +50,7 @@ def fill(run: Run, table: str, *rows: dict[str, Any], **values: Any) -> None:
 def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run directory as training and `restock eval` leave it, over the synthetic store."""
     root = tmp_path_factory.mktemp("reported")
-    mixture = parse_mixture(
-        "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
-    )
-    panel = panel_of(store_path, mixture, root / "panel", task=TASK)
+    panel = panel_of(store_path, EVERY + NO_SPLIT, root / "panel", task=TASK)
     config = {
         "target": {"rule": "hard", "every": 500},
         "replay": {"ring_capacity": 4096},
@@ -118,9 +114,8 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.path
 
 
-def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
-    assert cli.main(["report", str(run), "--card", "--json"]) == 0
-    card = json.loads(capsys.readouterr().out)
+def test_the_replay_card_answers_every_question(run: Path, shell) -> None:
+    card = shell.json("report", run, "--card")
     assert card["capacity"]["ring_rows"] == 4096
     assert card["capacity"]["panel_rows"] > 0
     assert card["target"] == {"rule": "hard", "every": 500}
@@ -141,9 +136,8 @@ def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
     assert json.loads((run / "replay_card.json").read_text()) == card
 
 
-def test_the_replay_card_is_a_page_that_trusts_no_name(run: Path, capsys) -> None:
-    assert cli.main(["report", str(run), "--card"]) == 0
-    page = capsys.readouterr().out
+def test_the_replay_card_is_a_page_that_trusts_no_name(run: Path, shell) -> None:
+    page = shell.out("report", run, "--card")
     assert (run / "replay_card.md").read_text() == page
     assert "<script" not in page
 
@@ -260,14 +254,13 @@ def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
 
 
-def test_the_verb_writes_the_page(run, tmp_path, capsys):
+def test_the_verb_writes_the_page(run, tmp_path, shell):
     out = tmp_path / "deep" / "page.html"
-    assert cli.main(["report", str(run), "--out", str(out), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = shell.json("report", run, "--out", out)
     assert said == {"report": str(out), "bytes": out.stat().st_size}
 
 
-def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path, capsys):
+def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path, shell):
     own = tmp_path / "run"
     shutil.copytree(run, own)
     before = sorted([*store_path.rglob("*"), *run.rglob("*")])
@@ -283,8 +276,7 @@ def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path
         (["twin", "layout", "--out", f"{run}/floor.png"], f"the run {run}"),
         (["twin", "fit", store, "--out", f"{store}/fitted.toml"], f"the store {store}"),
     ):
-        assert cli.main(words) == 2
-        assert f"is within {place}:" in " ".join(capsys.readouterr().err.split())
+        assert f"is within {place}:" in " ".join(shell.err(*words).split())
     assert sorted([*store_path.rglob("*"), *run.rglob("*")]) == before
 
 

@@ -62,11 +62,10 @@ def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
     assert HOSTILE in found.text  # shown, as text
 
 
-def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, capsys):
+def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, shell):
     page = tmp_path / "page.html"
     argv = ["coverage", str(store_path), "--out", str(page)]
-    assert main(argv) == 0
-    assert "rows that hold each condition" in capsys.readouterr().out
+    assert "rows that hold each condition" in shell.out(*argv)
     found, html = read(page), page.read_text(encoding="utf-8")
     for section in ("shelves", "shopping", "weeks", "robots", "map"):
         assert f'<section id="{section}">' in html
@@ -77,7 +76,7 @@ def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, capsys):
 
 def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> None:
     with Store(store_path) as store:
-        sections = coverage_of(store, missing())
+        sections = coverage_of(store)
         slips = "SELECT count(*) FROM transitions WHERE"
         ((held,),) = store.sql(f"{slips} list_contains(conditions, 'wheel_slip')").fetchall()
         ((named,),) = store.sql(f"{slips} primary_condition = 'wheel_slip'").fetchall()
@@ -91,18 +90,21 @@ def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> N
 
 CONTROL_PERIOD_S = 0.2
 NO_PLAN = {"orders": [], "total": 0.0, "total_low": 0.0, "total_high": 0.0, "hours": 0.0}
+NO_GAPS = {  # as `restock coverage gaps --json` prints it
+    "store": "store",
+    "store_version": 1,
+    "mixture": "coverage",
+    "confidence": 0.8,
+    "unit": "missions",
+    "closed": True,
+    "gaps": [],
+    "plan": NO_PLAN,
+}
 
 
-def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[str, Any]:
-    """As `restock coverage gaps --json` prints it."""
-    place = {"store": "store", "store_version": 1, "mixture": "coverage", "confidence": 0.8}
-    whole = {**NO_PLAN, **plan}
-    return {**place, "unit": unit, "closed": not gaps, "gaps": list(gaps), "plan": whole}
-
-
-def coverage_of(store: Store, gaps: dict[str, Any]) -> dict[str, Any]:
+def coverage_of(store: Store) -> dict[str, Any]:
     """Return the sections of a store's page by id."""
-    page = coverage_page(store, gaps, "nothing to compare")
+    page = coverage_page(store, NO_GAPS, "nothing to compare")
     return {section.id: section for section in page["sections"] if section is not None}
 
 
@@ -111,7 +113,7 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     tags = [{"robot": "a"}, {"robot": "a"}, {"robot": "b"}]
     with Store(write_store(tmp_path / "store", tables, tags=tags)) as store:
-        sections = coverage_of(store, missing())
+        sections = coverage_of(store)
         (table,) = sections["robots"].tables
         weeks, _ = coverage_weeks(store)
         of_robot = (
@@ -140,7 +142,7 @@ def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:
     assert [row["td"] for row in shown] == [0.5, None, None, 1.0]
 
 
-def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, capsys):
+def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, shell):
     folder = tmp_path / "night"
     wider = {"config__replay__batch_size": 7}
     make_run(folder / "runs" / "<b>monday", document(0, created_ns=1), success=0.2)
@@ -149,8 +151,7 @@ def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, capsys):
     damaged = make_run(folder / "damaged", document(1)) / "fed.parquet"
     damaged.write_bytes(damaged.read_bytes()[:-9])
     (folder / "fleet").symlink_to(store_path)
-    assert main(["report", str(folder)]) == 0
-    assert capsys.readouterr().out == f"{folder / 'report.html'}\n"
+    assert shell.out("report", folder) == f"{folder / 'report.html'}\n"
     text = read(folder / "report.html").text
     assert "tuesday, the latest run, against <b>monday: better in wheel slip" in text
     assert re.search(r"replay\.batch_size \d+ → 7\b", text)

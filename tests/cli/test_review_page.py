@@ -118,32 +118,33 @@ def test_verdicts_by_keys_equal_those_by_csv(browser, store, made, tmp_path):
     assert rows(store, LABELS) != rows(made, LABELS)
 
 
-def test_another_condition_a_mark_a_note_and_undo(browser, store, tmp_path):
-    with ServedReview(store) as server:
-        tab = opened(browser, server.address)
-        first = tab.run("review.here()")
-        condition = first.rpartition("/")[2]
-        press(tab, "c")
-        other = tab.text("#pick-names button").split(maxsplit=1)[1].replace(" ", "_")
-        press(tab, "1")
-        tab.wait(f"review.here() !== {json.dumps(first)} && review.moment()")
-        counting = Journal.of(Location.of(store)).counting()
-        said = {(one.condition, one.verdict) for one in counting}
-        assert said == {(condition, "no"), (other, "yes")}
-        press(tab, "u")
-        assert tab.run("review.here()") == first
-        assert Journal.of(Location.of(store)).counting() == []
-        tab.run("document.getElementById('note').value = 'a child with a ball'")
-        press(tab, "y")
-        (entry,) = Journal.of(Location.of(store)).counting()
-        assert (entry.note, entry.event, entry.verdict) == ("a child with a ball", first, "yes")
-        press(tab, "m", "1")
-        tab.wait("document.getElementById('kind').innerText === 'marked by you'")
-        press(tab, "y")
-        (mark,) = Journal.of(Location.of(store)).counting()[1:]
-        assert mark.verdict == "yes"
-        assert mark.last_step >= mark.first_step
-        tab.close()
+def test_another_condition_a_mark_a_note_and_undo(browser, in_process, store):
+    server, _ = in_process
+    tab = opened(browser, server.address)
+    first = tab.run("review.here()")
+    condition = first.rpartition("/")[2]
+    press(tab, "c")
+    other = tab.text("#pick-names button").split(maxsplit=1)[1].replace(" ", "_")
+    press(tab, "1")
+    tab.wait(f"review.here() !== {json.dumps(first)} && review.moment()")
+    counting = Journal.of(Location.of(store)).counting()
+    said = {(one.condition, one.verdict) for one in counting}
+    assert said == {(condition, "no"), (other, "yes")}
+    press(tab, "u")
+    assert tab.run("review.here()") == first
+    assert Journal.of(Location.of(store)).counting() == []
+    tab.run("document.getElementById('note').value = 'a child with a ball'")
+    press(tab, "y")
+    (entry,) = Journal.of(Location.of(store)).counting()
+    assert (entry.note, entry.event, entry.verdict) == ("a child with a ball", first, "yes")
+    press(tab, "m", "1")
+    tab.wait("document.getElementById('kind').innerText === 'marked by you'")
+    press(tab, "y")
+    (mark,) = Journal.of(Location.of(store)).counting()[1:]
+    assert mark.verdict == "yes"
+    assert mark.last_step >= mark.first_step
+    tab.close()
+    server.review.write()
     found = rows(store, "SELECT condition, value FROM corrections")
     assert (mark.condition, True) in found
     assert (condition, True) in found
@@ -178,7 +179,7 @@ def test_names_stay_text(browser, tmp_path):
             tab.close()
 
 
-def test_a_killed_server_loses_nothing(browser, store, tmp_path):
+def test_a_killed_server_loses_nothing(browser, store):
     server = ServedReview(store)
     tab = opened(browser, server.address)
     press(tab, *"yynyn")
@@ -226,10 +227,9 @@ def test_two_people_and_two_servers_lose_no_verdict(browser, store):
     assert len(rows(store, "FROM corrections")) == 1
 
 
-def test_a_file_gives_the_verdicts_back(browser, store, tmp_path, capsys):
+def test_a_file_gives_the_verdicts_back(browser, store, tmp_path, shell):
     page = tmp_path / "page.html"
-    assert main(["review", str(store), "--out", str(page)]) == 0
-    assert "open it in a browser" in capsys.readouterr().err
+    assert "open it in a browser" in shell.err("review", store, "--out", page, code=0)
     tab = opened(browser, page.as_uri())
     first = tab.run("review.here()")
     press(tab, "n", "y")
@@ -243,20 +243,17 @@ def test_a_file_gives_the_verdicts_back(browser, store, tmp_path, capsys):
     saved = json.loads(file.read_text())
     assert (saved[0]["event"], saved[0]["verdict"]) == (first, "no")
     for dry in (["--dry-run"], []):
-        assert main(["review", str(store), str(file), "--json", *dry]) == 0
-        assert json.loads(capsys.readouterr().out)["verdicts"] == 2
-    assert main(["review", str(store), str(file)]) == 0  # the same again
-    assert "no verdict is new" in capsys.readouterr().out
+        assert shell.json("review", store, file, *dry)["verdicts"] == 2
+    assert "no verdict is new" in shell.out("review", store, file)  # the same again
     found = [(row[1], row[2]) for row in rows(store, CORRECTIONS)]
     assert sorted(found) == sorted((one["condition"], one["verdict"] == "yes") for one in saved)
 
 
 @pytest.mark.parametrize("text", ["[{}]", "hello", '[{"kind": "verdict"}]', "[" * 99])
-def test_a_file_without_verdicts_is_refused(store, tmp_path, text, capsys):
+def test_a_file_without_verdicts_is_refused(store, tmp_path, text, shell):
     file = tmp_path / "verdicts.json"
     file.write_text(text)
-    assert main(["review", str(store), str(file)]) == 2
-    assert "verdict" in capsys.readouterr().err
+    assert "verdict" in shell.err("review", store, file)
     assert not (store / NAME).exists()
 
 

@@ -10,7 +10,6 @@ import pytest
 from jsonschema import Draft202012Validator
 from support.paths import ROOT
 
-from restock import cli
 from restock.cli.learning.schema import CONFIGS, schema_of
 from restock.train.dqn.config import TrainConfig
 from restock.train.twin.physics.perturbation import PERTURBATIONS
@@ -85,10 +84,7 @@ def test_what_restock_refuses_is_underlined(name: str, toml: str, said: str) -> 
     assert said in "; ".join(problems(name, tomllib.loads(toml)))
 
 
-def test_the_command_prints_schemas_and_lists_them(capsys):
-    assert cli.main(["profile", "schema", "--json"]) == 0
-    assert [row["name"] for row in json.loads(capsys.readouterr().out)] == list(CONFIGS)
-    assert cli.main(["profile", "schema", "study"]) == 0
-    assert json.loads(capsys.readouterr().out) == SCHEMAS["study"]
-    assert cli.main(["profile", "schema", "robot"]) == 2
-    assert "choose one of train" in capsys.readouterr().err
+def test_the_command_prints_schemas_and_lists_them(shell):
+    assert [row["name"] for row in shell.json("profile", "schema")] == list(CONFIGS)
+    assert json.loads(shell.out("profile", "schema", "study")) == SCHEMAS["study"]
+    assert "choose one of train" in shell.err("profile", "schema", "robot")

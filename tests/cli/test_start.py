@@ -1,17 +1,18 @@
 """`restock start` takes a stranger's bag stage by stage, and stops where a person must decide."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.driven_robot import Drive, start, up_to_the_panel, write_bag
+from support.driven_robot import Drive, up_to_the_panel, write_bag
 from support.long import one_in
 
-from restock import cli
 from restock.cli.start import outcomes
+from restock.cli.start.decisions import fit_is_worse
 from restock.cli.start.stages import Stage
 from restock.cli.start.start import StartCommand, Way
 from restock.cli.start.work import Ended, Work
@@ -86,11 +87,10 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, bag: Path) -> 
         way(tmp_path, Verbs(), bag)
 
 
-def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, capsys):
+def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, shell):
     out, bags = tmp_path / "out", tmp_path / "bags"
     recording = write_bag(Drive(), bags / "drive")
-    assert cli.main(["start", str(bags), "--out", str(out), "--dry-run"]) == 0
-    printed = capsys.readouterr().out
+    printed = shell.out("start", bags, "--out", out, "--dry-run")
     commands = [line for line in printed.splitlines() if line.startswith("$ restock ")]
     assert commands[0] == f"$ restock info {bags}"
     assert commands[1].startswith(f"$ restock profile new {bags} --out ")
@@ -99,8 +99,7 @@ def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, capsys):
     assert not out.exists()
     out.mkdir()
     (out / "thesis.tex").touch()  # what the run would refuse
-    assert cli.main(["start", str(bags), "--out", str(out), "--dry-run"]) == 2
-    assert capsys.readouterr().out == ""
+    assert shell.out("start", bags, "--out", out, "--dry-run", code=2) == ""
 
 
 @pytest.mark.parametrize("fails", one_in(3, ["eval", "ways", "judge"]))
@@ -129,11 +128,10 @@ class Parked(Drive):
         return topics
 
 
-def test_a_bag_without_commands_stops_at_the_proposal(tmp_path, capsys):
+def test_a_bag_without_commands_stops_at_the_proposal(tmp_path, shell):
     recording = write_bag(Parked(), tmp_path / "parked")
     out = tmp_path / "out"
-    code, document = start(capsys, str(recording), "--out", str(out))
-    assert code == 3
+    document = shell.json("start", recording, "--out", out, code=3)
     assert [stage["name"] for stage in document["stages"]] == ["info", "propose"]
     assert "no topic for command" in document["stopped"]["why"]
     assert str(out / "profile.toml") in document["stopped"]["remedies"][0]
@@ -148,42 +146,41 @@ class Lost(Drive):
         return {name: topics[name] for name in ("/cmd_vel", "/scan")}
 
 
-def test_commands_and_poses_in_different_recordings(tmp_path, capsys):
+def test_commands_and_poses_in_different_recordings(tmp_path, shell):
     """Of a Nav2 cart only the one was told as missing, though the other recording has it."""
     write_bag(Lost(), tmp_path / "bags" / "commands")
     write_bag(Parked(), tmp_path / "bags" / "poses")
-    code, document = start(capsys, str(tmp_path / "bags"), "--out", str(tmp_path / "out"))
-    assert code == 3
+    document = shell.json("start", tmp_path / "bags", "--out", tmp_path / "out", code=3)
     why = "bags/commands has a command (/cmd_vel) and no pose: one recording must hold both"
     assert why in document["stopped"]["why"]
     assert str(tmp_path / "out" / "profile.toml") in document["stopped"]["remedies"][0]
 
 
-def test_an_edited_profile_is_taken_and_never_replaced(tmp_path, capsys):
+def test_an_edited_profile_is_taken_and_never_replaced(tmp_path, shell):
     recording = write_bag(Drive(), tmp_path / "drive")
     out = tmp_path / "out"
-    argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))
-    code, document = start(capsys, *argv)
-    assert code == 3
+    argv = (recording, "--out", out, *up_to_the_panel(tmp_path))
+    document = shell.json("start", *argv, code=3)
     assert document["stages"][-1]["name"] == "mix"
     assert all(stage["status"] == "done" for stage in document["stages"][:-1])
-    assert [s["status"] for s in start(capsys, *argv)[1]["stages"][:-1]] == ["kept"] * 6
+    *kept, _ = shell.json("start", *argv, code=3)["stages"]
+    assert [stage["status"] for stage in kept] == ["kept"] * 6
     profile = out / "profile.toml"
     mine = profile.read_text().replace("range_max_m = ", "range_max_m = 1") + "\n# mine\n"
     profile.write_text(mine)
-    _, document = start(capsys, *argv)
+    document = shell.json("start", *argv, code=3)
     assert "propose" not in [stage["name"] for stage in document["stages"]]
     assert {s["name"]: s["status"] for s in document["stages"]}["ingest"] == "done"
     assert profile.read_text() == mine
 
 
-def test_a_copy_of_a_recording_is_not_counted_twice(tmp_path, capsys):
+def test_a_copy_of_a_recording_is_not_counted_twice(tmp_path, shell):
     """The store had half of the transitions that were told."""
     bags = tmp_path / "bags"
     recording = write_bag(Drive(), bags / "drive")
     shutil.copytree(recording, bags / "again")
     out = tmp_path / "out"
-    _, document = start(capsys, str(bags), "--out", str(out), *up_to_the_panel(tmp_path))
+    document = shell.json("start", bags, "--out", out, *up_to_the_panel(tmp_path), code=3)
     (stage,) = [stage for stage in document["stages"] if stage["name"] == "ingest"]
     with Store(out / "store") as store:
         ((rows, episodes),) = store.sql(
@@ -194,12 +191,11 @@ def test_a_copy_of_a_recording_is_not_counted_twice(tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_without_a_trusted_twin_the_policy_is_from_logs_alone(tmp_path, quick_models, capsys):
+def test_without_a_trusted_twin_the_policy_is_from_logs_alone(tmp_path, quick_models, shell):
     recording = write_bag(Drive(12.0), tmp_path / "drive")
     out = tmp_path / "out"
-    argv = (str(recording), "--out", str(out), "--minutes", "0.02")
-    code, document = start(capsys, *argv)
-    assert code == 0
+    argv = (recording, "--out", out, "--minutes", "0.02")
+    document = shell.json("start", *argv)
     stages = {stage["name"]: stage for stage in document["stages"]}
     assert "env.twin=false" in stages["train"]["command"]
     assert "eval" not in stages
@@ -207,21 +203,20 @@ def test_without_a_trusted_twin_the_policy_is_from_logs_alone(tmp_path, quick_mo
     page = (out / "run" / "report.html").read_text("utf-8")
     assert "logs alone" in page.split("<h1>")[1].split("</h1>")[0]
     assert "Does it reach the goal?" not in page
-    again = start(capsys, *argv)[1]["stages"]
+    again = shell.json("start", *argv)["stages"]
     failed = {name for name, stage in stages.items() if stage["status"] == "failed"}
     assert {stage["name"] for stage in again if stage["status"] != "kept"} == failed
 
 
 @pytest.mark.long
-def test_a_person_chooses_among_command_topics(tmp_path, capsys):
+def test_a_person_chooses_among_command_topics(tmp_path, shell):
     recording = write_bag(Drive(proposals="/base/cmd_vel"), tmp_path / "drive")
     out = tmp_path / "out"
-    argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))
-    code, document = start(capsys, *argv)
-    assert code == 3
+    argv = (recording, "--out", out, *up_to_the_panel(tmp_path))
+    document = shell.json("start", *argv, code=3)
     assert document["stages"][-1]["name"] == "propose"
     assert "/base/cmd_vel, /cmd_vel" in document["stopped"]["why"]
-    _, document = start(capsys, *argv, "--accept")
+    document = shell.json("start", *argv, "--accept", code=3)
     assert document["stages"][-1]["name"] == "mix"
 
 
@@ -238,3 +233,37 @@ def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
         "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
     )
     assert reported.endswith(f"(pdwis) refused: {few}")
+
+
+def test_a_worse_fit_is_reported_with_its_figures() -> None:
+    def gap(*ends: tuple[str, str, float, float]) -> dict[str, Any]:
+        rows = [
+            {"condition": "nominal", "quantity": what, "source": source, "median": m, "p90": p}
+            for what, source, m, p in ends
+        ]
+        return {"paths": rows}
+
+    described = ("position", "nominal", 0.12, 0.3)
+    worse = gap(described, ("position", "calibrated", 0.26, 0.5))
+    assert "0.260 m from the log" in str(fit_is_worse(worse))
+    assert "without it 0.120 m" in str(fit_is_worse(worse))
+    assert fit_is_worse(gap(described, ("position", "calibrated", 0.13, 0.2))) is None
+    assert fit_is_worse(gap(described, ("position", "calibrated", 0.08, 0.4))) is None
+    assert fit_is_worse(gap(described, ("heading", "calibrated", 0.9, 0.9))) is None
+
+
+def test_a_lidar_that_sees_into_the_robot_stops_it(tmp_path, shell):
+    """A robot of 4 x 3 m in a small room went all the way to a policy."""
+    recording, out = write_bag(Drive(), tmp_path / "drive"), tmp_path / "out"
+    argv = (recording, "--out", out, *up_to_the_panel(tmp_path))
+    shell.json("start", *argv, code=3)
+    profile = out / "profile.toml"
+    text = re.sub(r"(length_m|width_m) = [\d.]+", r"\1 = 8.0", profile.read_text())
+    profile.write_text(text)  # the nearest return is 3 m away
+    document = shell.json("start", *argv, code=3)
+    assert document["stages"][-1]["name"] == "check"
+    assert "the robot's outline (8 x 8 m) is wrong" in document["stopped"]["why"]
+    assert "inside it at 100% of the ticks" in document["stopped"]["why"]
+    assert "length_m and width_m of [task.body]" in document["stopped"]["remedies"][0]
+    document = shell.json("start", *argv, "--accept", code=3)
+    assert document["stages"][-1]["name"] == "mix"

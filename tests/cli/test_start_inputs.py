@@ -12,7 +12,6 @@ from support.driven_robot import (
     columns,
     cut_bag,
     scans,
-    start,
     typed_topics,
     up_to_the_panel,
     write_bag,
@@ -37,21 +36,19 @@ def commands(document: Any) -> dict[str, str]:
     return {stage["name"]: stage["command"] for stage in document["stages"]}
 
 
-def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, capsys):
+def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, shell):
     """And its map of another frame stops it at the floor."""
     damaged = cut_bag(tmp_path / "bags" / "damaged")
     out, hall = tmp_path / "out", tmp_path / "hall.yaml"
     Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
     hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [200.0, -2.0, 0]\n")
-    argv = (str(damaged), "--out", str(out), "--map", str(hall))
-    code, document = start(capsys, *argv)
-    assert code == 3
+    argv = (damaged, "--out", out, "--map", hall)
+    document = shell.json("start", *argv, code=3)
     assert document["stopped"]["why"] == "no recording can be read"
     assert document["stopped"]["remedies"][0].startswith("add --salvage to this command")
 
     tags = ("--tag", "robot=amr-7", "--tag", "site=north")
-    code, document = start(capsys, *argv, "--salvage", *tags)
-    assert code == 3
+    document = shell.json("start", *argv, "--salvage", *tags, code=3)
     said = {stage["name"]: stage["outcome"] for stage in document["stages"]}
     assert any(line.startswith("damaged: ") for line in said["info"])
     assert any(line.startswith("lost: ") for line in said["ingest"])
@@ -81,7 +78,7 @@ WHEEL = """<link name='{0}'><collision><geometry><cylinder radius='0.09' length=
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, capsys):
+def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, shell):
     urdf, hall, out = tmp_path / "cart.urdf", tmp_path / "hall.yaml", tmp_path / "out"
     urdf.write_text(CART.format(WHEEL.format("left", 0.22) + WHEEL.format("right", -0.22)))
     Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
@@ -89,9 +86,8 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, capsys):
     topics = typed_topics(Drive(20.0))
     topics["/scan"][1].fields["ranges"].values[:] = np.inf  # returns would not lie on its walls
     bag = write_topics(topics, tmp_path / "bag")
-    argv = (str(bag), "--out", str(out), "--urdf", str(urdf), "--map", str(hall))
-    code, document = start(capsys, *argv, "--minutes", "0.1")
-    assert code == 0
+    argv = (bag, "--out", out, "--urdf", urdf, "--map", hall)
+    document = shell.json("start", *argv, "--minutes", "0.1")
     assert Path(document["report"]).is_file()
     said = {stage["name"]: stage["outcome"] for stage in document["stages"]}
     assert said["floor"][0].startswith(f"made from {hall}: 15 x 4 m")
@@ -101,8 +97,9 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, capsys):
     assert robot.origin_of("track_m") == "urdf"
     # Once the profile is a person's, a proposal's flags are said to change nothing.
     (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
-    assert cli.main(["start", *argv, *up_to_the_panel(tmp_path)]) == 3
-    assert "--urdf can only change a proposal" in capsys.readouterr().out
+    assert "--urdf can only change a proposal" in shell.out(
+        "start", *argv, *up_to_the_panel(tmp_path), code=3
+    )
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
@@ -130,7 +127,7 @@ def test_a_robots_own_types_are_read_by_their_definitions(tmp_path, capsys) -> N
     assert "--definitions" in recording["topics"]["/accel"]["skipped"]
 
 
-def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkeypatch, capsys):
+def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkeypatch, shell):
     monkeypatch.chdir(tmp_path)
     Path("text.mcap").write_text("text\n")
     Path("bags").mkdir()
@@ -143,30 +140,28 @@ def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkey
         ("bags",): "restock: bags/empty.mcap: an empty file",
         ("bare",): "restock: bare: a bag without its storage files",
     }.items():
-        assert cli.main(["start", *paths, "--out", "out"]) == 2
-        printed = capsys.readouterr()
-        assert printed.err.startswith(said)
-        assert printed.out == ""
+        out, err = shell.printed("start", *paths, "--out", "out", code=2)
+        assert err.startswith(said)
+        assert out == ""
         assert not Path("out").exists()
 
 
 @pytest.mark.long
-def test_unread_recordings_are_sorted_by_kind_too(tmp_path, monkeypatch, capsys):
+def test_unread_recordings_are_sorted_by_kind_too(tmp_path, monkeypatch, shell):
     """The small drive of another robot was ingested with the others."""
     monkeypatch.setattr(drives, "drives_by_kind", partial(drives.drives_by_kind, most=2))
     bags, out = tmp_path / "bags", tmp_path / "out"
     for name, seconds in (("a", 9.0), ("b", 4.0), ("c", 8.0)):
         write_bag(Drive(seconds), bags / name)
     write_bag(OtherLidar(3.0), bags / "small")
-    code, document = start(capsys, str(bags), "--out", str(out))
-    assert code == 3
+    document = shell.json("start", bags, "--out", out, code=3)
     mine = f"{bags / 'a'} {bags / 'b'} {bags / 'c'}"
     assert document["stopped"]["remedies"][:2] == [
         f"restock start {mine} --out {out}",
         f"restock start {bags / 'small'} --out {out}-2",
     ]
-    argv = (str(bags), "--out", str(out), "--accept", *up_to_the_panel(tmp_path))
-    _, document = start(capsys, *argv)
+    argv = (bags, "--out", out, "--accept", *up_to_the_panel(tmp_path))
+    document = shell.json("start", *argv, code=3)
     assert f"restock ingest {mine} --store" in commands(document)["ingest"]
     (proposed,) = [stage for stage in document["stages"] if stage["name"] == "propose"]
     assert "by the 2 largest of 3 recordings of this robot" in proposed["outcome"][0]
@@ -202,14 +197,13 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
     ],
 )
 def test_wrong_options_are_refused_before_the_first_stage(
-    tmp_path, monkeypatch, capsys, option, value, why
+    tmp_path, monkeypatch, shell, option, value, why
 ):
     monkeypatch.chdir(tmp_path)
     Path("box.urdf").write_text("<robot name='box'><link name='base_link'/></robot>")
-    assert cli.main(["start", "no_bag", "--out", "out", option, value]) == 2
-    said = capsys.readouterr()
-    assert why in said.err
-    assert said.out == ""
+    out, err = shell.printed("start", "no_bag", "--out", "out", option, value, code=2)
+    assert why in err
+    assert out == ""
     assert not Path("out").exists()
 
 

@@ -1,6 +1,5 @@
 """Bytes of a store that changed are found before rows are taken from it, and by `store verify`."""
 
-import json
 import os
 import random
 import shutil
@@ -8,9 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from support.shell import Shell
 from support.stores import recording_transitions, write_store
 
-from restock import cli
 from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.damaged_files import verify_store
@@ -81,25 +80,22 @@ def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
     ],
     ids=" ".join,
 )
-def test_verbs_refuse_damaged_rows(verb, store, tmp_path, capsys):
+def test_verbs_refuse_damaged_rows(verb, store, tmp_path, shell):
     file, out = rows_file(store), tmp_path / "out.parquet"
     flip(file, 1000)
     argv = [{"STORE": str(store), "OUT": str(out)}.get(word, word) for word in verb]
-    assert cli.main(argv) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*argv)
     assert f"its file {file.relative_to(store)} cannot be read" in said
     assert "--drop-damaged" in said
     assert not out.exists()
 
 
-def test_verify_lists_what_is_damaged(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["store", "verify", str(store)]) == 0
-    assert "2 of 2 files whole" in capsys.readouterr().err
+def test_verify_lists_what_is_damaged(store: Path, shell: Shell) -> None:
+    assert "2 of 2 files whole" in shell.err("store", "verify", store, code=0)
     file, gone = rows_file(store), next(store.glob("recordings/compacted/*.parquet"))
     flip(file, 1000)
     gone.unlink()
-    assert cli.main(["store", "verify", str(store), "--json"]) == 1
-    reported = json.loads(capsys.readouterr().out)
+    reported = shell.json("store", "verify", store, code=1)
     assert reported["files"] == 2
     assert [one["file"] for one in reported["damaged"]] == [
         str(one.relative_to(store)) for one in (file, gone)

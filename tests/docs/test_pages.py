@@ -5,7 +5,7 @@ import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from importlib.resources import files
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 
 import pytest
@@ -18,16 +18,8 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.train.study.study import load_study
 from restock.train.twin.floors.floor_files import read_floor
 
-LANGUAGES = (
-    *RUN,
-    "toml",
-    "yaml",
-    "json",
-    "csv",
-    "text",
-    "xml",
-    "py",
-)  # py: signatures in docs/reference.md
+# py: signatures in docs/reference.md
+LANGUAGES = (*RUN, "toml", "yaml", "json", "csv", "text", "xml", "py")
 ALL = {page: blocks(page) for page in PAGES}
 NOTEBOOKS = [ROOT / "docs/tutorial.md"]  # test_tutorial.py runs it
 PARTS = {  # (page, number of its folder) -> the blocks that run there, one after the other
@@ -37,12 +29,7 @@ PARTS = {  # (page, number of its folder) -> the blocks that run there, one afte
 }
 PARTS_RUN = [p for p in PARTS if p[0] not in NOTEBOOKS and any(b.is_run for b in PARTS[p])]
 PARTS_SLOW = [part for part in PARTS if any("slow" in block.marks for block in PARTS[part])]
-TOML = [
-    b
-    for reported in ALL.values()
-    for b in reported
-    if b.language == "toml" and "file" not in b.marks
-]
+TOML = [b for b in chain(*ALL.values()) if b.language == "toml" and "file" not in b.marks]
 
 
 def name(page: Path) -> str:
@@ -88,9 +75,7 @@ def run_part(
         if target := block.marks.get("file"):
             (folder / target).parent.mkdir(parents=True, exist_ok=True)
             (folder / target).write_text(block.text, encoding="utf-8")
-    wanted = [
-        block for block in PARTS[part] if block.is_run and (slow or "slow" not in block.marks)
-    ]
+    wanted = [b for b in PARTS[part] if b.is_run and (slow or "slow" not in b.marks)]
     wrong = server.run(wanted, folder)
     assert not wrong, wrong
 
@@ -111,16 +96,13 @@ def test_a_page_runs_with_its_slow_blocks(part, server, prepared, tmp_path):
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_blocks_are_fenced_and_name_their_language(page: Path) -> None:
     assert indented(page) == []
-    assert [b.place for b in blocks(page) if b.language not in LANGUAGES] == []
+    assert [b.place for b in ALL[page] if b.language not in LANGUAGES] == []
 
 
 def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
     """Each needs what no test has. A new one is counted here, so that it is seen in review."""
-    reported = [block for page in PAGES for block in blocks(page) if block.language in RUN]
-    left_out = {
-        block.place: block.marks["not run"] for block in reported if "not run" in block.marks
-    }
-    print("\n".join(f"{place}: {reason}" for place, reason in left_out.items()))  # noqa: T201
+    reported = [block for block in chain(*ALL.values()) if block.language in RUN]
+    left_out = {b.place: b.marks["not run"] for b in reported if "not run" in b.marks}
     assert all(len(reason.split()) >= 2 for reason in left_out.values()), left_out
     assert len(left_out) <= 30
     assert len(reported) > 5 * len(left_out)

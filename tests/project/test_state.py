@@ -113,13 +113,6 @@ def test_an_array_comes_back_with_its_type_and_shape(array: np.ndarray[Any, Any]
     assert not np.shares_memory(again, state)
 
 
-@pytest.mark.parametrize("bits", [np.random.PCG64, np.random.SFC64])
-def test_a_generator_goes_on_where_it_was(bits: Any) -> None:
-    generator, other = np.random.Generator(bits(1)), np.random.Generator(bits(2))
-    assert restored(other, saved(generator)) is other
-    assert other.random() == generator.random()
-
-
 def test_a_state_of_another_network_is_refused_with_what_differs() -> None:
     with pytest.raises(RunError, match=r"of another network: size mismatch for weight.*\n.*give"):
         restored(torch.nn.Linear(3, 1), saved(torch.nn.Linear(2, 1)))

@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.panels import NO_SPLIT, panel_of
+from support.shell import Shell
 
-from restock.cli import main
 from restock.errors import RestockError
 from restock.replay import Panel, sampler_for
 
@@ -82,12 +82,11 @@ def test_rows_in_another_order_are_the_same_episodes(tmp_path: Path) -> None:
         np.testing.assert_array_equal(in_order.rows, shuffled.rows)
 
 
-def test_a_file_is_mixed_as_a_table_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_is_mixed_as_a_table_is(tmp_path: Path, shell: Shell) -> None:
     pq.write_table(table(ROWS, "after"), tmp_path / "log.parquet")
     (tmp_path / "mixture.toml").write_text(QUOTAS)
     options = ["--mixture", str(tmp_path / "mixture.toml"), "--out", str(tmp_path / "cli")]
-    assert main(["mix", str(tmp_path / "log.parquet"), *options]) == 0
-    assert "rows of the table" in capsys.readouterr().out
+    assert "rows of the table" in shell.out("mix", tmp_path / "log.parquet", *options)
     panel = panel_of(table(ROWS, "after"), QUOTAS, tmp_path / "p")
     assert Panel.open(tmp_path / "cli").id == panel.id
     other = [{**row, "reward": 2.0} for row in ROWS]  # a table's content is in the id

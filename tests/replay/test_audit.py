@@ -334,10 +334,9 @@ def test_findings_do_not_depend_on_what_is_held_in_memory(tmp_path, monkeypatch)
     }
 
 
-def test_the_verb_fails_on_an_error_and_passes_without(store_path, tmp_path, capsys):
+def test_the_verb_fails_on_an_error_and_passes_without(store_path, tmp_path, shell):
     junit, audit = tmp_path / "audit.xml", ["audit", str(store_path)]
-    assert cli.main([*audit, "--json", "--junit", str(junit)]) == 1
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json(*audit, "--junit", junit, code=1)
     assert document["failed"] == 1
     assert [a["audit"] for a in document["audits"] if a["status"] == "fail"] == ["rare_condition"]
     (root,) = ElementTree.fromstring(junit.read_text())
@@ -346,21 +345,19 @@ def test_the_verb_fails_on_an_error_and_passes_without(store_path, tmp_path, cap
     assert root.get("tests") == str(len(AUDITS))
     (tmp_path / "easy.toml").write_text("[rare_condition]\nmin_rows = 1\nmin_episodes = 1")
     easy = [*audit, "--thresholds", str(tmp_path / "easy.toml")]
-    assert cli.main(easy) == 0
-    out = capsys.readouterr().out
+    out = shell.out(*easy)
     assert "stale_data" in out
     assert "skipped" in out
     assert cli.main([*easy, "--strict", "--junit", str(junit)]) == 1
     assert int(ElementTree.fromstring(junit.read_text())[0].get("failures", "")) > 0
 
 
-def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp_path, capsys):
+def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp_path, shell):
     lost, rows = tmp_path / "lost", recording_transitions(1)
     StoreWriter(lost).write(manifest(rows), rows)
     for file in (lost / "transitions").rglob("*.parquet"):
         file.unlink()
     assert cli.main(["store", "compact", str(lost), "--drop-damaged"]) == 3
-    capsys.readouterr()
     other = write_store(tmp_path / "other", [recording_transitions(4)])
     drawn = {"source": "logs", "stratum": "a", "episode": f"{1:016x}/0", "drawn_rows": 1}
     rows = [drawn, drawn | {"source": "fresh", "episode": "7"}]
@@ -375,8 +372,7 @@ def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp
         (other, [panels["time"]], panels["time"]),  # made from another store
         (other, [run], run),
     ):
-        assert cli.main(["audit", str(place), *map(str, words)]) == 2
-        assert str(named) in "".join(capsys.readouterr().err.split())
+        assert str(named) in "".join(shell.err("audit", place, *words).split())
     moved = shutil.copytree(store_path, tmp_path / "moved")
     with open_place(moved, beside={"panel": panels["time"], "run": run}):
         pass

@@ -21,8 +21,7 @@ from support.cameras import (
 )
 from support.neighbours import read_with
 
-from restock import cli
-from restock.errors import ExitCode, QueryError, StoreError
+from restock.errors import QueryError, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.store.writer import StoreWriter
 from restock.replay import Store, camera_frames, export_dataset
@@ -197,28 +196,26 @@ def test_frames_of_two_sizes_are_refused(tmp_path):
         export_dataset(store, "lerobot", tmp_path / "a")
 
 
-def test_the_command_line_names_cameras(store_path, tmp_path, capsys):
+def test_the_command_line_names_cameras(store_path, tmp_path, shell):
     export = ["export", str(store_path), "--out", str(tmp_path / "a"), "--to"]
-    assert cli.main([*export, "lerobot", "--cameras", "front"]) == ExitCode.OK
-    assert "observation.images.front: 29 pictures as they were recorded" in capsys.readouterr().out
+    assert "observation.images.front: 29 pictures as they were recorded" in shell.out(
+        *export, "lerobot", "--cameras", "front"
+    )
     pytest.importorskip("minari")
-    assert cli.main([*export, "minari", "--cameras", "front"]) == ExitCode.USAGE
-    assert "holds no images" in capsys.readouterr().err
+    assert "holds no images" in shell.err(*export, "minari", "--cameras", "front")
 
 
-def test_a_trace_names_the_frames_of_its_row(store_path, tmp_path, capsys):
+def test_a_trace_names_the_frames_of_its_row(store_path, shell):
     with Store(store_path) as store:
         (front, *_) = camera_frames(store, "FROM transitions WHERE step_index = 2", "front")
     argv = ["trace", str(store_path), str(front.transition_id)]
-    assert cli.main([*argv, "--json"]) == 0
-    found = {one["camera"]: one for one in json.loads(capsys.readouterr().out)["frames"]}
+    found = {one["camera"]: one for one in shell.json(*argv)["frames"]}
     assert list(found) == ["front", "rear"]
     assert found["front"]["frame_index"] == front.frame_index
     assert found["front"]["age_s"] == pytest.approx(front.age_s)
     assert found["front"]["sha256"] == front.sha256
     held = pq.read_table(found["rear"]["file"]).to_pylist()
     assert found["rear"]["sha256"] in {one["sha256"] for one in held if one["camera"] == "rear"}
-    assert cli.main(argv) == 0
-    out = capsys.readouterr().out
+    out = shell.out(*argv)
     assert "the frames of its cameras" in out
     assert "48 x 32 jpeg" in out

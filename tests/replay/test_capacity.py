@@ -1,13 +1,11 @@
 """Capacity by task diversity: against a naive count over the newest rows."""
 
-import json
 from collections import Counter
 
 import pyarrow as pa
 import pytest
 from support.stores import recording_transitions, write_store
 
-from restock import cli
 from restock.errors import ConfigError
 from restock.ingest.store.transitions import replaced
 from restock.replay.store.audit import recommend_capacity
@@ -60,14 +58,13 @@ def test_the_rows_must_be_worth_so_many_episodes_too(store_path, transitions):
     assert "all of them are worth less than 1e+06" in too_many.reason
 
 
-def test_whether_coverage_is_saturated_is_said(tmp_path, capsys):
+def test_whether_coverage_is_saturated_is_said(tmp_path, shell):
     growing = write_store(tmp_path / "growing", [recording_transitions(1)])
     with Store(growing) as store:
         found = recommend_capacity(store.connection)
     assert found.half_share == found.curve[-2]["cells_share"] < 0.95
     assert not found.saturated
-    assert cli.main(["audit", str(growing), "--capacity"]) == 0
-    assert "more recordings will add more" in capsys.readouterr().out
+    assert "more recordings will add more" in shell.out("audit", growing, "--capacity")
     rows = recording_transitions(1)
     alike = {"condition": "nominal", "zone": "cross", "action": 1}
     rows = replaced(rows, {name: [value] * len(rows) for name, value in alike.items()})
@@ -75,13 +72,11 @@ def test_whether_coverage_is_saturated_is_said(tmp_path, capsys):
         assert recommend_capacity(store.connection).saturated
 
 
-def test_the_verb_recommends(store_path, capsys):
-    assert cli.main(["audit", str(store_path), "--capacity", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)["capacity"]
+def test_the_verb_recommends(store_path, shell):
+    document = shell.json("audit", store_path, "--capacity")["capacity"]
     assert document["curve"][-1]["capacity"] == document["rows"]
     assert document["curve"][-1]["cells_share"] == 1.0
-    assert cli.main(["audit", str(store_path), "--capacity"]) == 0
-    assert f"{document['recommended']:,} rows: " in capsys.readouterr().out
+    assert f"{document['recommended']:,} rows: " in shell.out("audit", store_path, "--capacity")
 
 
 @pytest.mark.parametrize(("share", "episodes"), [(2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)])

@@ -20,10 +20,9 @@ import pyarrow.parquet as pq
 import pytest
 from ruamel.yaml import YAML
 from support.neighbours import read_with
-from support.panels import panel_of
+from support.panels import EVERY, NO_SPLIT, panel_of
 from support.stores import TASK, recording_transitions, write_store
 
-from restock import cli
 from restock.errors import ConfigError, ExitCode, PanelError, QueryError, StoreError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.store.transitions import replaced
@@ -57,11 +56,7 @@ def matrix(column: pa.ChunkedArray) -> np.ndarray:
 
 
 def n_step_panel(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
-    mixture = (
-        f'n_step = {n_step}\n{where}[each_condition]\nshare = "natural"\n'
-        '[evaluation_split]\nby = "none"\n'
-    )
-    return panel_of(store, mixture, out)
+    return panel_of(store, f"n_step = {n_step}\n{where}{EVERY}{NO_SPLIT}", out)
 
 
 def test_whose_drive_it_was_goes_along(tmp_path):
@@ -453,20 +448,15 @@ def test_a_panel_has_no_commands_but_its_store_has(store_path, tmp_path):
     assert document["provenance"]["panel"] == panel.id
 
 
-def test_the_verb_says_what_it_wrote(store_path, tmp_path, capsys):
+def test_the_verb_says_what_it_wrote(store_path, tmp_path, shell):
     out = tmp_path / "a.parquet"
-    assert (
-        cli.main(["export", str(store_path), "--to", "parquet", "--out", str(out), "--json"]) == 0
-    )
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json("export", store_path, "--to", "parquet", "--out", out)
     assert document["transitions"] == document["rows"] == pq.read_metadata(out).num_rows
     arguments = ["export", str(store_path), "--to", "parquet", "--out", str(tmp_path / "b.parquet")]
-    assert cli.main([*arguments, "--query", SLIP]) == 0
-    assert "cut where rows are missing" in capsys.readouterr().out
-    assert cli.main(arguments) == ExitCode.USAGE
-    captured = capsys.readouterr()
-    assert "already there" in captured.err
-    assert captured.out == ""
+    assert "cut where rows are missing" in shell.out(*arguments, "--query", SLIP)
+    out, err = shell.printed(*arguments, code=ExitCode.USAGE)
+    assert "already there" in err
+    assert out == ""
 
 
 @pytest.mark.parametrize("to", ["lerobot", "minari"])

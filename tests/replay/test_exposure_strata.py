@@ -9,7 +9,6 @@ import pytest
 from support.panels import planned
 from support.stores import CONDITIONS, recording_transitions, write_store
 
-from restock.cli import main
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import parse_mixture
@@ -128,7 +127,7 @@ def audited(store: Path) -> tuple[str, list[dict[str, object]]]:
     return finding.status, finding.sample
 
 
-def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, capsys):
+def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, shell):
     store = write_store(tmp_path / "store", [planted(lambda number: NEAR[number])])
     status, sample = audited(store)
     assert status == "warn"
@@ -144,9 +143,7 @@ def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, capsys):
             "left_out_success_share": 1.0,
         }
     ]
-    capsys.readouterr()
-    assert main(["audit", str(store), "--strict"]) == 1
-    assert 'kind = "exposure"' in capsys.readouterr().out
+    assert 'kind = "exposure"' in shell.out("audit", store, "--strict", code=1)
 
 
 @pytest.mark.parametrize(

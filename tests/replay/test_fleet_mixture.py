@@ -97,7 +97,7 @@ def test_only_episodes_that_the_mixture_admits_are_held_out(fleet, by):
         assert plan.evaluation_split.sum() == pytest.approx(0.1 * (robots == "a").sum(), rel=0.5)
 
 
-def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
+def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(tmp_path):
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     store = write_store(tmp_path / "store", tables, tags=[{}, {"robot": "a"}, {"robot": "b"}])
     text = "[evaluation_split]\nby = 'robot'\n" + EVERY

@@ -1,6 +1,5 @@
 """`restock coverage gaps`: what is missing, what fills it, and how sure that is."""
 
-import json
 import re
 from pathlib import Path
 
@@ -83,12 +82,7 @@ def test_audits_and_cells_ask_too(store):
     }
     with Store(store) as opened:
         yields, gaps = find_gaps(
-            opened,
-            mixture,
-            name="mine",
-            kinds=KINDS,
-            thresholds=limits,
-            min_rows=1,
+            opened, mixture, name="mine", kinds=KINDS, thresholds=limits, min_rows=1
         )
         rare = dict(
             opened.sql(
@@ -138,7 +132,7 @@ def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path):
     assert by == {"mixture mine"}  # its stratum is empty
 
 
-def test_a_gap_names_its_action(tmp_path, capsys):
+def test_a_gap_names_its_action(tmp_path, shell):
     rows = recording_transitions(1)
     turned = [
         "wheel_slip" in held and action == 3
@@ -147,8 +141,7 @@ def test_a_gap_names_its_action(tmp_path, capsys):
         )
     ]
     path = write_store(tmp_path / "store", [rows.filter(pa.array([not one for one in turned]))])
-    assert main(["coverage", "gaps", str(path), "--json"]) == 0
-    gaps = json.loads(capsys.readouterr().out)["gaps"]
+    gaps = shell.json("coverage", "gaps", path)["gaps"]
     cells = [one for one in gaps if one["asked_by"] == "audit missing_cells"]
     (gap,) = [one for one in cells if (one["condition"], one["action"]) == ("wheel_slip", 3)]
     assert (gap["action_name"], gap["cell"]) == ("turn left 1.2", "wheel_slip, turn left 1.2")
@@ -184,15 +177,13 @@ EQUAL = "[each_condition]\nshare = 'equal'\n"
         "each_condition = { unit = 'episode', share = 'equal' }\n",
     ],
 )
-def test_mix_and_gaps_say_the_same_rows(text, tmp_path, capsys):
+def test_mix_and_gaps_say_the_same_rows(text, tmp_path, shell):
     store = str(write_store(tmp_path / "store", [recording_transitions(n) for n in (1, 2, 3)]))
     (tmp_path / "mine.toml").write_text(f"max_replays_per_row = 40\nshortfall = 'shrink'\n{text}")
     chosen = (store, "--mixture", str(tmp_path / "mine.toml"))
     in_gaps = ["coverage", "gaps", *chosen, "--unit", "hours", "--thresholds", "none"]
-    assert main(["mix", *chosen, "--dry-run", "--json"]) == 0
-    mixed = json.loads(capsys.readouterr().out)["strata"]
-    assert main([*in_gaps, "--json"]) == 0
-    gaps = {gap["stratum"]: gap for gap in json.loads(capsys.readouterr().out)["gaps"]}
+    mixed = shell.json("mix", *chosen, "--dry-run")["strata"]
+    gaps = {gap["stratum"]: gap for gap in shell.json(*in_gaps)["gaps"]}
     short = [line for line in mixed if line["missing_rows"]]
     assert short
     assert {line["stratum"] for line in short} == set(gaps)
@@ -272,12 +263,11 @@ def test_a_rare_find_leaves_much_open_and_silence_a_bound():
     assert probability_to_close([(np.zeros(50), 30)], 30, rng=rng) == 0
 
 
-def test_the_list_is_a_file_that_reads_back(store, tmp_path, capsys):
+def test_the_list_is_a_file_that_reads_back(store, tmp_path, shell):
     (tmp_path / "mine.toml").write_text(ASKING)
-    args = ["coverage", "gaps", str(store), "--mixture", str(tmp_path / "mine.toml"), "--json"]
+    args = ["coverage", "gaps", store, "--mixture", tmp_path / "mine.toml"]
     out = tmp_path / "next.toml"
-    assert main([*args, "--missions-out", str(out)]) == 0
-    plan = json.loads(capsys.readouterr().out)["plan"]
+    plan = shell.json(*args, "--missions-out", out)["plan"]
     read = read_missions(out)
     assert [order.missions for order in read.missions] == [o["missions"] for o in plan["orders"]]
     assert read.store.endswith("store@2")
@@ -286,8 +276,7 @@ def test_the_list_is_a_file_that_reads_back(store, tmp_path, capsys):
         ([*args, "--missions-out", str(out)], "already there"),
         ([*none, "--missions-out", str(tmp_path / "none.toml")], "there are no gaps"),
     ):
-        assert main(words) == 2
-        assert problem in capsys.readouterr().err
+        assert problem in shell.err(*words)
     assert not (tmp_path / "none.toml").exists()
 
 

@@ -9,7 +9,6 @@ import pytest
 from support.panels import EVERY, planned
 from support.paths import ROOT
 
-from restock import cli
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import (
@@ -191,21 +190,6 @@ def test_part_of_a_draw_is_planned_for_no_row(transitions):
     )
 
 
-def test_priority_decides_overlap(transitions):
-    def count(priority: int) -> int:
-        plan = planned(
-            transitions,
-            "unlisted = 'drop'\n[evaluation_split]\nby = 'none'\n[[strata]]\nname = 'fast'\n"
-            f"where = 'command_speed_mps > 0'\npriority = {priority}\n" + EVERY,
-        )
-        return next(line.rows for line in plan.strata if line.name == "fast")
-
-    fast = np.sum(transitions["command_speed_mps"].to_numpy() > 0)
-    assert count(1) == fast
-    assert count(2000) == 0
-    assert 0 < count(500) < fast  # before nominal, after every condition
-
-
 def test_strata_take_their_timing_from_conditions():
     conditions = [Condition("slip", "post", "x", 30), Condition("blocked", "pre", "x", 40)]
     mixture = parse_mixture("[correction]\npost = 'clipped'\n" + EVERY)
@@ -264,37 +248,31 @@ def test_the_plan_counts_replays(transitions):
     assert plan.effective_rows == pytest.approx(len(plan.panel_rows), rel=1e-3)
 
 
-def test_the_verb_explains_then_packs_and_never_overwrites(store_path, tmp_path, capsys):
+def test_the_verb_explains_then_packs_and_never_overwrites(store_path, tmp_path, shell):
     out = tmp_path / "panel"
-    assert cli.main(["mix", str(store_path), "--out", str(out), "--dry-run"]) == 0
-    text = capsys.readouterr().out
+    text = shell.out("mix", store_path, "--out", out, "--dry-run")
     assert "near_collision" in text
     assert "nothing was written" in text
     assert not out.exists()
-    assert cli.main(["mix", str(store_path), "--out", str(out), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json("mix", store_path, "--out", out)
     assert sum(line["share"] for line in document["strata"]) == pytest.approx(1)
     assert document["store_version"] == 2
     before = (out / "panel.json").read_bytes()
     assert json.loads(before)["id"] == document["id"]
-    assert cli.main(["mix", str(store_path), "--out", str(out)]) == 2
-    assert "already there" in capsys.readouterr().err
+    assert "already there" in shell.err("mix", store_path, "--out", out)
     assert (out / "panel.json").read_bytes() == before
-    assert cli.main(["mix", str(store_path)]) == 2
-    assert "no --out" in capsys.readouterr().err
+    assert "no --out" in shell.err("mix", store_path)
 
 
-def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, capsys):
-    assert cli.main(["mix", str(store_path), "--dry-run"]) == 0
-    text = capsys.readouterr().out
+def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, shell):
+    text = shell.out("mix", store_path, "--dry-run")
     assert "these numbers are for 2,560,000 draws of logged rows" in text
     assert "no row is drawn more than 400 times (max_replays_per_row)" in text
     # Few rows: at the default training budget they bear less.
     assert "warning: at the default training budget (51,500 updates of 128 rows)" in text
     (tmp_path / "m.toml").write_text("planned_draws = 12_800\n[sources]\nlogs = 1\n" + EVERY)
     requested = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
-    assert cli.main(requested) == 0
-    text = capsys.readouterr().out
+    text = shell.out(*requested)
     assert "these numbers are for 12,800 draws of logged rows" in text
     assert "max_replays_per_row" not in text
 

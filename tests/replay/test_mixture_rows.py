@@ -1,6 +1,5 @@
 """Which rows a mixture takes, by safety, version, caps, labels and store; and its schema."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from support.panels import EVERY, NO_SPLIT, by_priority, moment, panel_of, planned
 from support.stores import CONDITIONS, recording_transitions, write_store
 
-from restock import cli
 from restock.errors import MixtureError, StoreError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.mixture.share_controller import PlannedDraws
@@ -142,22 +140,20 @@ def two_stores(tmp_path, store_path) -> Path:
     return tmp_path
 
 
-def test_a_store_whose_rows_are_all_in_the_first_one_is_named(tmp_path, store_path, capsys):
+def test_a_store_whose_rows_are_all_in_the_first_one_is_named(tmp_path, store_path, shell):
     rows = recording_transitions(3)
     write_store(tmp_path / "other", [rows])
     mixture = tmp_path / "m.toml"
     mixture.write_text(OTHERS.replace("@1", "") + EVERY)
-    assert cli.main(["mix", str(store_path), "--mixture", str(mixture), "--dry-run"]) == 2
-    said = capsys.readouterr().err
+    said = shell.err("mix", store_path, "--mixture", mixture, "--dry-run")
     assert f"all {len(rows)} rows of 'twin' are also in the main store" in said
     assert "leave this store out of the mixture" in said
 
 
-def test_another_store_is_drawn_from_at_its_pinned_version(two_stores, store_path, capsys):
+def test_another_store_is_drawn_from_at_its_pinned_version(two_stores, store_path, shell):
     out = two_stores / "panel"
-    arguments = ["mix", str(store_path), "--mixture", str(two_stores / "m.toml"), "--json"]
-    assert cli.main([*arguments, "--out", str(out)]) == 0
-    document = json.loads(capsys.readouterr().out)
+    words = ("mix", store_path, "--mixture", two_stores / "m.toml", "--out", out)
+    document = shell.json(*words)
     (other,) = document["other_stores"]
     assert (other["name"], other["version"]) == ("twin", 1)
     repeated = len(recording_transitions(3))

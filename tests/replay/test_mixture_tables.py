@@ -1,6 +1,5 @@
 """`mixture(name)` and `mixture_rows(name)`: a plan in SQL, and `restock mix` packs just that."""
 
-import json
 from pathlib import Path
 
 import pyarrow as pa
@@ -9,7 +8,6 @@ from support.long import one_in
 from support.panels import EVERY, NO_SPLIT
 from support.stores import recording_transitions, write_store
 
-from restock import cli
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.mixture_tables import ROWS, STRATA
@@ -88,19 +86,17 @@ def test_a_file_that_changed_is_planned_again(folder, tmp_path):
         assert store.sql(query).fetchall() != first
 
 
-def test_the_verb_answers_of_a_version_and_joins(folder, capsys):
+def test_the_verb_answers_of_a_version_and_joins(folder, shell):
     store = str(folder / "store")
     query = (
         "SELECT stratum, any_value(m.rows) AS rows, count(*) AS packed"
         " FROM mixture('uniform') AS m JOIN mixture_rows('uniform') USING (stratum)"
         " JOIN transitions USING (transition_id) GROUP BY ALL"
     )
-    assert cli.main(["sql", store, query, "--json"]) == 0
-    newest = json.loads(capsys.readouterr().out)
+    newest = shell.json("sql", store, query)
     assert newest
     assert all(row["rows"] == row["packed"] for row in newest)
-    assert cli.main(["sql", f"{store}@0", query, "--json"]) == 0
-    older = json.loads(capsys.readouterr().out)
+    older = shell.json("sql", f"{store}@0", query)
     assert sum(row["rows"] for row in older) < sum(row["rows"] for row in newest)
 
 
@@ -113,14 +109,13 @@ def test_the_verb_answers_of_a_version_and_joins(folder, capsys):
         ("{folder}/refused.toml", "of the gradient after weights"),
     ],
 )
-def test_what_cannot_be_mixed_is_refused_as_by_mix(folder, name, message, capsys):
+def test_what_cannot_be_mixed_is_refused_as_by_mix(folder, name, message, shell):
     (folder / "wrong.toml").write_text("seeed = 1\n" + EVERY)
     (folder / "refused.toml").write_text(
         "[correction]\npost = 'full'\n[each_condition]\nshare = 'equal'\n"
     )
     name = name.format(folder=folder)
     for macro in ("mixture", "mixture_rows"):
-        assert cli.main(["sql", str(folder / "store"), f"FROM {macro}('{name}')"]) == 2
-        said = capsys.readouterr().err
+        said = shell.err("sql", folder / "store", f"FROM {macro}('{name}')")
         assert message in said
         assert "UDF" not in said

@@ -1,6 +1,5 @@
 """Recordings whose action is the measured motion: said at ingest, audited, in no panel unasked."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -37,51 +36,40 @@ def profiles(tmp_path_factory) -> tuple[Path, Path, Path]:
     return folder, reported, seen
 
 
-def ingested(folder: Path, recording: str, profile: Path, store: Path, capsys) -> dict:
+def ingested(folder: Path, recording: str, profile: Path, store: Path, shell) -> dict:
     arguments = ["ingest", str(folder / recording), "--profile", str(profile), "--store"]
-    assert main([*arguments, str(store), "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    (row,) = shell.json(*arguments, store)["recordings"]
     return row
 
 
-def mixed(folder: Path, store: Path, capsys, more: str = "") -> tuple[int, str, str]:
-    mixture = folder / "mix.toml"
-    mixture.write_text(MIXTURE.format(more=more))
-    code = main(["mix", str(store), "--mixture", str(mixture), "--dry-run", "--json"])
-    return code, *capsys.readouterr()
+def mixture(folder: Path, more: str = "") -> tuple[str, Path]:
+    (folder / "mix.toml").write_text(MIXTURE.format(more=more))
+    return "--mixture", folder / "mix.toml"
 
 
-def test_panels_leave_measured_actions_out_and_count_them(profiles, tmp_path, capsys):
+def test_panels_leave_measured_actions_out_and_count_them(profiles, tmp_path, shell):
     folder, reported, seen = profiles
-    store = tmp_path / "store"
-    capsys.readouterr()
-    first = ingested(folder, "commanded", reported, store, capsys)
+    store, panel = tmp_path / "store", tmp_path / "panel"
+    first = ingested(folder, "commanded", reported, store, shell)
     assert {"input": "command", "instead": INSTEAD} not in first["stand_ins"]
-    second = ingested(folder, "measured", seen, store, capsys)
+    second = ingested(folder, "measured", seen, store, shell)
     assert {"input": "command", "instead": INSTEAD} in second["stand_ins"]
-    code, out, _ = mixed(tmp_path, store, capsys)
-    assert code == 0
-    assert f'"odometry in place of a command": {second["transitions"]}' in out
-    mixture, panel = str(tmp_path / "mix.toml"), tmp_path / "panel"
-    assert main(["mix", str(store), "--mixture", mixture, "--out", str(panel)]) == 0
-    assert f"{first['transitions']:,} rows of store" in capsys.readouterr().out
-    code, out, _ = mixed(tmp_path, store, capsys, "odometry_as_command = true")
-    assert code == 0
-    assert "odometry in place" not in out
-    main(["audit", str(store), "--json"])
-    audits = json.loads(capsys.readouterr().out)["audits"]
+    words = ("mix", store, *mixture(tmp_path))
+    left_out = {"odometry in place of a command": second["transitions"]}
+    assert shell.json(*words, "--dry-run")["left_out"] == left_out
+    assert f"{first['transitions']:,} rows of store" in shell.out(*words, "--out", panel)
+    mixture(tmp_path, "odometry_as_command = true")
+    assert shell.json(*words, "--dry-run")["left_out"] == {}
+    audits = shell.json("audit", store, code=1)["audits"]
     (found,) = [each for each in audits if each["audit"] == "odometry_as_command"]
     assert [row["source_file"] for row in found["sample"]] == [str(folder / "measured")]
 
 
-def test_a_store_of_measured_actions_alone_makes_no_panel(profiles, tmp_path, capsys):
+def test_a_store_of_measured_actions_alone_makes_no_panel(profiles, tmp_path, shell):
     folder, _, seen = profiles
     store = tmp_path / "store"
-    capsys.readouterr()
     recording = ["ingest", str(folder / "measured"), "--profile", str(seen)]
-    assert main([*recording, "--store", str(store)]) == 0
-    assert f"no command: {INSTEAD}" in capsys.readouterr().out
-    code, _, err = mixed(tmp_path, store, capsys)
-    assert code == 2
+    assert f"no command: {INSTEAD}" in shell.out(*recording, "--store", store)
+    err = shell.err("mix", store, *mixture(tmp_path), "--dry-run")
     assert "the action of every transition is odometry" in err
     assert "odometry_as_command = true" in err

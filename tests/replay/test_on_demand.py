@@ -4,7 +4,6 @@ import re
 
 import pytest
 from support.long import one_in
-from support.stores import recording_transitions, write_store
 
 from restock.errors import QueryError
 from restock.replay.store.definitions import MACROS, VIEWS, definitions, install_named
@@ -20,62 +19,57 @@ def made(store: Store) -> set[str]:
 
 
 @pytest.mark.parametrize("every", one_in(2, [8, 1]))
-def test_every_view_and_macro_can_be_named_alone(tmp_path, every):
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
+def test_every_view_and_macro_can_be_named_alone(store_path, every):
     text = definitions(names=[*VIEWS, *MACROS])
     views = re.findall(r"CREATE OR REPLACE VIEW (\w+)", text)
     assert {"events", "coverage_by_week", "drift", "signal_weeks"} <= set(views)
     for view in views[::every]:
-        with Store(path) as store:
+        with Store(store_path) as store:
             store.sql(f'FROM "{view.upper()}" LIMIT 1').fetchall()
     for macro in re.findall(r"CREATE OR REPLACE MACRO (\w+)", text)[::every]:
-        with Store(path) as store:
+        with Store(store_path) as store:
             install_named(store.bare, macro)  # bound when it is made
-    with Store(path) as store:
+    with Store(store_path) as store:
         store.sql("FROM drift_by('month')").fetchall()
 
 
-def test_a_query_has_made_what_it_names_and_no_more(tmp_path):
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
-    with Store(path) as store:
+def test_a_query_has_made_what_it_names_and_no_more(store_path):
+    with Store(store_path) as store:
         assert not made(store) & {"transitions", "recordings", "coverage"}
         store.sql("SELECT count(*) FROM Transitions").fetchall()
         assert "transitions" in made(store)
         assert not made(store) & {"coverage", "coverage_by_condition", "held_conditions"}
         store.sql("FROM missing_cells").fetchall()
         assert {"held_conditions", "conditions", "actions"} <= made(store)
-    with Store(path) as store:
+    with Store(store_path) as store:
         common = {"transitions", "episodes", "coverage", "label_scores", "corrections"}
         assert common <= {name for (name,) in store.connection.execute(_LISTED).fetchall()}
 
 
-def test_a_computed_name_is_found_and_a_misspelt_one_corrected(tmp_path):
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
-    with Store(path) as store:
+def test_a_computed_name_is_found_and_a_misspelt_one_corrected(store_path):
+    with Store(store_path) as store:
         rows = store.sql("FROM query_table('cover' || 'age')").fetchall()
         assert rows == store.sql("FROM coverage").fetchall()
-    with Store(path) as store, pytest.raises(QueryError, match='mean "reward_mix"'):
+    with Store(store_path) as store, pytest.raises(QueryError, match='mean "reward_mix"'):
         store.sql("FROM rewardmix")
 
 
-def test_what_a_query_makes_itself_is_left_as_it_is(tmp_path):
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
-    with Store(path) as store:
+def test_what_a_query_makes_itself_is_left_as_it_is(store_path):
+    with Store(store_path) as store:
         store.sql("CREATE OR REPLACE VIEW drops AS SELECT 'mine' AS reason; FROM drops")
         assert store.sql("SELECT reason FROM drops").fetchall() == [("mine",)]
         assert query(store.connection, "FROM drops", where="").fetchall() == [("mine",)]
 
 
 @pytest.mark.long
-def test_lists_of_views_have_all_of_them(tmp_path):
-    path = write_store(tmp_path / "store", [recording_transitions(1)])
+def test_lists_of_views_have_all_of_them(store_path):
     for text in (
         "SELECT DISTINCT view FROM columns",
         "SELECT table_name FROM information_schema.tables",
         "SELECT name FROM (SHOW ALL TABLES)",
     ):
-        with Store(path) as store:
+        with Store(store_path) as store:
             names = {name for (name,) in store.sql(text).fetchall()}
         assert {"transitions", "events", "drift", "columns"} <= names, text
-    with Store(path) as store, pytest.raises(QueryError, match="no_such_view"):
+    with Store(store_path) as store, pytest.raises(QueryError, match="no_such_view"):
         store.sql("FROM no_such_view")

@@ -47,34 +47,6 @@ def test_a_sampler_draws_by_it(recent_panel):
             assert stamps[of_stratum].min() >= newest.min()
 
 
-def test_stable_baselines3_draws_by_it(recent_panel, tmp_path):
-    pytest.importorskip("stable_baselines3")
-    from support.library_buffers import sb3_envs
-
-    from restock.train import MixtureReplayBuffer
-
-    env = sb3_envs(1)
-    spaces = env.observation_space, env.action_space
-    given = {"panel": recent_panel.path, "run": tmp_path / "run", "logs_share": 1.0}
-    buffer = MixtureReplayBuffer(100, *spaces, device="cpu", n_envs=1, **given)
-    observations = buffer.sample(32).observations.numpy()
-    newest = {
-        row.tobytes()
-        for stratum in recent_panel.stratum_rows()
-        for row in recent_panel.rows[newest_rows(recent_panel, stratum)]
-    }
-    width = observations.shape[1]
-    known = {np.frombuffer(row, np.float32)[:width].tobytes() for row in newest}
-    assert {row.tobytes() for row in observations} <= known
-    buffer.close()
-    env.close()
-
-
-def newest_rows(panel: Panel, stratum: np.ndarray) -> np.ndarray:
-    newest = np.argsort(panel.meta_column("stamp_ns")[stratum], kind="stable")[::-1]
-    return stratum[newest[: max(len(stratum) // 10, 1)]]
-
-
 def test_a_rule_that_nobody_made_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="the rules are uniform, without_replacement, per"):
         panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")

@@ -15,7 +15,6 @@ import pytest
 from support.panels import panel_of
 from support.stores import CONDITIONS, TASK, manifest, recording_transitions, write_store
 
-from restock import cli
 from restock.errors import PanelError, RestockError, StoreError
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
@@ -290,19 +289,17 @@ def changed(path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
 
-def test_damage_is_found(transitions, tmp_path, capsys):
+def test_damage_is_found(transitions, tmp_path, shell):
     panel = build_panel(transitions, uniform(), tmp_path / "p")
     rows, header = panel.path / ROWS, panel.path / "panel.json"
     assert not rows.stat().st_mode & 0o222
-    assert cli.main(["store", "verify", str(panel.path)]) == 0
-    assert panel.id in capsys.readouterr().err
+    assert panel.id in shell.err("store", "verify", panel.path, code=0)
     good, text = rows.read_bytes(), header.read_bytes()
     between = bytearray(good)
     between[6000] ^= 1  # between two of the blocks that every opening looks at
     changed(rows, bytes(between))
     Panel.open(panel.path)
-    assert cli.main(["store", "verify", str(panel.path)]) == 2
-    assert str(rows) in "".join(capsys.readouterr().err.split())
+    assert str(rows) in "".join(shell.err("store", "verify", panel.path).split())
     for path, content, problem in (
         (rows, good[:-1] + bytes([good[-1] ^ 1]), "checksum"),
         (rows, good[:-4], "bytes, not the"),

@@ -1,6 +1,5 @@
 """The same drive in two recordings is found by content, never trained on and held out at once."""
 
-import json
 from pathlib import Path
 
 import duckdb
@@ -10,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.paths import SHARED
+from support.shell import Shell
 from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
@@ -22,11 +22,9 @@ from restock.train.evaluation.ope_dataset import load_ope_dataset
 NEATO = SHARED / "fleet-neato"
 
 
-def audited(store: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, list[dict[str, object]]]:
+def audited(store: Path, shell: Shell) -> dict[str, list[dict[str, object]]]:
     """Return the first rows of each audit that failed."""
-    capsys.readouterr()
-    assert main(["audit", str(store), "--json"]) == 1
-    findings = json.loads(capsys.readouterr().out)["audits"]
+    findings = shell.json("audit", store, code=1)["audits"]
     return {one["audit"]: one["sample"] for one in findings if one["status"] == "fail"}
 
 
@@ -50,14 +48,14 @@ def copy_of(
 
 @pytest.mark.long
 @pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
-def test_a_drive_that_was_replayed_a_year_later(tmp_path, capsys):
+def test_a_drive_that_was_replayed_a_year_later(tmp_path, shell):
     profile, store = str(tmp_path / "neato.toml"), str(tmp_path / "store")
     (original,) = (NEATO / "2022-original").iterdir()
     assert main(["profile", "new", str(original), "--out", profile]) == 0
     folders = ["2022-original", "2023-replayed", "2024-danpark"]
     paths = [str(NEATO / folder) for folder in folders]
     assert main(["ingest", *paths, "--profile", profile, "--store", store]) in (0, 3)
-    (found,) = audited(Path(store), capsys)["repeated_steps"]
+    (found,) = audited(Path(store), shell)["repeated_steps"]
     names = {Path(str(found[name])).name for name in ("source_file", "same_as_file")}
     assert names == {"macfirst_floor_take_2", "mac_take_2_bag"}
     assert float(str(found["share"])) > 0.95
@@ -100,21 +98,12 @@ def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path):
     panel = panel_of(store, EVERY + "[evaluation_split]\nshare = 0.2", tmp_path / "panel")
     kept = panel.meta
     held = pq.read_table(panel.path / "evaluation_split.parquet")
-    steps = {
-        (number % 2**25, recording)
-        for number, recording in zip(
-            held["transition_id"].to_pylist(), held["recording_id"].to_pylist(), strict=True
-        )
-        if recording != f"{2:016x}"
-    }
-    twins = {f"{1:016x}": f"{5:016x}", f"{5:016x}": f"{1:016x}"}
-    shown = {(number, twins[recording]) for number, recording in steps} - steps
-    trained = {
-        (number % 2**25, recording)
-        for number, recording in zip(
-            kept["transition_id"].to_pylist(), kept["recording_id"].to_pylist(), strict=True
-        )
-    }
+    held_steps, trained = (
+        {divmod(number, 2**25) for number in table["transition_id"].to_pylist()}
+        for table in (held, kept)
+    )
+    twins = {1: 5, 5: 1}
+    shown = {(twins[one], step) for one, step in held_steps if one in twins} - held_steps
     assert shown
     assert not shown & trained
     assert panel.header.left_out["same steps as the evaluation split"] == len(shown)

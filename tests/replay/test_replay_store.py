@@ -3,6 +3,7 @@
 import gc
 import json
 import re
+import threading
 import weakref
 from typing import Any
 
@@ -82,12 +83,11 @@ def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path):
     ("found", "command"),
     [(None, "sql"), ("restock-store/1", "audit"), ("restock-store/99", "store compact")],
 )
-def test_a_store_of_another_format_is_refused(tmp_path, monkeypatch, capsys, found, command):
+def test_a_store_of_another_format_is_refused(tmp_path, monkeypatch, shell, found, command):
     monkeypatch.setattr("support.stores.FORMAT", found)
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     query = ["FROM recordings"] if command == "sql" else []
-    assert main([*command.split(), str(path), *query]) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*command.split(), path, *query)
     assert str(path) in said
     assert "restock ingest RECORDINGS --store NEW" in said
 
@@ -304,16 +304,15 @@ def test_queries_are_read_only(store, tmp_path):
         assert store.sql(text).columns
 
 
-def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path, capsys):
+def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path, shell):
     for text in (
         "CREATE TABLE mine AS SELECT 1",
         "SET threads = 1",
         "SELECT 1; SET VARIABLE x = 2",
     ):
-        assert main(["sql", str(store_path), text]) == 2
-        said = capsys.readouterr()
-        assert not said.out
-        assert "the last statement gives no rows" in said.err
+        out, err = shell.printed("sql", store_path, text, code=2)
+        assert not out
+        assert "the last statement gives no rows" in err
     assert main(["sql", str(store_path), "CREATE MACRO more(x) AS x + 1; SELECT more(1) AS n"]) == 0
 
 
@@ -400,3 +399,25 @@ def test_a_store_is_freed_with_its_threads(tmp_path, closed):
     del store
     gc.collect()
     assert [one_left() for one_left in left] == [None, None]
+
+
+def test_a_store_that_another_thread_reads_from_says_so(store_path):
+    opened, reading, go_on = Store(store_path), threading.Event(), threading.Event()
+
+    def wait(value: int) -> int:
+        reading.set()
+        go_on.wait(60)
+        return value
+
+    opened.connection.create_function("wait_for", wait, ["INTEGER"], "INTEGER")
+    answer = opened.sql("SELECT wait_for(7)")
+    other = threading.Thread(target=lambda: answer.fetchall())
+    other.start()
+    try:
+        assert reading.wait(60)
+        with pytest.raises(QueryError, match="another thread is reading from it"):
+            opened.sql("SELECT avg(reward) FROM transitions")
+    finally:
+        go_on.set()
+        other.join()
+    assert len(opened.sql("SELECT avg(reward) FROM transitions").fetchall()) == 1

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
-from restock import cli
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
@@ -74,9 +73,16 @@ def folder(tmp_path_factory) -> Path:
 
 
 def planned(
-    folder: Path, archive: str = "", main: str = "", rule: str = "none", first: str = "main"
+    folder: Path,
+    archive: str = "",
+    main: str = "",
+    rule: str = "none",
+    first: str = "main",
+    share: str = "0.5",
 ) -> PanelPlan:
-    text = TWO.format(archive=archive, main=main, rule=rule)
+    text = TWO.format(archive=archive, main=main, rule=rule).replace(
+        "share = 0.5", f"share = {share}"
+    )
     if first == "incidents":
         text = text.replace('path = "incidents"', 'path = "main"').replace(
             'name = "incidents"', 'name = "other"'
@@ -132,7 +138,7 @@ def test_archives_are_told_by_their_odds(mine, theirs, refused, warned):
     assert look_for_archives(said | {"incidents": "archive"}, observed, ["all"]) == ()
 
 
-def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, capsys):
+def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, shell):
     """By its conditions or its exposures, whatever the strata are."""
     write_store(tmp_path / "main", [recording(1, 100, 20)])
     write_store(tmp_path / "incidents", [recording(2, 30, 14)])
@@ -147,11 +153,10 @@ def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, capsys):
     (tmp_path / "m.toml").write_text(
         TWO.format(archive="", main="", rule="none").replace('path = "incidents"', 'path = "bags"')
     )
-    requested = ["mix", str(tmp_path / "main"), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
-    assert cli.main([*requested, "--json"]) == 0
-    said = capsys.readouterr()
-    assert "warning: the source 'incidents' may be an archive: 26 of its 30" in said.err
-    assert len(json.loads(said.out)["warnings"]) == 1
+    requested = ("mix", tmp_path / "main", "--mixture", tmp_path / "m.toml", "--dry-run", "--json")
+    out, err = shell.printed(*requested)
+    assert "warning: the source 'incidents' may be an archive: 26 of its 30" in err
+    assert len(json.loads(out)["warnings"]) == 1
 
 
 def test_an_archive_stands_for_the_main_rates_or_given_ones(folder):
@@ -168,10 +173,7 @@ def test_an_archive_stands_for_the_main_rates_or_given_ones(folder):
 
 
 def test_natural_shares_are_the_represented_ones(folder):
-    text = TWO.replace("share = 0.5", 'share = "natural"')
-    mixture = parse_mixture(text.format(archive='represents = "archive"', main="", rule="none"))
-    with Store(folder / "main") as store, open_source(store, mixture, folder=folder) as source:
-        plan = plan_panel(source.connection, mixture, source.conditions, source.others)
+    plan = planned(folder, 'represents = "archive"', share='"natural"')
     lines = {line.name: line for line in plan.strata}
     assert lines["incidents/near_collision"].share == pytest.approx(
         lines["near_collision"].share  # half of the logs' part is of each store

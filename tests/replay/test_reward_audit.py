@@ -1,6 +1,5 @@
 """Whether more success earns more: told of planted drivers, and not told where it cannot be."""
 
-import json
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -107,14 +106,14 @@ def test_a_reward_that_does_not_pay_for_haste_passes(tmp_path):
     assert found == {"reward_order": "pass", "reward_undetermined": "pass"} | pair
 
 
-def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, capsys):
-    place = str(store_of(tmp_path / "store", hasty_and_careful(earlier, 120)))
-    assert cli.main(["audit", place, "--reward", "--discount", "0.97"]) == 1
-    shown = " ".join(capsys.readouterr().out.split())  # a cell may be wrapped
+def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, shell):
+    place = str(store_of(tmp_path / "store", hasty_and_careful(earlier, 60)))
+    shown = " ".join(
+        shell.out("audit", place, "--reward", "--discount", "0.97", code=1).split()
+    )  # a cell may be wrapped
     assert "discounted by 0.97" in shown
     assert all(text in shown for text in ("goal after a bump", "bump_terminates", "1 reversed"))
-    assert cli.main(["audit", place, "--reward", "--discount", "0.97", "--json"]) == 1
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json("audit", place, "--reward", "--discount", "0.97", code=1)
     (pair,) = document["order"]
     assert (pair["driver"], pair["verdict"], document["failed"]) == ("planner 1", "reversed", 1)
     assert pair["more_success"][0] > 0 > pair["more_return"][1]
@@ -139,7 +138,7 @@ def test_returns_are_discounted_from_the_first_step(tmp_path):
 
 
 @pytest.mark.parametrize("drivers", ["few", "one", "handed over"])
-def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, capsys, drivers):
+def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, shell, drivers):
     episodes = hasty_and_careful(earlier, 19 if drivers == "few" else 60)
     if drivers == "one":
         episodes = [("planner", rewards, outcome) for _, rewards, outcome in episodes]
@@ -148,11 +147,10 @@ def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, capsys, drive
         place = store_of(tmp_path / "other", [e for e in episodes if e[0] == "planner"])
     found = audited(place)
     assert (found["reward_order"], found["reward_undetermined"]) == ("pass", "warn")
-    assert cli.main(["audit", str(place), "--reward", "--strict"]) == 1
-    assert "undetermined" in capsys.readouterr().out
+    assert "undetermined" in shell.out("audit", place, "--reward", "--strict", code=1)
 
 
-def test_an_evaluation_is_compared_mission_by_mission(tmp_path, capsys):
+def test_an_evaluation_is_compared_mission_by_mission(tmp_path):
     """Missions differ far more than drivers do: only their pairs tell."""
     run = make_run(tmp_path / "run", document())
     with pytest.raises(RunError, match="no evaluation with discounted returns"):
@@ -228,15 +226,13 @@ def test_returns_of_fewer_than_three_episodes_have_no_interval(paired):
         assert ordered([5.0] * few, list(range(many)), paired=paired)["verdict"] == "undetermined"
 
 
-def test_the_command_shows_a_pair_without_an_interval(tmp_path, capsys):
+def test_the_command_shows_a_pair_without_an_interval(tmp_path, shell):
     episodes: list[Episode] = [("planner", [1.0], "goal"), ("agent", [2.0], "goal")]
     place = str(store_of(tmp_path / "store", [*episodes, ("agent", [3.0], "bump")]))
-    assert cli.main(["audit", place, "--reward"]) == 0
-    shown = capsys.readouterr().out
+    shown = shell.out("audit", place, "--reward")
     assert "undetermined" in shown
     assert "nan" not in shown
-    assert cli.main(["audit", place, "--reward", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["order"][0]["more_return"] == [None, None]
+    assert shell.json("audit", place, "--reward")["order"][0]["more_return"] == [None, None]
 
 
 @pytest.mark.long

@@ -97,22 +97,6 @@ def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make, way):
     assert counts.sum() == 160_000
 
 
-def test_shares_and_batch_size_may_change_between_batches(make, way):
-    """What was drawn ahead goes back: it is owed, and is no turn."""
-    drawing, counts = make(batch_size=16), np.zeros(400)
-    for index in range(300):
-        if index % 7 == 0:
-            share = (index % 5) / 5
-            drawing.sampler.set_shares([1 - share, share])
-            drawing.sampler.set_batch_size(20 + index % 11)
-        drawn, stratum, _ = drawing.draw()
-        assert len(drawn) == drawing.sampler.batch_size
-        if share == 0:
-            assert (stratum == 0).all()
-        np.add.at(counts, drawn, 1)
-        assert all(np.ptp(counts[rows]) <= 1 for rows in in_turns(way))
-
-
 @pytest.mark.parametrize("before", [0, 3, 107])  # on the way, what was drawn ahead is given back
 def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
     def go_on(drawing: Drawing, batches: int, seed: int) -> list[Any]:

@@ -26,11 +26,10 @@ def drive(steps: int) -> pa.Table:
 
 
 @pytest.mark.parametrize("name", shipped_mixtures())
-def test_every_shipped_mixture_packs_one_episode(name, tmp_path, capsys):
+def test_every_shipped_mixture_packs_one_episode(name, tmp_path, capsys, shell):
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
     options = ["--mixture", name, "--out", str(tmp_path / "panel")]
-    assert cli.main(["mix", str(store), *options]) == 0
-    said = capsys.readouterr().out
+    said = shell.out("mix", store, *options)
     assert "held out: the last 10% of the one episode there is, after a gap of 2 s" in said
     panel = Panel.open(tmp_path / "panel", verify=True)
     assert panel.header.split_by == "within_episode"
@@ -42,11 +41,10 @@ def test_every_shipped_mixture_packs_one_episode(name, tmp_path, capsys):
     assert found["leakage"]["status"] == "pass"
 
 
-def test_wanted_is_a_share_of_a_batch_in_the_table(tmp_path, capsys):
+def test_wanted_is_a_share_of_a_batch_in_the_table(tmp_path, shell):
     """Of few rows a stratum may be short, and yet more of the logged rows than was wanted."""
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
-    assert cli.main(["mix", str(store), "--dry-run"]) == 0
-    said = capsys.readouterr().out
+    said = shell.out("mix", store, "--dry-run")
     fill = r"logged rows fill \d\.\d% of a batch, not 50\.0% \(\[sources\]\): there are not enough"
     assert re.search(fill, said)
     (header,) = (line for line in said.splitlines() if "wanted: %" in line)
@@ -59,11 +57,10 @@ def test_wanted_is_a_share_of_a_batch_in_the_table(tmp_path, capsys):
     assert not any("%" in line for line in short)
 
 
-def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path, capsys):
+def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path, shell):
     store = write_store(tmp_path / "store", [drive(20)], task=TASK)
-    options = ["--mixture", "uniform", "--out", str(tmp_path / "panel"), "--json"]
-    assert cli.main(["mix", str(store), *options]) == 0
-    document = json.loads(capsys.readouterr().out)
+    options = ["--mixture", "uniform", "--out", tmp_path / "panel"]
+    document = shell.json("mix", store, *options)
     note = "nothing, as the one episode lasts 3.8 s: too short to split"
     assert document["evaluation_split"] == {"by": "none", "rows": 0, "note": note}
     assert document["rows"] == 20

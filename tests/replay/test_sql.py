@@ -23,12 +23,6 @@ from restock.replay.store.store import Store
 from restock.train.run.run import Run
 
 
-def out_of(capsys: pytest.CaptureFixture[str], *args: str, code: int = 0) -> str:
-    assert cli.main(["sql", *args]) == code
-    captured = capsys.readouterr()
-    return captured.out if code == 0 else captured.err
-
-
 @pytest.fixture
 def run_dir(tmp_path) -> Path:
     """Return a run directory as far as SQL looks at it."""
@@ -43,58 +37,56 @@ def run_dir(tmp_path) -> Path:
     return path
 
 
-def test_json_is_a_list_of_row_objects(store_path, capsys, transitions):
+def test_json_is_a_list_of_row_objects(store_path, shell, transitions):
     query = "SELECT count(*) AS rows, ['a', 'b'] AS list, 0.0/0 AS nothing FROM transitions"
-    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    rows = shell.json("sql", store_path, query)
     assert rows == [{"rows": len(transitions), "list": ["a", "b"], "nothing": None}]
-    assert json.loads(out_of(capsys, str(store_path), query + " WHERE false", "--json")) == [
+    assert shell.json("sql", store_path, query + " WHERE false") == [
         {"rows": 0, "list": ["a", "b"], "nothing": None}
     ]
 
 
-def test_decimals_are_numbers_and_columns_keep_their_values(store_path, capsys):
+def test_decimals_are_numbers_and_columns_keep_their_values(store_path, shell):
     """A script would compare "278.2" as text; and of two columns `a`, both were the second's."""
     query = "SELECT 2782 * 0.1 AS s, 2.50 * 2 AS whole, 1 AS a, 2 AS a_1, 3 AS a, 4 AS a"
-    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    rows = shell.json("sql", store_path, query)
     assert rows == [{"s": 278.2, "whole": 5, "a": 1, "a_1": 2, "a_2": 3, "a_3": 4}]
-    text = out_of(capsys, str(store_path), query, "--csv")
+    text = shell.out("sql", store_path, query, "--csv")
     assert text == "s,whole,a,a_1,a_2,a_3\n278.2,5.00,1,2,3,4\n"
-    lines = out_of(capsys, str(store_path), "SELECT 1 a, 2 a, 1234567.8::DOUBLE b, -6e5::DOUBLE c")
+    lines = shell.out("sql", store_path, "SELECT 1 a, 2 a, 1234567.8::DOUBLE b, -6e5::DOUBLE c")
     assert lines.splitlines()[0].split() == ["a", "a_1", "b", "c"]
     assert lines.splitlines()[2].split() == ["1", "2", "1,234,568", "-600,000"]
 
 
-def test_times_with_a_zone_are_text_in_utc(store_path, capsys):
+def test_times_with_a_zone_are_text_in_utc(store_path, shell):
     query = "SELECT ingested_at, ingested_at AS again FROM recordings LIMIT 1"
-    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    rows = shell.json("sql", store_path, query)
     assert rows == [{"ingested_at": "2026-01-01 00:00:00Z", "again": "2026-01-01 00:00:00Z"}]
 
 
-def test_csv_has_a_header_even_without_rows(store_path, capsys):
-    text = out_of(capsys, str(store_path), "SELECT condition, rows_held FROM ages", "--csv")
+def test_csv_has_a_header_even_without_rows(store_path, shell):
+    text = shell.out("sql", store_path, "SELECT condition, rows_held FROM ages", "--csv")
     found = list(csv.DictReader(io.StringIO(text)))
     assert {row["condition"] for row in found} >= {"nominal", "wheel_slip"}
     query = "SELECT condition, rows_held FROM ages WHERE false"
-    assert out_of(capsys, str(store_path), query, "--csv") == "condition,rows_held\n"
+    assert shell.out("sql", store_path, query, "--csv") == "condition,rows_held\n"
 
 
-def test_a_query_comes_from_stdin(store_path, capsys, monkeypatch):
+def test_a_query_comes_from_stdin(store_path, shell, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("SELECT 1 AS one;\nSELECT 2 AS two"))
-    assert json.loads(out_of(capsys, str(store_path), "-", "--json")) == [{"two": 2}]
+    assert shell.json("sql", store_path, "-") == [{"two": 2}]
 
 
-def test_a_run_is_queried_by_its_tables(run_dir, capsys):
-    assert json.loads(out_of(capsys, str(run_dir), "FROM progress", "--json")) == [
-        {"env_steps": 10, "loss": 0.5}
-    ]
-    assert "dqn" in out_of(capsys, str(run_dir), "FROM eval_episodes")
-    assert "gradient_step" in out_of(capsys, str(run_dir), "FROM columns")
+def test_a_run_is_queried_by_its_tables(run_dir, shell):
+    assert shell.json("sql", run_dir, "FROM progress") == [{"env_steps": 10, "loss": 0.5}]
+    assert "dqn" in shell.out("sql", run_dir, "FROM eval_episodes")
+    assert "gradient_step" in shell.out("sql", run_dir, "FROM columns")
 
 
-def test_a_runs_columns_are_listed_with_their_meanings(tmp_path, capsys):
+def test_a_runs_columns_are_listed_with_their_meanings(tmp_path, shell):
     Run.create(tmp_path / "run", {})
     query = "SELECT * FROM columns WHERE column_name = 'row_hash'"
-    assert json.loads(out_of(capsys, str(tmp_path / "run"), query, "--json")) == [
+    assert shell.json("sql", tmp_path / "run", query) == [
         {
             "view": "audit",
             "column_name": "row_hash",
@@ -103,27 +95,27 @@ def test_a_runs_columns_are_listed_with_their_meanings(tmp_path, capsys):
         }
     ]
     undocumented = "SELECT count(*) AS n FROM columns WHERE meaning IS NULL AND view <> 'columns'"
-    assert json.loads(out_of(capsys, str(tmp_path / "run"), undocumented, "--json")) == [{"n": 0}]
+    assert shell.json("sql", tmp_path / "run", undocumented) == [{"n": 0}]
 
 
-def test_what_was_sampled_joins_what_was_logged(store_path, run_dir, capsys, transitions):
+def test_what_was_sampled_joins_what_was_logged(store_path, run_dir, shell, transitions):
     query = (
         "SELECT transition_id, source_file FROM run.audit JOIN transitions USING (transition_id)"
         " ORDER BY ALL"
     )
-    rows = json.loads(out_of(capsys, str(store_path), str(run_dir), query, "--json"))
+    rows = shell.json("sql", store_path, run_dir, query)
     assert rows == [
         {"transition_id": (1 << 25) + step, "source_file": "logs/1.mcap"} for step in (3, 4)
     ]
 
 
-def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, capsys):
+def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, shell):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
     query = "SELECT sum(rows) AS rows FROM strata"
-    assert json.loads(out_of(capsys, str(panel.path), query, "--json")) == [{"rows": len(panel)}]
+    assert shell.json("sql", panel.path, query) == [{"rows": len(panel)}]
     query = "SELECT count(*) AS rows FROM panel.rows JOIN transitions USING (transition_id)"
     places = str(store_path), str(panel.path)
-    assert json.loads(out_of(capsys, *places, query, "--json")) == [{"rows": len(panel)}]
+    assert shell.json("sql", *places, query) == [{"rows": len(panel)}]
 
 
 @pytest.mark.parametrize(
@@ -134,21 +126,21 @@ def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, capsys):
         ("FROM ages_at('2026-12-01')", "\n    epoch_ns("),  # its tabs were written out
     ],
 )
-def test_wrong_sql_is_one_message_and_exit_2(store_path, capsys, query, message):
-    err = out_of(capsys, str(store_path), query, code=2)
+def test_wrong_sql_is_one_message_and_exit_2(store_path, shell, query, message):
+    err = shell.err("sql", store_path, query)
     assert message in err
     assert "Traceback" not in err
 
 
-def test_a_view_that_a_panel_lacks_is_not_duckdbs_own(tmp_path, store_path, capsys):
+def test_a_view_that_a_panel_lacks_is_not_duckdbs_own(tmp_path, store_path, shell):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
-    err = out_of(capsys, str(panel.path), "FROM transitions", code=2)
+    err = shell.err("sql", panel.path, "FROM transitions")
     assert "does not exist" in err
     assert "pg_" not in err
-    assert 'try "FROM columns"' in out_of(capsys, str(panel.path), "", code=2)
+    assert 'try "FROM columns"' in shell.err("sql", panel.path, "")
 
 
-def test_wrong_places_are_refused(tmp_path, store_path, run_dir, capsys):
+def test_wrong_places_are_refused(tmp_path, store_path, run_dir, shell):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p").path
     for place, words, problem in (
         (tmp_path, [], "it is not a store"),
@@ -159,7 +151,7 @@ def test_wrong_places_are_refused(tmp_path, store_path, run_dir, capsys):
         (store_path, [run_dir, run_dir], "is a second run"),
         (store_path, ["--json", "--csv"], "choose one"),
     ):
-        assert problem in out_of(capsys, str(place), *map(str, words), "SELECT 1", code=2)
+        assert problem in shell.err("sql", place, *words, "SELECT 1")
 
 
 def test_without_a_query_there_is_a_prompt(store_path, capsys, monkeypatch):
@@ -191,7 +183,7 @@ def test_the_prompt_has_help_and_lists_tables(store_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("ending", ["parquet", "csv", "json"])
-def test_rows_are_written_to_a_file_by_its_ending(store_path, tmp_path, capsys, ending):
+def test_rows_are_written_to_a_file_by_its_ending(store_path, tmp_path, shell, ending):
     out = tmp_path / f"rows.{ending}"
     query = "SELECT range::INT AS n, '=' || range AS text, {'a': [range]} AS nested FROM range(2)"
     line = ["sql", str(store_path), query, "--export", str(out)]
@@ -205,14 +197,12 @@ def test_rows_are_written_to_a_file_by_its_ending(store_path, tmp_path, capsys, 
             pq.read_table(out).to_pylist() if ending == "parquet" else json.loads(out.read_text())
         )
         assert rows == [{"n": n, "text": f"={n}", "nested": {"a": [n]}} for n in (0, 1)]
-    assert cli.main(line) == 2
-    assert "already there" in capsys.readouterr().err
-    assert cli.main([*line[:-1], str(tmp_path / "rows.txt")]) == 2
-    assert "name it .parquet, .csv or .json" in capsys.readouterr().err
+    assert "already there" in shell.err(*line)
+    assert "name it .parquet, .csv or .json" in shell.err(*line[:-1], tmp_path / "rows.txt")
 
 
 @pytest.mark.parametrize("name", one_in(2, ["views.sql", "views.duckdb"]))
-def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, capsys, name):
+def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, shell, name):
     out = tmp_path / name
     assert cli.main(["sql", str(store_path), "--export", str(out)]) == 0
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -227,14 +217,12 @@ def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, capsys, name):
             other.execute(out.read_text())
         assert [other.sql(question).fetchall() for question in questions] == expected
         assert not other.sql("FROM columns WHERE contains(view, 'frames')").fetchall()
-    assert cli.main(["sql", str(store_path), "--export", str(out)]) == 2
-    assert cli.main(["sql", str(store_path), "--export", str(tmp_path / "views.db")]) == 2
-    line = ["sql", str(store_path), "FROM coverage", "--export", str(tmp_path / "v.sql")]
-    assert cli.main(line) == 2
-    err = capsys.readouterr().err
-    assert "runs no query" in err
-    assert "already there" in err
-    assert "no export to .db" in err
+    for words, problem in (
+        (["--export", out], "already there"),
+        (["--export", tmp_path / "views.db"], "no export to .db"),
+        (["FROM coverage", "--export", tmp_path / "v.sql"], "runs no query"),
+    ):
+        assert problem in shell.err("sql", store_path, *words)
 
 
 def test_ctrl_c_stops_a_query_at_once(store_path):

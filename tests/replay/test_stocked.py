@@ -1,6 +1,5 @@
 """A mixture that stocks: nothing corrected below its natural share, and what is missing is told."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 from support.panels import EVERY, NO_SPLIT, by_priority, panel_of, planned
 from support.stores import CONDITIONS
 
-from restock import cli
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import StratumRule, parse_mixture
 from restock.replay.mixture.shares import missing_rows, plan_shares
@@ -151,19 +149,17 @@ def test_what_is_missing_counts_the_logging_that_a_mixture_is_of(transitions):
         assert found.tolist() == of_episodes[~np.isnan(of_episodes)].tolist()
 
 
-def test_the_plan_shows_four_shares_and_what_is_missing(store_path, tmp_path, capsys):
+def test_the_plan_shows_four_shares_and_what_is_missing(store_path, tmp_path, shell):
     (tmp_path / "m.toml").write_text(
         "max_replays_per_row = 40\n[each_condition]\nunit = 'episode'\nshare = 'equal'\n"
     )
     arguments = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
-    assert cli.main([*arguments, "--json"]) == 0
-    lines = json.loads(capsys.readouterr().out)["strata"]
+    lines = shell.json(*arguments)["strata"]
     short = [line for line in lines if line["missing_rows"]]
     assert short
     for line in short:
         assert line["note"]
-    assert cli.main(arguments) == 0
-    text = capsys.readouterr().out
+    text = shell.out(*arguments)
     for name in ("natural: %", "wanted: %", "drawn: % of", "% of their"):  # what each is of
         assert name in text
     assert "% wanted" not in text  # one number of a name: the table's

@@ -1,20 +1,22 @@
-"""`restock coverage diff` of stores and versions: what came, went and changed."""
+"""`restock coverage diff` of stores, versions and panels: what came, went and changed."""
 
-import json
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow as pa
 import pytest
 from deltalake import write_deltalake
-from support.stores import manifest, one, recording_transitions, write_store
+from support.panels import EVERY, NO_SPLIT, panel_of
+from support.stores import TASK, manifest, one, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ArgumentError, StoreError
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.version import FORMAT, parse_version, split_version
 from restock.ingest.store.writer import StoreWriter
+from restock.replay.fleet.panel_difference import key_differences
 from restock.replay.fleet.store_difference import diff_stores
 from restock.replay.store.store import Store
 
@@ -81,14 +83,13 @@ def test_rows_that_changed_make_their_episode_another(tmp_path):
     assert found["recordings"][0]["episodes_changed"] == 1
 
 
-def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, capsys):
+def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, shell):
     writer = StoreWriter(tmp_path / "store")
     for number in (1, 2):
         newest = writer.write(*one(number))
     store = f"{tmp_path}/store"
     before = f"{store}@{newest - 1}"
-    assert main(["coverage", "diff", before, store, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = shell.json("coverage", "diff", before, store)
     assert [row["change"] for row in found["recordings"]] == ["in"]
     assert (found["a"]["version"], found["b"]["version"]) == (newest - 1, newest)
     assert main(["coverage", "diff", store, store, "--exit-code"]) == 0
@@ -122,3 +123,52 @@ def test_the_manifest_of_an_empty_store_is_no_task(tmp_path):
     found = differences(empty, full)
     assert found["a"]["rows"] == 0
     assert found["episodes"]["in"] == 12
+
+
+HALF = "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\n" + EVERY + NO_SPLIT
+
+
+def test_rows_shares_and_keys_that_differ(tmp_path, shell):
+    store = write_store(tmp_path / "store", [recording_transitions(1), recording_transitions(2)])
+    panel_of(store, EVERY + NO_SPLIT, tmp_path / "a")
+    panel_of(store, "where = \"zone = 'cross'\"\n" + HALF, tmp_path / "b")
+    found = shell.json("coverage", "diff", tmp_path / "a", tmp_path / "b")
+    zones = [row["zone"] for n in (1, 2) for row in recording_transitions(n).to_pylist()]
+    cross = zones.count("cross")
+    rows = found["rows"]
+    assert (rows["in"], rows["out"], rows["both"]) == (0, len(zones) - cross, cross)
+    keys = {row["key"]: (row["a"], row["b"]) for row in found["mixture"]}
+    assert keys["where"] == (None, "zone = 'cross'")
+    assert keys["strata[wheel_slip].share"] == (None, 0.5)
+    slip = next(row for row in found["strata"] if row["stratum"] == "wheel_slip")
+    assert slip["wanted_share_b"] == 0.5
+    assert slip["share_a"] == pytest.approx(slip["natural_share_a"])
+    assert found["weights"]["rows_changed"] > 0
+    assert "strata[wheel_slip].share" in shell.out(
+        "coverage", "diff", tmp_path / "a", tmp_path / "b"
+    )
+    assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "a"), "--exit-code"]) == 0
+
+
+def test_two_tasks_and_two_kinds_of_places_are_refused(tmp_path, shell):
+    other = msgspec.structs.replace(TASK, actions=TASK.actions[:3])
+    first = write_store(tmp_path / "first", [recording_transitions(1)])
+    second = write_store(tmp_path / "second", [recording_transitions(1, task=other)], task=other)
+    panel_of(first, EVERY, tmp_path / "a")
+    panel_of(second, EVERY, tmp_path / "b")
+    for left, right in ((tmp_path / "a", tmp_path / "b"), (first, second)):
+        message = shell.err("coverage", "diff", left, right)
+        assert TASK.hash in message
+        assert other.hash in message
+    assert "--profile" in message  # of stores: their recordings can be ingested again
+    assert "is a panel" in shell.err("coverage", "diff", tmp_path / "a", first)
+    assert "no such store" in shell.err("coverage", "diff", first, tmp_path / "none")
+
+
+def test_keys_are_compared_below_lists_by_name():
+    a = {"strata": [{"name": "x", "share": 1}], "seed": 1, "same": [1]}
+    b = {"strata": [{"name": "y"}, {"name": "x", "share": 2}], "seed": 1, "same": [1]}
+    assert key_differences(a, b) == [
+        {"key": "strata[x].share", "a": 1, "b": 2},
+        {"key": "strata[y].name", "a": None, "b": "y"},
+    ]

@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.bag_samples import TOPICS, write_bag, write_channels
 from support.panels import panel_of
 from support.paths import SHARED
+from support.shell import Shell
 
 import restock
 from restock import cli
@@ -53,13 +54,7 @@ def read_by_rosbags(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
             yield connection.topic, log_ns, plain(message)
 
 
-def rows_of(capsys: pytest.CaptureFixture[str], path: Path, query: str, code: int = 0) -> Any:
-    capsys.readouterr()
-    assert cli.main(["sql", str(path), query, "--json"]) == code
-    return json.loads(capsys.readouterr().out)
-
-
-def expect_equal(capsys: pytest.CaptureFixture[str], path: Path) -> int:
+def expect_equal(shell: Shell, path: Path) -> int:
     """Compare every row of every topic with rosbags; return how many rows that were."""
     expected: dict[str, list[str]] = {}
     for topic, log_ns, fields in read_by_rosbags(path):
@@ -67,7 +62,7 @@ def expect_equal(capsys: pytest.CaptureFixture[str], path: Path) -> int:
         own = {"log_time_ns": log_ns} | ({} if stamp is None else {"stamp_ns": stamp})
         expected.setdefault(topic, []).append(json.dumps(finite(own | fields), sort_keys=True))
     for topic, rows in expected.items():
-        found = rows_of(capsys, path, f'FROM "{topic}"')
+        found = shell.json("sql", path, f'FROM "{topic}"')
         assert sorted(json.dumps(row, sort_keys=True) for row in found) == sorted(rows), topic
     return sum(map(len, expected.values()))
 
@@ -82,20 +77,20 @@ def finite(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_values_are_those_that_rosbags_reads(storage, tmp_path, capsys):
+def test_values_are_those_that_rosbags_reads(storage, tmp_path, shell):
     bag = write_bag(tmp_path / "bag", storage=storage)
-    assert expect_equal(capsys, bag) == 20 * len(TOPICS)
+    assert expect_equal(shell, bag) == 20 * len(TOPICS)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", BAGS)
-def test_values_of_other_peoples_recordings_are_equal(name, capsys):
+def test_values_of_other_peoples_recordings_are_equal(name, shell):
     if not (SHARED / name).exists():
         pytest.skip("../shared/bags is absent")
-    assert expect_equal(capsys, SHARED / name)
+    assert expect_equal(shell, SHARED / name)
 
 
-def test_only_topics_that_a_query_names_are_decoded(tmp_path, capsys, monkeypatch):
+def test_only_topics_that_a_query_names_are_decoded(tmp_path, shell, monkeypatch):
     bag, decoded = write_bag(tmp_path / "bag"), []
     batches = Recording.batches
 
@@ -105,55 +100,47 @@ def test_only_topics_that_a_query_names_are_decoded(tmp_path, capsys, monkeypatc
 
     monkeypatch.setattr(Recording, "batches", recorded)
     query = 'SELECT count(*) AS n FROM odom ASOF JOIN "/scan" s ON odom.stamp_ns >= s.stamp_ns'
-    assert rows_of(capsys, bag, query) == [{"n": 20}]
+    assert shell.json("sql", bag, query) == [{"n": 20}]
     assert sorted(decoded) == ["/odom", "/scan"]
-    assert len(rows_of(capsys, bag, "FROM topics")) == len(TOPICS)
-    columns = rows_of(capsys, bag, "FROM columns WHERE view = '/plan' ORDER BY ALL")
-    assert columns[-1] == {
-        "view": "/plan",
-        "column_name": "stamp_ns",
-        "type": "BIGINT",
-    }
+    assert len(shell.json("sql", bag, "FROM topics")) == len(TOPICS)
+    columns = shell.json("sql", bag, "FROM columns WHERE view = '/plan' ORDER BY ALL")
+    assert columns[-1] == {"view": "/plan", "column_name": "stamp_ns", "type": "BIGINT"}
     assert "poses[].pose.position.x" in {row["column_name"] for row in columns}
     assert sorted(decoded) == ["/odom", "/scan"]
 
 
-def test_a_missing_topic_is_refused_with_the_nearest_names(tmp_path, capsys):
+def test_a_missing_topic_is_refused_with_the_nearest_names(tmp_path, shell):
     bag = write_bag(tmp_path / "bag")
-    assert cli.main(["sql", str(bag), 'FROM "/odm"']) == 2
-    err = capsys.readouterr().err
+    err = shell.err("sql", bag, 'FROM "/odm"')
     assert '"/odom"' in err
     assert "FROM columns" in err
 
 
-def test_a_folder_is_a_union_that_names_its_files(tmp_path, capsys):
+def test_a_folder_is_a_union_that_names_its_files(tmp_path, shell):
     for name, count in (("a", 3), ("b's", 5)):
         write_bag(tmp_path / name, count=count)
     query = 'SELECT file, count(*) AS n FROM "/odom" GROUP BY ALL ORDER BY n'
     files = [str(tmp_path / "a"), str(tmp_path / "b's")]
-    assert rows_of(capsys, tmp_path, query) == [
+    assert shell.json("sql", tmp_path, query) == [
         {"file": files[0], "n": 3},
         {"file": files[1], "n": 5},
     ]
-    assert rows_of(capsys, f"{tmp_path}/a*", query) == [{"file": files[0], "n": 3}]
+    assert shell.json("sql", f"{tmp_path}/a*", query) == [{"file": files[0], "n": 3}]
     query = "SELECT DISTINCT file FROM topics ORDER BY ALL"
-    assert [row["file"] for row in rows_of(capsys, tmp_path, query)] == files
-    assert cli.main(["sql", str(tmp_path), "FROM stord_odom"]) == 2
-    assert "Did you mean" not in capsys.readouterr().err  # a table of our own
+    assert [row["file"] for row in shell.json("sql", tmp_path, query)] == files
+    assert "Did you mean" not in shell.err("sql", tmp_path, "FROM stord_odom")  # a table of our own
 
 
-def test_what_is_lost_is_said_and_the_rest_answered(tmp_path, capsys):
+def test_what_is_lost_is_said_and_the_rest_answered(tmp_path, shell):
     whole = write_bag(tmp_path / "bag", storage="mcap", count=2000)
     (file,) = whole.glob("*.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     (tmp_path / "empty.mcap").touch()
-    assert cli.main(["sql", str(cut), 'SELECT count(*) FROM "/odom"', "--csv"]) == 3
-    out, err = capsys.readouterr()
+    out, err = shell.printed("sql", cut, 'SELECT count(*) FROM "/odom"', "--csv", code=3)
     assert 0 < int(out.splitlines()[1]) < 2000
     assert err.startswith("lost: the file: cut short")
-    assert cli.main(["sql", str(tmp_path), 'SELECT DISTINCT file FROM "/odom"']) == 3
-    out, err = capsys.readouterr()
+    out, err = shell.printed("sql", tmp_path, 'SELECT DISTINCT file FROM "/odom"', code=3)
     assert len(out.splitlines()) == 4
     assert f"lost: {tmp_path / 'empty.mcap'}: an empty file" in err
     assert cli.main(["sql", str(tmp_path / "empty.mcap"), "FROM topics"]) == 2
@@ -173,34 +160,35 @@ def write_json(path: Path, topics: dict[str, list[Any]]) -> Path:
     return path
 
 
-def test_hostile_names_stay_names(tmp_path, capsys):
+def test_hostile_names_stay_names(tmp_path, shell):
     name = """/a"b'; DROP TABLE x; --é \u202e\x1b[2J"""
     fields = {"x": 1.0, "X": 2.0, "": 3.0, "log_time_ns": 4.0, "in": {"y": "-2", "Y": "=1"}}
     topics = {name: [fields], "/Odom": [{"a": 1.0}], "/odom": [{"a": 2.0}], "columns": [{"a": 3.0}]}
     file = write_json(tmp_path / "hostile.mcap", topics)
-    listed = rows_of(capsys, file, "SELECT topic FROM topics")
+    listed = shell.json("sql", file, "SELECT topic FROM topics")
     shown = next(row["topic"] for row in listed if row["topic"].startswith("/a"))
     assert shown.isprintable()
     query = f'FROM "{shown.replace(chr(34), 2 * chr(34))}"'
-    (row,) = rows_of(capsys, file, query)
+    (row,) = shell.json("sql", file, query)
     assert row["x"] == 1
     assert row["X_1"] == 2
     assert row["log_time_ns"] == 0
     assert row["log_time_ns_1"] == 4
     assert row["in"] == {"y": "-2", "Y_1": "=1"}
-    assert rows_of(capsys, file, 'SELECT a FROM "/Odom"') == [{"a": 1}]
-    assert rows_of(capsys, file, 'SELECT a FROM "/odom_1"') == [{"a": 2}]
-    assert rows_of(capsys, file, 'SELECT a FROM "columns_1"') == [{"a": 3}]
-    assert cli.main(["sql", str(file), f'SELECT "in".* FROM {query[5:]}', "--csv"]) == 0
-    assert capsys.readouterr().out.splitlines() == ["y,Y_1", "-2,'=1"]
+    assert shell.json("sql", file, 'SELECT a FROM "/Odom"') == [{"a": 1}]
+    assert shell.json("sql", file, 'SELECT a FROM "/odom_1"') == [{"a": 2}]
+    assert shell.json("sql", file, 'SELECT a FROM "columns_1"') == [{"a": 3}]
+    assert shell.out("sql", file, f'SELECT "in".* FROM {query[5:]}', "--csv").splitlines() == [
+        "y,Y_1",
+        "-2,'=1",
+    ]
 
 
-def test_a_topic_that_cannot_be_decoded_is_refused(tmp_path, capsys):
+def test_a_topic_that_cannot_be_decoded_is_refused(tmp_path, shell):
     write_channels(
         tmp_path / "a.mcap", ("/own", "cbor", "own_msgs/msg/Own", "ros2msg", b"", [b"x"])
     )
-    assert cli.main(["sql", str(tmp_path / "a.mcap"), 'FROM "/own"']) == 2
-    assert "/own cannot be decoded" in capsys.readouterr().err
+    assert "/own cannot be decoded" in shell.err("sql", tmp_path / "a.mcap", 'FROM "/own"')
 
 
 def test_python_opens_a_recording_a_panel_and_a_store_alike(store_path, tmp_path, capsys):

@@ -11,11 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable, write_deltalake
-from support.panels import panel_of
+from support.panels import EVERY, NO_SPLIT, panel_of
 from support.paths import ROOT
 from support.stores import TASK, manifest, recording_transitions, write_store
 
-from restock import cli
 from restock.errors import PanelError, RunError, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
@@ -29,9 +28,7 @@ from restock.replay.store.store import Store
 from restock.replay.trace.trace import listed_rows, trace_row
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
-MIXTURE = parse_mixture(
-    "n_step = 3\n[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'"
-)
+MIXTURE = parse_mixture("n_step = 3\n" + EVERY + NO_SPLIT)
 
 
 @dataclass
@@ -232,19 +229,15 @@ def replace_recording(store: Path, rows: pa.Table) -> None:
     write_deltalake(table, rows, mode="overwrite", predicate=predicate)
 
 
-def test_the_verb_prints_a_trace_and_its_document(places, capsys):
-    assert cli.main(["trace", str(places.run)]) == 0
-    assert "7/2" in capsys.readouterr().out
+def test_the_verb_prints_a_trace_and_its_document(places, shell):
+    assert "7/2" in shell.out("trace", places.run)
     arguments = ["trace", str(places.run), "7/2", "--recording", str(RECORDING)]
-    assert cli.main(arguments) == 0
-    out = capsys.readouterr().out
+    out = shell.out(*arguments)
     for said in ("as it was sampled", "its recording", "/cmd_vel", "same_bytes_as_sampled"):
         assert said in out
-    assert cli.main([*arguments, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json(*arguments)
     assert document["messages"][0]["topic"] == "/cmd_vel"
     assert document["transition"]["recording_id"] == document["recording"]["recording_id"]
     assert document["notes"] == []
     for words, problem in (([places.run, "9/9"], "was not audited"), ([places.panel], "give ROW")):
-        assert cli.main(["trace", *map(str, words)]) == 2
-        assert problem in capsys.readouterr().err
+        assert problem in shell.err("trace", *words)

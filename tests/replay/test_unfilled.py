@@ -1,6 +1,5 @@
 """Strata that want a share and have nearly no rows: each is named, with what gives it some."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import pytest
 from support.paths import ROOT
 from support.profile_texts import WAREHOUSE
+from support.shell import Shell
 
 from restock.cli import main
 
@@ -38,28 +38,24 @@ def braking(tmp_path_factory) -> Path:
 class Mix:
     """`restock mix --dry-run` of a mixture's text."""
 
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.folder, self.capsys = folder, capsys
+    def __init__(self, folder: Path, shell: Shell) -> None:
+        self.file, self.shell = folder / "mine.toml", shell
+
+    def words(self, store: Path, text: str) -> tuple[object, ...]:
+        self.file.write_text(text)
+        return "mix", store, "--mixture", self.file, "--dry-run"
 
     def __call__(self, store: Path, text: str) -> tuple[dict[str, dict[str, Any]], list[str]]:
-        assert self.run(store, text, "--json") == 0
-        plan = json.loads(self.capsys.readouterr().out)
+        plan = self.shell.json(*self.words(store, text))
         return {line["stratum"]: line for line in plan["strata"]}, plan["warnings"]
 
-    def refused(self, store: Path, text: str) -> str:
-        assert self.run(store, text) == 2
-        return self.capsys.readouterr().err
-
-    def run(self, store: Path, text: str, *options: str) -> int:
-        (self.folder / "mine.toml").write_text(text)
-        self.capsys.readouterr()
-        chosen = ("--mixture", str(self.folder / "mine.toml"), "--dry-run")
-        return main(["mix", str(store), *chosen, *options])
+    def err(self, store: Path, text: str, code: int = 2) -> str:
+        return self.shell.err(*self.words(store, text), code=code)
 
 
 @pytest.fixture
-def mix(tmp_path, capsys) -> Mix:
-    return Mix(tmp_path, capsys)
+def mix(tmp_path: Path, shell: Shell) -> Mix:
+    return Mix(tmp_path, shell)
 
 
 def test_a_condition_of_every_episode_leaves_nominal_none(braking, mix):
@@ -67,10 +63,9 @@ def test_a_condition_of_every_episode_leaves_nominal_none(braking, mix):
     strata, (warning,) = mix(store, NOMINAL + EACH)
     assert strata["nominal"]["rows"] == 0
     assert warning.startswith("nominal has no episode: each met the condition of another stratum")
-    assert mix.run(store, NOMINAL + EACH) == 0
-    assert "warning: nominal has no episode" in mix.capsys.readouterr().err
+    assert "warning: nominal has no episode" in mix.err(store, NOMINAL + EACH, code=0)
     # It does not hide behind a refusal.
-    refused = mix.refused(store, 'shortfall = "refuse"\n' + NOMINAL + EACH)
+    refused = mix.err(store, 'shortfall = "refuse"\n' + NOMINAL + EACH)
     assert "nominal wants 40.0%, and has no episode" in refused
     # The remedies that it gives fill the shelf.
     for remedy in ('unit = "step"', 'unit = "episode"\nmin_steps = 2'):
@@ -103,7 +98,7 @@ def test_a_quota_for_what_the_logs_lack_is_named(braking, mix):
         text.startswith("wet_floor has no row") and text.endswith("or change its `where`")
         for text in mix(store, own + EACH)[1]
     )
-    unknown = mix.refused(store, own.replace("where = \"zone = 'nowhere'\"\n", "") + EACH)
+    unknown = mix.err(store, own.replace("where = \"zone = 'nowhere'\"\n", "") + EACH)
     assert "stratum 'wet_floor' is not a condition or exposure of these rows" in unknown
     assert "name one of nominal, " in unknown
     assert "or give it a `where`; or add it to the profile and run `restock store label`" in unknown
@@ -112,7 +107,7 @@ def test_a_quota_for_what_the_logs_lack_is_named(braking, mix):
 def test_quotas_that_no_shelf_can_fill_are_each_named(store_path, mix):
     names = ("nominal", "recovery", "near_collision", "wheel_slip", "blocked_aisle")
     limit = "shortfall = 'refuse'\nmax_replays_per_row = 3\n[each_condition]\nshare = 'equal'\n"
-    refused = mix.refused(store_path, limit)
+    refused = mix.err(store_path, limit)
     for name in names:
         assert re.search(rf"^  {name} wants 20.0%, its .* rows in \d+ episodes allow 0.\d\d%$",
                          refused, re.MULTILINE)  # fmt: skip
@@ -120,5 +115,5 @@ def test_quotas_that_no_shelf_can_fill_are_each_named(store_path, mix):
     floors = "[[strata]]\nname = 'nominal'\nshare = 0.9\n[each_condition]\nfloor = 0.1\n"
     assert (
         "the floors of recovery, near_collision, wheel_slip, blocked_aisle sum to 0.4"
-        in mix.refused(store_path, floors)
+        in mix.err(store_path, floors)
     )

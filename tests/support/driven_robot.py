@@ -1,6 +1,5 @@
 """A robot that drives straight ahead at .5 m/s, for tests worked out by hand."""
 
-import json
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -316,14 +315,6 @@ def up_to_the_panel(folder: Path) -> tuple[str, str]:
     path = folder / "of_nothing.toml"
     path.write_text('[[strata]]\nname = "none"\nwhere = "no_such_column = 1"\nshare = 1.0\n')
     return "--mixture", str(path)
-
-
-def start(capsys: Any, *argv: str) -> tuple[int, Any]:
-    """Return the exit code of `restock start`, and its document."""
-    from restock.cli import main
-
-    code = main(["start", *argv, "--json"])
-    return code, json.loads(capsys.readouterr().out)
 
 
 def cut_bag(folder: Path) -> Path:
