@@ -80,21 +80,6 @@ def test_weights_are_those_of_the_distribution_drawn_from(beta):
     assert seen == 400
 
 
-def test_weighted_draws_have_the_mean_of_uniform_ones():
-    drawing, value = sampler(per_alpha=1.0, per_beta=1.0), errors(9)
-    for rows in STRATA:
-        drawing.update(rows, value[rows])  # the value itself decides what is drawn
-    total, plain = np.zeros(2), np.zeros(2)
-    for _ in range(4000):
-        drawn, stratum = drawing.draw()
-        total += np.bincount(stratum, drawing.drawn_weights * value[drawn])
-        plain += np.bincount(stratum, value[drawn])
-    count = 4000 * np.array([35, 15])
-    truth = np.array([value[rows].mean() for rows in STRATA])
-    np.testing.assert_allclose(total / count, truth, rtol=0.01)
-    assert (plain / count > 1.5 * truth).all()
-
-
 def test_beta_grows_to_one():
     numbers = Prioritised(per_beta=0.4)
     grown = [numbers.beta_after(part * BETA_BATCHES // 2) for part in (0, 1, 2, 9)]
