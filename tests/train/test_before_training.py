@@ -629,7 +629,7 @@ def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
 
 
-def test_labels_that_goals_in_hindsight_leave_unknown_are_not_wrong(tmp_path: Path) -> None:
+def test_labels_unknown_by_goals_in_hindsight_are_not_wrong(tmp_path: Path) -> None:
     profile = load_profile(hindsight_profile(tmp_path))
     ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
     rule = {"name": "on_the_plan", "sql": "plan_gap_m > 0", "let": {}}
