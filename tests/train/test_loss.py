@@ -1,6 +1,7 @@
 """The loss against hand arithmetic."""
 
 import pytest
+import torch
 from torch import tensor
 
 from restock.train.dqn.algorithm import conservative_penalty, dqn_loss, margin_penalty, td_target
@@ -24,6 +25,15 @@ def test_double_dqn_selects_online_and_evaluates_with_target() -> None:
     assert td_target(reward, discount, slow, online, lower=True).tolist() == [2.0]
     assert td_target(reward, discount, slow, online / 9, lower=True).tolist() == [1.5]
     assert td_target(reward, discount, slow).tolist() == [3.0]  # 1 + 0.5 * 4
+
+
+def test_a_preference_selects_and_is_no_part_of_the_value() -> None:
+    reward, discount = tensor([1.0]), tensor([0.5])
+    slow, online = tensor([[4.0, 2.0, 8.0]]), tensor([[1.0, 3.0, 5.0]])
+    implausible, proposed = tensor([[0, 0, -torch.inf]]), tensor([[9.0, 0, 0]])
+    assert td_target(reward, discount, slow, online, implausible).tolist() == [1 + 0.5 * 2]
+    assert td_target(reward, discount, slow, preference=implausible).tolist() == [1 + 0.5 * 4]
+    assert td_target(reward, discount, slow, online, proposed).tolist() == [1 + 0.5 * 4]
 
 
 def test_loss_by_hand() -> None:
