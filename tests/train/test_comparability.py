@@ -85,7 +85,6 @@ FEW = {f"episodes of logs/{name}" for name in ("nominal", "wheel_slip", "rare")}
         ({"weight": (1, 0.2, 1, 1, 1)}, {"mix after weights"}, None),  # which undo a boost
         ({"log_episodes": 40}, FEW, FEW),
     ],
-    ids=str,
 )
 def test_what_is_planted_is_found(planted, least, most) -> None:
     names = {check.name for check in failing(feed(1, runs=5), feed(2, runs=5, **planted))}
