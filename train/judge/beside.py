@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
+from restock.ingest.task.task import proposal_reader
 from restock.stats import ConfidenceInterval
 from restock.train.judge import answers as ends
 from restock.train.judge.answers import Answer, Broken, Relation, lagged, wheel_turn
@@ -418,10 +419,9 @@ def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
 
 def _of_drivers(rows: FedRows) -> Iterator[Tally]:
     """Count the actions of each driver that are those nearest to navigation's proposals."""
-    proposed = np.stack([rows.now("nav_speed"), rows.now("nav_yaw_rate")], axis=1)
-    away = np.linalg.norm(proposed[:, None] - rows.task.scaled_actions, axis=2)
-    nearest = away.argmin(axis=1)
-    known = rows.now("nav_known") > 0.5
+    near, offset, says = proposal_reader(rows.task)
+    nearest = (rows.observation @ near.T + offset).argmax(axis=1)
+    known = rows.observation @ says > 0.5
     for name in np.unique(rows.driver[known]).tolist() if rows.driver is not None else ():
         own = known & (rows.driver == name)
         if name and own.sum() >= _MIN_DRIVEN:
