@@ -19,9 +19,11 @@ of the logs do:
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,22 +31,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from restock.arrays import F32, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.task.schema import GOLDEN, splitmix64
 from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
+from restock.replay.sampling.ring import FreshRing
+from restock.train.dqn.learner import Learner, value_lag
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
-
-
-import hashlib
-from itertools import pairwise
-from typing import Any
-
-from restock.arrays import F64
-from restock.replay.sampling.ring import FreshRing
-from restock.train.dqn.learner import Learner, value_lag
 
 _UNPLANNED = PlannedDraws()
 _IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped

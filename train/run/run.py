@@ -20,12 +20,14 @@ import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import pyarrow as pa
+from safetensors import SafetensorError, safe_open
 
 from restock.errors import RunError, quoted
 from restock.files import (
@@ -40,12 +42,6 @@ from restock.train.run.run_tables import TABLES
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
-
-
-from dataclasses import asdict, dataclass
-from typing import Literal
-
-from safetensors import SafetensorError, safe_open
 
 FORMAT = "restock-run/3"
 MEAN_OF = "mean_of"  # in config.json: the policies whose mean this run's is; it learned nothing
