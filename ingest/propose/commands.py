@@ -286,7 +286,6 @@ def limit_of(settled: F64, fastest: float) -> float | None:
 
 MOSTLY, RARELY = 98, 2  # percentiles of speeds: what is beyond is an outlier
 APART = 0.25  # of the fastest command; a command that is further from every action is far off it
-SLIGHT = 0.05  # of the largest speed of commands: noise, or what was rounded
 
 
 @dataclass(frozen=True)
@@ -390,32 +389,6 @@ def commanded(
         turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
     sane = np.isfinite(speed) & np.isfinite(turn)
     return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
-
-
-def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[int, int]:
-    """Count the Twists that ask for motion no wheels make, and all that ask for motion.
-
-    No wheels go up and down, roll or pitch. Other types give (0, 0), and so does odometry, which
-    is measured on uneven floors.
-    """
-    topic, kind = fit
-    message = kind.fields["speed_mps"].removesuffix("linear.x")
-    leaves = [f"{message}{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
-    if is_motion(topic.type) or not set(leaves) <= set(recording.leaves(topic.name)):
-        return 0, 0
-    fields = recording.read({topic.name: leaves})[topic.name].fields
-    requested = np.abs(np.stack([np.asarray(fields[leaf], np.float64) for leaf in leaves], axis=1))
-    requested = requested[np.isfinite(requested).all(axis=1) & (requested > 0).any(axis=1)]
-    if not len(requested):
-        return 0, 0
-    least = SLIGHT * float(np.percentile(requested.max(axis=1), MOSTLY))
-    return int((requested[:, [2, 3, 4]] > least).any(axis=1).sum()), len(requested)
-
-
-def leaves_the_floor(recording: Recording, fit: Fit) -> bool:
-    """Return whether most commands of a topic are for an arm or a drone."""
-    off, requested = off_the_floor(recording, fit)
-    return 2 * off > requested
 
 
 def settled_at_most(

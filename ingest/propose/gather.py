@@ -21,7 +21,6 @@ from restock.ingest.propose.commands import (
     Commands,
     choose_command,
     how_it_turned,
-    leaves_the_floor,
     read_commands,
 )
 from restock.ingest.propose.footprint import (
@@ -170,8 +169,6 @@ def gather(recording: Recording, given: Given) -> Evidence:
     if not roles["command"] and given.odometry_as_command:
         roles["command"] = topics_for(recording, ODOMETRY_AS_COMMAND)
     else:
-        if len(roles["command"]) > 1:  # an arm on the robot may have its own
-            roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
         roles["command"], chosen = choose_command(recording, roles["command"])
     driven = {topic.name for topic, _ in roles["command"][:1]}
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]

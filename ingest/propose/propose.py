@@ -7,19 +7,16 @@ then tried on the recording, so that it can say what its choices cost.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.clock_choice import by_log_time
-from restock.ingest.propose.commands import off_the_floor
 from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather, without_first
 from restock.ingest.propose.proposal_lines import advice_of, profile_lines
-from restock.ingest.propose.roles import REQUIRED, Kind, several_commands
+from restock.ingest.propose.roles import REQUIRED, several_commands
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.clocks import STAMP
@@ -60,7 +57,6 @@ class Proposal:
     commands: list[str] = field(default_factory=list)  # topics, if several may drive the robot
     kinds: list[RobotKind] = field(default_factory=list)  # if there are several: its own first
     findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
-    wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 
 def propose_profile(recording: Recording, name: str, given: Given | None = None) -> Proposal:
@@ -85,9 +81,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         + (INSTEAD_OF_COMMANDS if role == "command" and seen.roles["wheels"] else "")
         for role in missing
     ]
-    if other := no_wheeled_robot(recording, seen.roles["command"], located=located):
-        problems = [other]
-    elif seen.motion is not None and seen.motion.problem:
+    if seen.motion is not None and seen.motion.problem:
         problems.append(seen.motion.problem)
     trial = Trial()
     if not problems:
@@ -114,7 +108,6 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice=advice,
         commands=several_commands(recording),
         findings=trial.findings,
-        wheeled=other is None,
     )
 
 
@@ -166,32 +159,3 @@ def tried(recording: Recording, toml: str) -> Trial:
         return try_profile(profile, read_topics(recording, profile))
     except (ConfigError, RecordingError) as error:
         return Trial(problem=error.what)
-
-
-DRONES = ("mavros_msgs/", "px4_msgs/", "mav_msgs/", "ardupilot_msgs/", "crazyflie_interfaces/")
-MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
-ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its velocity commands"
-
-
-def no_wheeled_robot(
-    recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
-) -> str | None:
-    """Say what a recording seems to be if it is not of a wheeled robot; else None.
-
-    `command` are the topics that may drive it, `located` whether anything says where it is.
-    """
-    if command:
-        off, requested = off_the_floor(recording, command[0])
-        if 2 * off > requested:
-            return (
-                f"this looks like a robot arm's or a drone's recording ({off:,} of the"
-                f" {requested:,} commands to move of {command[0][0].name} have linear.z, angular.x"
-                f" or angular.y): {ON_WHEELS}"
-            )
-        if located:
-            return None
-    types = {topic.type for topic in recording.topics.values() if topic.expected}
-    flying = sorted(kind for kind in types if kind.startswith(DRONES) or kind == MULTI_DOF)
-    if not flying:
-        return None
-    return f"this looks like a drone's recording (it has {', '.join(flying[:3])}): {ON_WHEELS}"

@@ -26,7 +26,7 @@ from support.driven_robot import (
     write_bag,
     write_topics,
 )
-from support.ingested import answered, ingested
+from support.ingested import ingested
 from support.paths import ROOT, SHARED, sample_transitions
 from support.profile_texts import WAREHOUSE
 
@@ -222,49 +222,6 @@ def with_laser(frame: str = "laser", **tf: tuple[str, TopicColumns]) -> Topics:
 TENTHS = np.arange(60) * 0.1
 MOVING = transforms(TENTHS, ("odom", "base_link"))
 STATIC = transforms(np.zeros(1), ("base_link", "mast"), ("mast", "laser", 0.0, 0.0, np.pi / 2))
-SECONDS = np.arange(0, 8, 0.1)
-RISING = np.clip(SECONDS, 0, 6)
-EMPTY = columns(SECONDS, {})
-
-
-def flight(command: str = "/mavros/setpoint_velocity/cmd_vel", climbs: bool = True) -> Topics:
-    """As mavros publishes it: local pose and velocity set points."""
-    at = pose("pose", SECONDS * 0.3, 1.0) | {"pose.position.z": RISING}
-    speeds = {"twist.linear.x": np.full(len(SECONDS), 0.3)}
-    speeds["twist.linear.z"] = climbs * np.gradient(RISING, SECONDS)
-    place = "geometry_msgs/msg/PoseStamped", columns(SECONDS, at)
-    return {"/mavros/local_position/pose": place, command: (STAMPED, columns(SECONDS, speeds))}
-
-
-def servoed(**speeds: object) -> Topics:
-    """As MoveIt Servo drives an arm: twists of its tool, which is located in the base's frame."""
-    at = pose("pose", 0.4 + 0.1 * np.sin(SECONDS), 0.1) | {"pose.position.z": 0.5 + 0 * SECONDS}
-    reported = {"twist.linear.x": 0.1 * np.sin(SECONDS)}
-    reported |= {f"twist.{path}": value + 0 * SECONDS for path, value in speeds.items()}
-    return {
-        "/joint_states": ("sensor_msgs/msg/JointState", EMPTY),
-        "/servo/twists": (STAMPED, columns(SECONDS, reported)),
-        "/tool_pose": ("geometry_msgs/msg/PoseStamped", columns(SECONDS, at)),
-    }
-
-
-def with_a_base() -> Topics:
-    """Return an arm on a base, whose commands are far fewer and of a name that tells nothing."""
-    seldom = SECONDS[::4]
-    reported = {"twist.linear.x": 0.1 * np.sin(seldom), "twist.angular.z": 0.2 * np.cos(seldom)}
-    base = {"/wheels/speeds": (STAMPED, columns(seldom, reported))}
-    return servoed(**{"linear.z": 0.05, "angular.y": 0.1}) | base
-
-
-def swaying() -> Topics:
-    """Odometry in three dimensions, in place of commands: rough floor pitches and rolls it."""
-    sways = 0.2 * np.sin(9 * SECONDS)
-    motion = {"twist.twist.linear.x": 0.1 + 0 * SECONDS, "twist.twist.linear.z": sways}
-    motion |= {"twist.twist.angular.x": sways, "twist.twist.angular.y": sways}
-    at = pose("pose.pose", 0.1 * SECONDS, 1.0)
-    return {"/odom": ("nav_msgs/msg/Odometry", columns(SECONDS, motion | at))}
-
-
 ODOMETRY = ("--odometry-as-command",)
 HURRIED = told(3 * SPEED_MPS, seconds=12.0)
 UNEVEN = np.cumsum(np.random.default_rng(0).choice([0.06, 0.1, 0.1, 0.1, 0.17], 200))
@@ -384,18 +341,6 @@ ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], A
         with_laser(tf=MOVING, tf_static=STATIC), (), lambda p: p.task.body.lidar_yaw_rad,
         pytest.approx(np.pi / 2, abs=1e-3), ["- no transform places"],
     ),
-    # Robots on wheels, though something of them moves off the floor.
-    "on a ramp": (flight("/cmd_vel", False), (), topics_of("command"), ("/cmd_vel",), []),
-    "mostly on the floor": (
-        servoed(**{"linear.z": np.where(SECONDS < 3, 0.1, 0.0)}), (), topics_of("command"),
-        ("/servo/twists",), [],
-    ),
-    "noise off the floor": (
-        servoed(**{"angular.y": np.random.default_rng(0).normal(0, 1e-3, len(SECONDS))}), (),
-        topics_of("command"), ("/servo/twists",), [],
-    ),
-    "a base below an arm": (with_a_base(), (), topics_of("command"), ("/wheels/speeds",), []),
-    "rough floor": (swaying(), ODOMETRY, topics_of("command"), ("/odom",), []),
 }  # fmt: skip
 
 
@@ -410,36 +355,6 @@ def test_a_proposal_is_of_its_robot(name, tmp_path):
     for line in lines:
         assert (line.removeprefix("- ") in text) is not line.startswith("- "), line
     assert said["transitions"] > 5
-
-
-@pytest.mark.parametrize(
-    ("topics", "said"),
-    [
-        (flight(), "a robot arm's or a drone's recording ("),
-        (
-            {"/command/trajectory": ("trajectory_msgs/msg/MultiDOFJointTrajectory", EMPTY)},
-            "a drone's recording (it has trajectory_msgs/msg/MultiDOF",
-        ),
-        (
-            servoed(**{"linear.y": 0.1, "linear.z": 0.05, "angular.y": 0.1}),
-            "a robot arm's or a drone's recording (80 of the 80 commands to move of /servo/twists"
-            " have linear.z, angular.x or angular.y)",
-        ),
-        (
-            servoed(**{"linear.z": np.where(SECONDS < 4.2, 0.1, 0.0)}),
-            "a robot arm's or a drone's recording (42 of",
-        ),
-    ],
-)
-def test_a_recording_of_no_wheels_is_named_once(topics, said, tmp_path):
-    bag = write_topics(topics, tmp_path / "bag")
-    code, document = asked("new", bag)
-    (problem,) = document["problems"]
-    assert code == 3
-    assert f"this looks like {said}" in problem
-    stopped = answered("start", bag, "--out", tmp_path / "out", codes=(3,))["stopped"]
-    assert stopped["remedies"] == ["give recordings of a robot on wheels"]
-    assert not (tmp_path / "out" / "profile.toml").exists()
 
 
 # -- advice, and what a profile then gives -----------------------------------------------------

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from restock.ingest.propose.drives import Drives, RobotTraits
 
 # of a proposal
-_PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands", "wheeled")
+_PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands")
 OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
 
 
@@ -78,8 +78,8 @@ class ProfileCommand:
     """Also read what is intact in damaged or truncated files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice", "commands", "kinds", "wheeled", "read" (first the one it
-    was proposed from), "unread", "unreadable", "losses"}; `check`: {"inputs", "problems", "advice",
+    "problems", "advice", "commands", "kinds", "read" (first the one it was
+    proposed from), "unread", "unreadable", "losses"}; `check`: {"inputs", "problems", "advice",
     "inside_outline", "outcome", …}."""
 
     def run(self) -> int:

@@ -103,9 +103,6 @@ class Way:
         if not proposed.good:
             raise Stop("no profile can be proposed", f"write {to.profile}: docs/profile.md")
         document = proposed.document
-        if not document.get("wheeled", True):
-            Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
-            raise Stop("; ".join(document["problems"]), "give recordings of a robot on wheels")
         if problems := document.get("problems"):
             raise Stop(
                 "; ".join(problems),
