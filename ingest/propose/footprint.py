@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -39,7 +39,6 @@ from restock.ingest.propose.roles import Kind, own_first, shared
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Edges, PoseSeries, Tree, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
-from restock.ingest.task.task import yaw_of
 
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms
 SIZES_M = (0.02, 30.0)  # of a robot that this can be
@@ -331,7 +330,6 @@ def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
 
 MAX_ASIDE_M = 3.0  # of the middle: a lidar
 MIN_RANGE_M = 0.01
-LidarPose = tuple[float, float, float]  # ahead and to the left (m), and turned (rad)
 _TURN = 2 * math.pi
 
 
@@ -341,15 +339,6 @@ class SeenScans:
 
     frame: str = ""  # that the first one is in; "": it does not say
     angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last one
-    origin: LidarPose = (0.0, 0.0, 0.0)  # of the last one's lidar in its frame
-
-    def seen_from(self, x_m: float, y_m: float, yaw_rad: float, *, upside_down: bool) -> LidarPose:
-        """Return the lidar's place and the direction of its zero, for a frame that is here."""
-        ahead, left, turn = self.origin
-        left, turn = (-left, -turn) if upside_down else (left, turn)
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        at_m = x_m + cos * ahead - sin * left, y_m + sin * ahead + cos * left
-        return *at_m, math.remainder(yaw_rad + turn, _TURN) if turn else yaw_rad
 
     def view(
         self, yaw_rad: float = 0.0, *, upside_down: bool = False
@@ -375,18 +364,6 @@ class SeenScans:
         return low + yaw_rad, high + yaw_rad, beams
 
 
-def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
-    """Move the lidar of a footprint from its frame to where its scans say it is."""
-    if scans.origin == (0.0, 0.0, 0.0):
-        return footprint
-    frame = (footprint.lidar_x_m or 0.0, footprint.lidar_y_m, footprint.lidar_yaw_rad or 0.0)
-    x, y, yaw = scans.seen_from(*frame, upside_down=footprint.upside_down)
-    source = f"{footprint.lidar_source}, and the pose in its scans"
-    if footprint.lidar_x_m is None:
-        source = f"by the pose in its scans; that {scans.frame} is the middle is a guess"
-    return replace(footprint.with_lidar_at(x, y, source), lidar_yaw_rad=yaw)
-
-
 def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, SeenScans]:
     """Read the frame and angles of each topic's scans, of all topics in one pass."""
     wanted, counted = dict[str, list[str]](), dict[str, Reduction]()
@@ -394,7 +371,7 @@ def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> di
         leaves = set(recording.leaves(topic.name))
         frame, angles = frame_id_path(leaves), _angles(kind)
         kept = angles if leaves.issuperset(angles) else []
-        wanted[topic.name] = [*([frame] if frame else []), *kept, *_origin(kind, leaves)]
+        wanted[topic.name] = [*([frame] if frame else []), *kept]
         if len(kept) == 2:  # by the last of so many
             counted[topic.name] = Reduction((kind.fields["ranges_m"],), _beam_counts)
     columns = recording.read(wanted, counted) if wanted else {}
@@ -418,30 +395,19 @@ def _beam_counts(fields: Fields) -> dict[str, FieldColumn]:
     return {BEAMS: lengths}
 
 
-def _origin(kind: Kind, fields: Collection[str]) -> list[str]:
-    """Return the paths of the lidar's pose in the frame of its scans, if they have one."""
-    paths = [f"{kind.origin}.position.{axis}" for axis in "xy"]
-    paths += [f"{kind.origin}.orientation.{axis}" for axis in "xyzw"]
-    return paths if set(paths) <= set(fields) else []
-
-
 def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
-    angles, origin = _angles(kind), (0.0, 0.0, 0.0)
+    angles = _angles(kind)
     columns = {path: np.asarray(column) for path, column in fields.items()}
     if not all(map(len, columns.values())):
         return SeenScans()
     frame = frame_id_path(columns)
     said = "" if frame is None else str(columns[frame][0])
-    if place := _origin(kind, columns):
-        x, y, *turn = (np.asarray(columns[path][-1:], np.float64) for path in place)
-        yaw = float(yaw_of(*turn)[0])
-        origin = (float(x[0]), float(y[0]), yaw if np.isfinite(yaw) else 0.0)
     if angles[0] not in columns:
-        return SeenScans(said, None, origin)
+        return SeenScans(said)
     first, last, *step = (float(columns[path][-1]) for path in angles)
     if not step:
         step = [(last - first) / max(int(columns[BEAMS][-1]) - 1, 1)]
-    return SeenScans(said, (first, last, step[0]), origin)
+    return SeenScans(said, (first, last, step[0]))
 
 
 def with_lidar(

@@ -29,7 +29,6 @@ from restock.ingest.propose.footprint import (
     ScannedOutline,
     descriptions,
     footprint_of,
-    moved_in_frame,
     scanned_outline,
     scans_of,
     with_lidar,
@@ -202,8 +201,6 @@ def gather(recording: Recording, given: Given) -> Evidence:
         footprint = with_lidar(footprint, recording, edges, frame)
     if footprint.lidar_yaw_rad is None and plain(frame).split("/")[-1] not in BASE_FRAMES:
         footprint = replace(footprint, lidar_unplaced=plain(frame))
-    if scan is not None:
-        footprint = moved_in_frame(footprint, scanned[scan])
     robot = propose_robot(
         texts,
         scanned[scan] if scan is not None else None,

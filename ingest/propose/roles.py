@@ -35,7 +35,6 @@ class Kind:
     never: tuple[str, ...] = ()  # in the topic's name, they speak against it
     rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
     at_changes: bool = False  # messages come when something changes, and hold until then
-    origin: str = ""  # of scans: the field with the lidar's pose in their frame
 
     @property
     def by_fix(self) -> bool:
@@ -162,7 +161,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             ("scan",),
             rather=("back", "rear"),
         ),
-        Kind("foxglove.LaserScan", _SCAN, ("scan",), rather=("back", "rear"), origin="pose"),
+        Kind("foxglove.LaserScan", _SCAN, ("scan",), rather=("back", "rear")),
     ),
     "goal": (
         Kind(  # all that move_base was sent

@@ -62,19 +62,6 @@ def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encod
     assert str(traits.lidar) == f"lidar laser, {BEAMS} beams"
 
 
-def test_a_lidar_is_where_the_pose_in_its_scans_says(tmp_path):
-    messages = drive(8.0)
-    for _, topic, _, values in messages:
-        if "scan" in topic:
-            values["pose"] = pose(0.4, 0.0, np.pi)
-    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages))
-    body = parse_profile(toml, where="p").task.body
-    assert body.lidar_x_m == pytest.approx(0.4)
-    assert abs(body.lidar_yaw_rad) == pytest.approx(np.pi, abs=1e-3)
-    assert body.length_m == pytest.approx(0.8)  # a guess, which holds it
-    assert "by the pose in its scans" in toml
-
-
 def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path):
     messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
     for time_s in np.arange(0, 20, 0.2).tolist():

@@ -33,7 +33,7 @@ from restock.ingest.containers.storage import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile
-from restock.ingest.propose.footprint import Footprint, SeenScans, scans_of
+from restock.ingest.propose.footprint import Footprint, scans_of
 from restock.ingest.propose.roles import KINDS, Kind, topics_for
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.needs import angle_keys
@@ -91,8 +91,8 @@ def placed_scans(
     if columns is None or not len(columns):
         return []
     notes: list[str] = []
-    seen = scans_of(recording, [fit])[topic]
-    turn, place = _mount(recording, seen, profile, footprint, notes)
+    frame = scans_of(recording, [fit])[topic].frame
+    turn, place = _mount(recording, frame, profile, footprint, notes)
     first, last = (np.asarray(columns.fields[path], np.float64) for path in angles)
     if "angle_max_rad" in kind.fields:  # of so many beams
         last = (last - first) / np.maximum(np.asarray(columns.fields["count"]) - 1, 1)
@@ -156,8 +156,7 @@ def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Ki
         named = None if scan is None else recording.topics.get(scan.topic)
         if scan is None or named is None or not named.expected or named.skipped:
             return None
-        origin = next((kind.origin for kind in KINDS["scan"] if kind.type == scan.type), "")
-        return named, Kind(scan.type, scan.fields, origin=origin)
+        return named, Kind(scan.type, scan.fields)
     found = topics_for(recording, KINDS["scan"])
     return min(found, key=lambda fit: "fake" in fit[0].name or "sim" in fit[0].name, default=None)
 
@@ -181,20 +180,18 @@ def _thinned(path: str, fields: Fields) -> dict[str, FieldColumn]:
 
 def _mount(
     recording: Recording,
-    seen: SeenScans,
+    frame: str,
     profile: Profile | None,
     footprint: Footprint | None,
     notes: list[str],
 ) -> tuple[F64, F64]:
     """Return the lidar's rotation (3, 3) and place (3,) on the robot."""
-    frame = seen.frame
-    in_frame, moved = _turn(seen.origin[2]), np.array([*seen.origin[:2], 0.0])
     over = np.diag([1.0, -1.0, -1.0])
     scan = None if profile is None else profile.inputs.scan
     bases = [profile.frames.base] if profile is not None and profile.frames is not None else []
     for base in (*bases, *BASE_FRAMES):
         if found := mount_of(recording, frame, base):
-            place, turn = found[0] @ moved + found[1], found[0] @ in_frame
+            turn, place = found
             if scan is None or scan.upside_down == (turn[2, 2] < 0):
                 return turn, place
             way = "upside down" if scan.upside_down else "upright"
