@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
@@ -228,15 +228,6 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
     return {name: found[name] for name in own_first(recording, found)}
 
 
-@dataclass
-class _Namespace:
-    """The topics of a namespace, by what robots have."""
-
-    kinds: set[str] = field(default_factory=set)
-    shared: set[str] = field(default_factory=set)  # of topics that one beside it has by that name
-    messages: int = 0
-
-
 def robots_in(recording: Recording) -> list[str]:
     """Return the namespaces of a recording's robots, if it has several.
 
@@ -244,26 +235,31 @@ def robots_in(recording: Recording) -> list[str]:
 
     Robots' namespaces lie side by side, and topics of two kinds at least have the same name in
     more than one of them: `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one
-    robot. Beside one that was chosen, a command by the same name or topics of two kinds are enough.
+    robot.
     """
-    found, chosen = _namespaces(recording), recording.robot
-    robots = [name for name, one in found.items() if len(one.shared) > 1]
-    if chosen is not None:
-        robots = [
-            name
-            for name, one in found.items()
-            if name.rpartition("/")[0] == chosen.rpartition("/")[0]
-            and ("command" in one.shared or len(one.kinds) > 1)
-        ]
-    elif not any("command" in found[robot].kinds for robot in robots):
+    kinds, messages = defaultdict[str, set[str]](set), Counter[str]()
+    beside = defaultdict[tuple[str, str, str], set[str]](set)  # by place, name in it, and kind
+    for name, topic in _readable(recording):
+        other = topic.encoding in _OTHER_ENCODINGS
+        if (kind := _KIND_OF.get(last_part(topic.type) if other else topic.type)) is None:
+            continue
+        parts = name.strip("/").split("/")
+        for place in range(1, len(parts)):
+            namespace = "/" + "/".join(parts[:place])
+            kinds[namespace].add(kind)
+            messages[namespace] += topic.expected
+            beside[namespace.rpartition("/")[0], "/".join(parts[place:]), kind].add(namespace)
+    common = {(one, kind) for (*_, kind), many in beside.items() if len(many) > 1 for one in many}
+    robots = [one for one, count in Counter(one for one, _ in common).items() if count > 1]
+    if len(robots) < 2 or not any("command" in kinds[one] for one in robots):
         return []
     return sorted(
-        robots if len(robots) > 1 else [],
+        robots,
         key=lambda one: (
-            one != chosen,
-            "command" not in found[one].kinds,
-            -len(found[one].kinds - {"imu"}),  # which everything can do without
-            -found[one].messages,
+            one != recording.robot,
+            "command" not in kinds[one],
+            -len(kinds[one] - {"imu"}),  # which everything can do without
+            -messages[one],
             one,
         ),
     )
@@ -273,36 +269,19 @@ def choose_robot(recording: Recording, name: str) -> None:
     """Propose for the robot of this namespace, of several in the recording.
 
     Raises:
-        ConfigError: the namespace does not hold topics of two kinds; names those that do.
+        ConfigError: it is not one of them; names those that are. Or there are no such topics.
     """
-    found, chosen = _namespaces(recording), f"/{name.strip('/')}"
-    if chosen not in found or len(found[chosen].kinds) < 2:
-        robots = ", ".join(sorted(robots_in(recording)))
+    chosen, robots = f"/{name.strip('/')}", sorted(robots_in(recording))
+    known = any(topic.startswith(f"{chosen}/") for topic in recording.topics)
+    if not known or (robots and chosen not in robots):
         raise ConfigError(
             f"there is no robot {chosen} in the recording",
             where=str(recording.path),
-            remedy=f"its robots are {robots}" if robots else "it seems to be of one: name none",
+            remedy=f"its robots are {', '.join(robots)}"
+            if robots
+            else "it seems to be of one: name none",
         )
     recording.robot = chosen
-
-
-def _namespaces(recording: Recording) -> dict[str, _Namespace]:
-    found: defaultdict[str, _Namespace] = defaultdict(_Namespace)
-    where: defaultdict[tuple[str, str, str], set[str]] = defaultdict(set)  # beside, the rest, kind
-    for name, topic in _readable(recording):
-        other = topic.encoding in _OTHER_ENCODINGS
-        if (kind := _KIND_OF.get(last_part(topic.type) if other else topic.type)) is None:
-            continue
-        parts = name.strip("/").split("/")
-        for place in range(1, len(parts)):
-            namespace, rest = "/" + "/".join(parts[:place]), "/".join(parts[place:])
-            found[namespace].kinds.add(kind)
-            found[namespace].messages += topic.expected
-            where[namespace.rpartition("/")[0], rest, kind].add(namespace)
-    for (_, _, kind), beside in where.items():
-        for namespace in beside if len(beside) > 1 else ():
-            found[namespace].shared.add(kind)
-    return dict(found)
 
 
 def own_first(recording: Recording, names: Iterable[str]) -> list[str]:
