@@ -16,17 +16,18 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from restock.arrays import F64, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
-from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.tables import is_motion
 from restock.ingest.propose.clock_choice import Gaps
 from restock.ingest.propose.robot_choice import DriveEvidence, drive_evidence
-from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind, Roles
+from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind
 from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.task import wrap_angle
 
@@ -61,31 +62,68 @@ class CommandSource:
 
 
 @dataclass(frozen=True)
-class CommandChoice:
-    """The sources of the command that drives, and who drives where none of them does."""
+class CommandLog:
+    """The finite commands of a topic, in the order of log time."""
 
-    sources: list[CommandSource] = field(default_factory=list)
-    policy: str = "unknown"
-    why: str = "the driver, if no topic says so"
+    fit: Fit
+    log_time_ns: Ints  # (N,)
+    values: F64  # (N, 2) speed (m/s), and yaw rate (rad/s) or the angle of the front wheels (rad)
+    gaps: Gaps
+
+    @classmethod
+    def read(cls, recording: Recording, fit: Fit) -> CommandLog:
+        """Read the commands of a topic."""
+        topic, kind = fit
+        paths = list(kind.fields.values())
+        columns = recording.read({topic.name: paths})[topic.name]
+        values = np.stack([np.asarray(columns.fields[path], np.float64) for path in paths], axis=1)
+        rows = np.argsort(columns.log_time_ns, kind="stable")
+        rows = rows[np.isfinite(values[rows]).all(axis=1)]
+        return cls(fit, columns.log_time_ns[rows], values[rows], Gaps.of(columns))
+
+    @property
+    def measured(self) -> bool:
+        """Return whether it is odometry, in place of commands."""
+        return is_motion(self.fit[0].type)
+
+    @property
+    def steered(self) -> bool:
+        """Return whether it has the angle of the front wheels, as of a car."""
+        return "steering_rad" in self.fit[1].fields
+
+    @cached_property
+    def changed(self) -> Ints:
+        """Return the rows that differ from the one before."""
+        return np.flatnonzero((np.diff(self.values, axis=0) != 0).any(axis=1)) + 1
+
+    def passed_on(self, output: CommandLog) -> int:
+        """Count the changes of `output` to what this topic said last."""
+        times = output.log_time_ns[output.changed]
+        at = np.searchsorted(self.log_time_ns, times, "right") - 1
+        age_s = (times - self.log_time_ns[np.maximum(at, 0)]) * 1e-9
+        same = (self.values[np.maximum(at, 0)] == output.values[output.changed]).all(axis=1)
+        return int((same & (at >= 0) & (age_s <= PASSED_WITHIN_S)).sum())
+
+    def feeds(self, output: CommandLog, share: float) -> bool:
+        """Return whether `output` repeats this topic, at this share of its changes at least."""
+        passed = self.passed_on(output)
+        enough = passed >= max(MIN_PASSED, share * len(output.changed))
+        return enough and passed > output.passed_on(self)
+
+    def max_age_s(self) -> float:
+        """Return four of its periods."""
+        gaps = np.diff(self.log_time_ns) * 1e-9
+        return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
 
 
 @dataclass(frozen=True)
-class _Source:
-    fit: Fit
-    log_time_ns: Ints  # (N,) ascending
-    values: F64  # (N, 2) speed and turn
+class CommandChoice:
+    """The command that drives, its sources, and who drives where none of them does."""
 
-    def passed_on(self, output: _Source) -> int:
-        """Count the changes of `output` to what this topic said last."""
-        changed = np.flatnonzero((np.diff(output.values, axis=0) != 0).any(axis=1)) + 1
-        at = np.searchsorted(self.log_time_ns, output.log_time_ns[changed], "right") - 1
-        age_s = (output.log_time_ns[changed] - self.log_time_ns[np.maximum(at, 0)]) * 1e-9
-        same = (self.values[np.maximum(at, 0)] == output.values[changed]).all(axis=1)
-        return int((same & (at >= 0) & (age_s <= PASSED_WITHIN_S)).sum())
-
-    @property
-    def changes(self) -> int:
-        return int((np.diff(self.values, axis=0) != 0).any(axis=1).sum())
+    log: CommandLog | None = None  # None: there is none
+    sources: list[CommandSource] = field(default_factory=list)
+    policy: str = "unknown"
+    why: str = "the driver, if no topic says so"
 
 
 def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[Fit], CommandChoice]:
@@ -93,49 +131,27 @@ def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[F
 
     What comes last in a chain of multiplexers is first.
     """
-    if not fitting:
-        return [], CommandChoice()
-    reported = [one for one in (_read(recording, fit) for fit in fitting) if len(one.values)]
+    logs = [CommandLog.read(recording, fit) for fit in fitting]
+    reported = [one for one in logs if len(one.values)]
     if not reported:
-        return list(fitting), CommandChoice()
+        return list(fitting), CommandChoice(next(iter(logs), None))
     first = reported[0]
     for _ in reported:  # down a chain of multiplexers
-        later = [one for one in reported if one is not first and _feeds(first, one, HALF)]
+        later = [one for one in reported if one is not first and first.feeds(one, HALF)]
         if not later:
             break
         first = max(later, key=first.passed_on)
     chosen = [first.fit, *(fit for fit in fitting if fit is not first.fit)]
-    inputs = [one for one in reported if one is not first and _feeds(one, first, MIN_SHARE)]
+    inputs = [one for one in reported if one is not first and one.feeds(first, MIN_SHARE)]
     sources: dict[str, CommandSource] = {}
     for one in sorted(inputs, key=lambda one: -one.passed_on(first)):
         policy = _policy(one.fit[0].name)
-        source = CommandSource(policy, one.fit, one.passed_on(first), _age_s(one))
+        source = CommandSource(policy, one.fit, one.passed_on(first), one.max_age_s())
         sources.setdefault(policy, source)
     named = _policy(first.fit[0].name)
     if not sources and named in ("teleop", "navigation"):
-        return chosen, CommandChoice(policy=named, why=f"by the name of {first.fit[0].name}")
-    return chosen, CommandChoice([*sources.values()])
-
-
-def _read(recording: Recording, fit: Fit) -> _Source:
-    topic, kind = fit
-    paths = list(kind.fields.values())
-    columns = recording.read({topic.name: paths})[topic.name]
-    values = np.stack([np.asarray(columns.fields[path], np.float64) for path in paths], axis=1)
-    order = np.argsort(columns.log_time_ns, kind="stable")
-    return _Source(fit, columns.log_time_ns[order], values[order])
-
-
-def _age_s(one: _Source) -> float:
-    """Return four periods of a topic."""
-    gaps = np.diff(one.log_time_ns) * 1e-9
-    return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
-
-
-def _feeds(one: _Source, output: _Source, share: float) -> bool:
-    passed = one.passed_on(output)
-    enough = passed >= max(MIN_PASSED, share * output.changes)
-    return enough and passed > output.passed_on(one)
+        return chosen, CommandChoice(first, [], named, f"by the name of {first.fit[0].name}")
+    return chosen, CommandChoice(first, [*sources.values()])
 
 
 def _policy(topic: str) -> str:
@@ -246,33 +262,55 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
     return CommandHold(age_s, went <= stood, tuple(comments))
 
 
-def settled_speeds(command_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
-    """Return the measured speeds (K,) once the fastest commands had settled.
+@dataclass(frozen=True)
+class CommandedDrive:
+    """The commands of a drive and what odometry measured of it, each in m/s and rad/s."""
 
-    They are positive along the command.
+    command_ns: Ints  # (N,) ascending
+    command: F64  # (N, 2)
+    odometry_ns: Ints  # (M,)
+    odometry: F64  # (M, 2)
 
-    Args:
-        command_s, reported: time and value of the commands (N,), in order.
-        at_s, measured: of the odometry (M,), on the same clock.
-        fastest: that was commanded now and then; above 0.
-    """
-    if not len(reported):
-        return np.zeros(0)
-    fast = np.abs(reported) >= NEARLY * fastest
-    # Since when the commands have been fast, one way, without a break.
-    begins = np.append(
-        True, (fast[1:] != fast[:-1]) | (np.sign(reported[1:]) != np.sign(reported[:-1]))
-    )
-    since_s = command_s[np.maximum.accumulate(np.where(begins, np.arange(len(reported)), 0))]
-    index = np.searchsorted(command_s, at_s, "right") - 1
-    row = np.maximum(index, 0)
-    settled = (index >= 0) & fast[row] & (at_s - since_s[row] >= SETTLED_S)
-    settled &= at_s - command_s[row] < SETTLED_S  # the command is no old one
-    along = (measured * np.sign(reported[row]))[settled]
-    return np.asarray(along[np.isfinite(along)], np.float64)
+    @classmethod
+    def of(
+        cls, recording: Recording, log: CommandLog, wheels: Sequence[Fit], wheelbase_m: float | None
+    ) -> CommandedDrive:
+        """Read the odometry of a drive beside its commands."""
+        speed, turn = log.values.T
+        if log.steered:
+            turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
+        command = np.stack([speed, turn], axis=1)
+        if not wheels or log.measured:
+            return cls(log.log_time_ns, command, np.zeros(0, np.int64), np.zeros((0, 2)))
+        topic, kind = wheels[0]
+        paths = [kind.fields[key] for key in ("speed_mps", "yaw_rate_radps")]
+        columns = recording.read({topic.name: paths})[topic.name]
+        measured = [np.asarray(columns.fields[path], np.float64) for path in paths]
+        return cls(log.log_time_ns, command, columns.log_time_ns, np.stack(measured, axis=1))
+
+    def settled(self, axis: int, fastest: float) -> F64:
+        """Return what was measured along an axis (K,) once the fastest commands had settled.
+
+        It is positive along the command. `fastest` was commanded now and then; above 0.
+        """
+        reported, measured = self.command[:, axis], self.odometry[:, axis]
+        if not len(reported):
+            return np.zeros(0)
+        fast = np.abs(reported) >= NEARLY * fastest
+        # Since when the commands have been fast, one way, without a break.
+        breaks = (np.diff(fast) != 0) | (np.diff(np.sign(reported)) != 0)
+        begins = np.where(np.append(True, breaks), np.arange(len(reported)), 0)
+        since_ns = self.command_ns[np.maximum.accumulate(begins)]
+        index = np.searchsorted(self.command_ns, self.odometry_ns, "right") - 1
+        row = np.maximum(index, 0)
+        settled = (index >= 0) & fast[row]
+        settled &= (self.odometry_ns - since_ns[row]) * 1e-9 >= SETTLED_S
+        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # it is no old one
+        along = (measured * np.sign(reported[row]))[settled]
+        return np.asarray(along[np.isfinite(along)], np.float64)
 
 
-def limit_of(settled: F64, fastest: float) -> float | None:
+def _limit(settled: F64, fastest: float) -> float | None:
     """Return the limit that settled speeds (K,) show; None if the robot follows its commands.
 
     Driving and turning share the wheels, so the fastest tenth is used, in which the other motion
@@ -303,15 +341,26 @@ class Commands:
     wheelbase_m: float = 0.3
     reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
 
-    def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
-        """Limit the commands to what the robot reached; None: it reaches what they say."""
-        most = speed_mps or self.speed_mps
+    @classmethod
+    def of(cls, drives: Sequence[CommandedDrive], **known: Any) -> Commands:
+        """Find the fastest commands of these drives, and what the robot reached of them.
+
+        `known` are other fields.
+        """
+        command = np.concatenate([one.command for one in drives])
+        found = replace(cls().fastest(*command.T), count=len(command), **known)
+        fastest = found.speed_mps, found.yaw_rate_radps
+        speed, turn = (
+            _limit(np.concatenate([one.settled(axis, most) for one in drives]), most)
+            for axis, most in enumerate(fastest)
+        )
+        most = speed or found.speed_mps
         return replace(
-            self,
+            found,
             speed_mps=most,
-            yaw_rate_radps=yaw_rate_radps or self.yaw_rate_radps,
-            reverse_mps=tuple(sorted({min(back, most) for back in self.reverse_mps})),
-            reached=(speed_mps, yaw_rate_radps),
+            yaw_rate_radps=turn or found.yaw_rate_radps,
+            reverse_mps=tuple(sorted({min(back, most) for back in found.reverse_mps})),
+            reached=(speed, turn),
         )
 
     def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
@@ -341,94 +390,48 @@ def _reverse_speeds(back_mps: F64, most_mps: float) -> tuple[float, ...]:
 
 
 def read_commands(
-    recording: Recording, roles: Roles, poses: PoseSeries | None, wheelbase_m: float | None
-) -> tuple[Commands, Gaps, CommandHold]:
-    """Read the commands: how fast, which way, how often, and how long each holds."""
-    if not roles["command"]:
-        return Commands(), Gaps(), CommandHold()
-    topic, kind = roles["command"][0]
-    columns, times, speed, turn = commanded(recording, (topic, kind), wheelbase_m)
-    commands = replace(
-        Commands().fastest(speed, turn),
-        count=len(columns),
-        topic=topic.name,
-        measured=is_motion(topic.type),
-        steered="steering_rad" in kind.fields,
+    recording: Recording,
+    log: CommandLog | None,
+    wheels: Sequence[Fit],
+    poses: PoseSeries | None,
+    wheelbase_m: float | None,
+) -> tuple[CommandedDrive | None, Commands, CommandHold]:
+    """Read a drive: how fast and which way it was commanded, and how long each command holds."""
+    if log is None:
+        return None, Commands(), CommandHold()
+    drive = CommandedDrive.of(recording, log, wheels, wheelbase_m)
+    commands = Commands.of(
+        [drive],
+        topic=log.fit[0].name,
+        measured=log.measured,
+        steered=log.steered,
         wheelbase_m=wheelbase_m or Commands.wheelbase_m,
     )
-    settled = settled_at_most(recording, roles, commands, times, speed, turn)
-    commands = commands.limited(
-        limit_of(settled[0], commands.speed_mps), limit_of(settled[1], commands.yaw_rate_radps)
-    )
-    if poses is None or len(poses) < 2 or commands.measured:
-        return commands, Gaps.of(columns), CommandHold()
-    return commands, Gaps.of(columns), command_hold(*_from_first_pose(times, speed, turn, poses))
-
-
-def _from_first_pose(
-    times: Ints, speed: F64, turn: F64, poses: PoseSeries
-) -> tuple[F64, F64, F64, PoseSeries]:
-    """Sort commands by time, and count their time (s) and that of the poses from the first pose."""
-    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
-    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
-    return (times[order] - zero) * 1e-9, speed[order], turn[order], since
-
-
-def commanded(
-    recording: Recording, fit: tuple[TopicInfo, Kind], wheelbase_m: float | None
-) -> tuple[TopicColumns, Ints, F64, F64]:
-    """Read the commands of a topic.
-
-    Returns them, with log time (N,), m/s (N,) and rad/s (N,), without those that are not finite.
-    """
-    topic, kind = fit
-    paths = list(kind.fields.values())
-    columns = recording.read({topic.name: paths})[topic.name]
-    speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
-    if "steering_rad" in kind.fields:
-        turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
-    sane = np.isfinite(speed) & np.isfinite(turn)
-    return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
-
-
-def settled_at_most(
-    recording: Recording, roles: Roles, commands: Commands, times: Ints, speed: F64, turn: F64
-) -> tuple[F64, F64]:
-    """Return what odometry measured once the fastest commands had settled: (K,) m/s, (L,) rad/s."""
-    if not roles["wheels"] or commands.measured or not len(times):
-        return np.zeros(0), np.zeros(0)
-    topic, kind = roles["wheels"][0]
-    columns = recording.read({topic.name: [*kind.fields.values()]})[topic.name]
-    order = np.argsort(times, kind="stable")
-    zero = times[order[0]]
-    command_s, at_s = (times[order] - zero) * 1e-9, (columns.log_time_ns - zero) * 1e-9
-
-    def settled(key: str, values: F64, fastest: float) -> F64:
-        measured = np.asarray(columns.fields[kind.fields[key]], np.float64)
-        return settled_speeds(command_s, values[order], at_s, measured, fastest)
-
-    return (
-        settled("speed_mps", speed, commands.speed_mps),
-        settled("yaw_rate_radps", turn, commands.yaw_rate_radps),
-    )
+    if poses is None or len(poses) < 2 or log.measured:
+        return drive, commands, CommandHold()
+    hold = command_hold(*_from_first_pose(drive.command_ns, drive.command, poses))
+    return drive, commands, hold
 
 
 def how_it_turned(
-    recording: Recording, roles: Roles, poses: PoseSeries | None
+    log: CommandLog | None, poses: PoseSeries | None
 ) -> tuple[DriveEvidence, float | None]:
     """Return how the robot turned under its Twists.
 
     Also return the sharpest of commands that are steering angles.
     """
-    if not roles["command"]:
+    if log is not None and log.steered:
+        angles = np.abs(log.values[:, 1])
+        return DriveEvidence(), float(np.percentile(angles, MOSTLY)) if len(angles) else 0.0
+    if log is None or log.measured or poses is None or len(poses) < 2:
         return DriveEvidence(), None
-    topic, kind = roles["command"][0]
-    if (path := kind.fields.get("steering_rad")) is not None:
-        fields = recording.read({topic.name: [path]})[topic.name].fields
-        angles = np.abs(np.asarray(fields[path], np.float64))
-        angles = angles[np.isfinite(angles)]
-        return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
-    if is_motion(topic.type) or poses is None or len(poses) < 2:
-        return DriveEvidence(), None
-    _, times, speed, turn = commanded(recording, (topic, kind), None)
-    return drive_evidence(*_from_first_pose(times, speed, turn, poses)), None
+    return drive_evidence(*_from_first_pose(log.log_time_ns, log.values, poses)), None
+
+
+def _from_first_pose(
+    times_ns: Ints, values: F64, poses: PoseSeries
+) -> tuple[F64, F64, F64, PoseSeries]:
+    """Return the times (s) of commands, their two columns and poses, timed from the first pose."""
+    zero = poses.stamp_ns[0]
+    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+    return (times_ns - zero) * 1e-9, values[:, 0], values[:, 1], since

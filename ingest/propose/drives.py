@@ -33,9 +33,6 @@ from restock.ingest.propose.clock_choice import ClockChoice, drivable
 from restock.ingest.propose.commands import (
     CommandHold,
     Commands,
-    commanded,
-    limit_of,
-    settled_at_most,
 )
 from restock.ingest.propose.footprint import RobotText, descriptions
 from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather
@@ -179,7 +176,7 @@ def _bytes(path: Path) -> int:
 
 def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     """Return the evidence of one drive, with what belongs to the robot from all of them."""
-    driven = [base, *(one for one in drives if one.commands.topic == base.commands.topic)]
+    driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max((base, *drives), key=lambda one: len(one.robot.values))
     if base.commands.steered and not described.robot.described:  # of one wheelbase
         described = base
@@ -195,12 +192,12 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     )
     return replace(
         base,
-        commands=_commands(base.commands, driven[1:]),
-        hold=_hold([one.hold for one in driven[1:]]),
+        commands=_commands(base.commands, driven),
+        hold=_hold([one.hold for one in driven]),
         clock=replace(
             base.clock,
-            command_age_s=max(one.clock.command_age_s for one in driven),
-            max_gap_s=max(one.clock.max_gap_s for one in driven),
+            command_age_s=max(one.clock.command_age_s for one in (base, *driven)),
+            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # its own is at a rate
         ),
         paces_s={
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
@@ -215,22 +212,9 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
 
 def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
     """Return the fastest of the commands of all drives."""
-    driven = [one for one in drives if one.commands.count]
-    if not driven:
-        return base
-    reported = [
-        commanded(one.recording, one.roles["command"][0], one.robot.values.get("wheelbase_m"))
-        for one in driven
-    ]
-    speed, turn = (np.concatenate([each[part] for each in reported]) for part in (2, 3))
-    count = sum(one.commands.count for one in driven)
-    pooled = replace(base.fastest(speed, turn), count=count)
-    settled = [
-        settled_at_most(one.recording, one.roles, pooled, *each[1:])
-        for one, each in zip(driven, reported, strict=True)
-    ]
-    ahead, about = (np.concatenate([each[part] for each in settled]) for part in (0, 1))
-    return pooled.limited(limit_of(ahead, pooled.speed_mps), limit_of(about, pooled.yaw_rate_radps))
+    driven = [one.driven for one in drives if one.driven is not None]
+    known = {name: getattr(base, name) for name in ("topic", "measured", "steered", "wheelbase_m")}
+    return Commands.of(driven, **known) if driven else base
 
 
 def _hold(drives: Sequence[CommandHold]) -> CommandHold:

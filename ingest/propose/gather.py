@@ -17,7 +17,9 @@ from restock.ingest.propose.candidates import Candidate, candidates
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps, choose_clock
 from restock.ingest.propose.commands import (
     CommandChoice,
+    CommandedDrive,
     CommandHold,
+    CommandLog,
     Commands,
     choose_command,
     how_it_turned,
@@ -121,6 +123,7 @@ class Evidence:
     motion: MotionChoice | None  # if no topic has the wheels' speeds
     commands: Commands
     chosen: CommandChoice
+    driven: CommandedDrive | None
     hold: CommandHold
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
@@ -164,13 +167,13 @@ def gather(recording: Recording, given: Given) -> Evidence:
     unmeasured: dict[str, str] = {}
     for role, key in MEASURED.items():
         roles[role], unmeasured[role] = _measured(recording, roles[role], key)
-    chosen = CommandChoice()
     if not roles["command"] and given.odometry_as_command:
-        roles["command"] = topics_for(recording, ODOMETRY_AS_COMMAND)
+        roles["command"] = fits = topics_for(recording, ODOMETRY_AS_COMMAND)
+        chosen = CommandChoice(CommandLog.read(recording, fits[0]) if fits else None)
     else:
         roles["command"], chosen = choose_command(recording, roles["command"])
-    driven = {topic.name for topic, _ in roles["command"][:1]}
-    roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
+    best = {topic.name for topic, _ in roles["command"][:1]}
+    roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in best]
     if not (roles["goal"] and roles["plan"]):
         roles["goal"] = roles["plan"] = []
     edges = transform_edges(recording)
@@ -207,13 +210,16 @@ def gather(recording: Recording, given: Given) -> Evidence:
         upside_down=footprint.upside_down,
         lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
     )
-    turned, command_rad = how_it_turned(recording, roles, poses)
+    turned, command_rad = how_it_turned(chosen.log, poses)
     robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
     wheelbase_m = robot.values.get("wheelbase_m")
-    commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
+    driven, commands, hold = read_commands(
+        recording, chosen.log, roles["wheels"], poses, wheelbase_m
+    )
     best = {role: fits[0] for role, fits in roles.items() if fits}
     used = {role: topic.name for role, (topic, _) in best.items()}
     paces_s = _paces(recording, {*used.values()})
+    gaps = Gaps() if chosen.log is None else chosen.log.gaps
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces_s, used, poses))
     motion = None
     if not roles["wheels"] and poses is not None:
@@ -241,6 +247,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
         motion=motion,
         commands=commands,
         chosen=chosen,
+        driven=driven,
         hold=hold,
         paces_s=paces_s,
         clock=clock,
