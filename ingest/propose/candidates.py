@@ -1,14 +1,14 @@
-"""Optional parts of a proposed profile: fields as custom signals, and cameras.
+"""Optional parts of a proposed profile: fields that may become custom signals.
 
-The tables are written as comments, because a person must decide what a store should hold: frames
-are most of a recording, and the units of fields are guessed.
+Their tables are written as comments, because a person must decide what a store should hold, and
+the units of fields are guessed.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,6 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.tables import CustomSignal, name_problem
 from restock.ingest.propose.roles import usable_topics
-from restock.ingest.steps.cameras import TYPES
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
 MAX_A_TOPIC = 8
@@ -168,34 +167,3 @@ def _number(text: str) -> bool:
         return bool(np.isfinite(float(text)))
     except ValueError:
         return False
-
-
-ENOUGH_HZ = 5.0  # a control period has no more; a faster camera is thinned
-_MAX_AGE_S = 0.5  # the profile's default
-
-
-def camera_lines(topics: Iterable[TopicInfo], recorded_s: float) -> list[str]:
-    """Write a table in comments for each topic of images, and say what to do with them."""
-    cameras = sorted((one for one in topics if one.type in TYPES), key=lambda one: one.name)
-    if not cameras:
-        return []
-    lines = [
-        "# Cameras: frames kept beside the rows, as recorded. To keep those of one, remove the "
-        "first #",
-        "# of its lines; docs/profile.md describes what is kept.",
-        "",
-    ]
-    for topic in cameras:
-        name = re.sub(r"[^a-z0-9]+", "_", topic.name.lower()).strip("_")[:56]
-        name = name if name[:1].isalpha() else f"camera_{name}"
-        rate_hz = topic.expected / recorded_s if recorded_s > 0 else 0.0
-        lines += [
-            f"# [cameras.{name}]  # {rate_hz:.1f} Hz",
-            f"# topic = {json.dumps(topic.name)}",
-        ]
-        if rate_hz > ENOUGH_HZ:
-            lines.append(f"# max_hz = {ENOUGH_HZ:g}  # frames kept per second")
-        elif rate_hz and 2 / rate_hz > _MAX_AGE_S:
-            lines.append(f"# max_age_s = {2 / rate_hz:.2g}  # two of its periods")
-        lines.append("")
-    return lines

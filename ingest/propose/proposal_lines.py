@@ -16,7 +16,6 @@ from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import TAKEOVER
 from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.profile.tables import CLOUD, FALLBACKS, SCAN_OF_CLOUD, Input
-from restock.ingest.propose.candidates import camera_lines
 from restock.ingest.propose.clock_choice import ClockChoice
 from restock.ingest.propose.commands import Commands
 from restock.ingest.propose.footprint import DESCRIBED, GUESS, TIGHT_PER_WIDTH, range_lines
@@ -103,7 +102,6 @@ def profile_lines(
         ]
     for signal in seen.signals:
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
-    lines += camera_lines(usable_topics(recording).values(), seconds)
     # Topics are named by strangers: a line break in a name must not start a key.
     return [visible(line) for line in lines]
 

@@ -31,10 +31,7 @@ from support.cameras import (
 from support.long import one_in
 
 from restock.errors import ConfigError, RecordingError, StoreError
-from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.pipeline import IngestResult, ingest
-from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.propose import propose_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.cameras import (
     COMPRESSED,
@@ -311,20 +308,3 @@ def test_a_moment_for_review_shows_the_frames_in_force(bag, tmp_path):
         image = Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1])))
         sent = picture(2 * step)[3, -3]  # its colour says which message it is
         assert np.abs(np.array(image)[3, -3].astype(int) - sent).max() <= 4
-
-
-def test_an_uncommented_proposed_camera_works(tmp_path):
-    topics = front_and_rear() | {"/3D/Image": raw([picture(0)] * 6)}  # one frame a second
-    with open_recording(camera_bag(tmp_path / "bag", topics)) as recording:
-        text = propose_profile(recording, "robot").toml
-    assert parse_profile(text, where="test").cameras == {}
-    for line in text[text.index("# Cameras: frames kept") :].splitlines():
-        if line.startswith(("# [cameras", "# topic", "# max_")):
-            text = text.replace(line, line.removeprefix("# "))
-    cameras = parse_profile(text, where="test").cameras
-    assert {name: (one.topic, one.max_hz) for name, one in cameras.items()} == {
-        "front_image_compressed": (FRONT, 5.0),
-        "rear_image": (REAR, 5.0),
-        "camera_3d_image": ("/3D/Image", None),
-    }
-    assert cameras["camera_3d_image"].max_age_s > 1.0
