@@ -29,7 +29,6 @@ from restock.ingest.propose.roles import (
     Kind,
     clouds_alone,
     robots_in,
-    unread_bumpers,
     usable_topics,
 )
 from restock.ingest.propose.trial import Advice, Trial
@@ -134,8 +133,6 @@ def advice_of(seen: Evidence) -> Iterator[Advice]:
             f"no wheel_slip: poses and wheel speeds are both of {roles['wheels'][0][0].name}, and"
             " there is no IMU, so slip cannot be detected",
         )
-    if not roles["bumper"]:
-        yield from (Advice("inputs.bumper", line) for line in unread_bumpers(seen.recording))
     if not roles["scan"]:
         known = shipped()
         names = ", ".join(unseen([known[name] for name in _conditions(seen)[0]]))

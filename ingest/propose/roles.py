@@ -338,16 +338,6 @@ def own_bumpers(recording: Recording) -> list[tuple[TopicInfo, Kind]]:
     return found
 
 
-def unread_bumpers(recording: Recording) -> list[str]:
-    """Say of each topic that is named as a bumper and cannot be read what to do."""
-    return [
-        f"a topic {name} of unknown type {topic.type} is there: give its definition, --definitions"
-        " FOLDER (PACKAGE/msg/NAME.msg)"
-        for name, topic in recording.topics.items()
-        if "bump" in name.lower() and "unknown type" in (topic.skipped or "")
-    ]
-
-
 def topics_for(recording: Recording, kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
     """Sort the topics that may fill an input, best first.
 
