@@ -1,4 +1,4 @@
-"""The robot that a description (URDF) has: its drive, wheels, mass, casters and lidar.
+"""The robot that a description (URDF) has: its drive, wheels, mass and lidar.
 
 A wheel is a link on a joint that turns without end about an axis across the robot. Missing values
 stay unknown. Parts that cannot be used are named: meshes (no other file is read), arms, steering,
@@ -28,7 +28,6 @@ from restock.ingest.profile.description import (
 MIN_M = 0.005  # of a wheel's radius
 MAX_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
 ENDLESS_RAD = 6 * np.pi  # a joint that may turn so far is a wheel's
-AT_FLOOR_M = 0.012  # what is no higher above the floor stands on it
 DRIVES = {  # words in the names of links and of simulators' plugins
     "omnidirectional": ("mecanum", "omni_wheel", "omniwheel", "planar_move", "holonomic"),
     "ackermann": ("ackermann",),
@@ -95,11 +94,6 @@ def described_robot(
     }
     if boxes:
         values["height_m"] = max(float(high[2]) for _, high in boxes.values()) - floor
-    if drive == "differential":
-        rolling = {wheel.joint.child for wheel in driven}
-        casters = _casters(boxes, rolling, floor, middle)
-        if _stands(casters, values["axle_x_m"], values.get("height_m", radius * 4)):
-            values["casters_m"] = casters
     if lidar := _lidar_z(places, scan_frame, floor):
         values["lidar.z_m"] = lidar
     if meshes := sum(
@@ -107,8 +101,12 @@ def described_robot(
         for name, link in description.links.items()
     ):
         notes.append(f"only meshes, whose size is in other files: {counted(meshes, 'link')}")
-    rounded = {key: _rounded(value) for key, value in values.items()}
-    return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
+    rounded = {
+        key: round(value, 4) + 0.0 if isinstance(value, float) else value
+        for key, value in values.items()
+        if not isinstance(value, float) or np.isfinite(value)
+    }
+    return DescribedRobot(rounded, notes)
 
 
 def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
@@ -227,26 +225,6 @@ def _mass(link: ET.Element) -> float:
     return mass if 0 < mass < HEAVIEST_KG else 0.0
 
 
-def _casters(
-    boxes: dict[str, tuple[F64, F64]], rolling: set[str], floor: float, axle_x: float
-) -> list[list[float]]:
-    """Return x ahead of the axle and y of what else stands on the floor."""
-    found = []
-    for name, (low, high) in boxes.items():
-        small = float(max(high[0] - low[0], high[1] - low[1])) < 0.15
-        if name not in rolling and small and abs(float(low[2]) - floor) < AT_FLOOR_M:
-            x, y = (low[:2] + high[:2]) / 2
-            found.append([float(x) - axle_x, float(y)])
-    return found
-
-
-def _stands(casters: list[list[float]], axle_x_m: float, height_m: float) -> bool:
-    """Return whether the middle is between its supports, with room for speeding up and braking."""
-    room = 0.02 + 0.1 * height_m
-    ahead = [0.0, *(x for x, _ in casters)]
-    return min(ahead) + room < -axle_x_m < max(ahead) - room
-
-
 def _lidar_z(places: dict[str, Place], frame: str, floor: float) -> float | None:
     wanted = frame.strip("/").split("/")[-1]
     place = next((p for n, p in places.items() if n.split("/")[-1] == wanted), None)
@@ -267,12 +245,3 @@ def _no_wheels(description: Description, wheels: list[_Wheel]) -> str:
         f"{description.name!r} has no wheels: no joint of it turns without end about an axis across"
         " the robot"
     )
-
-
-def _rounded(value: Any) -> Any:
-    """Round to four digits after the point; None for a number that no robot has."""
-    if isinstance(value, list):
-        return [[round(number, 4) for number in pair] for pair in value]
-    if isinstance(value, float):
-        return round(value, 4) + 0.0 if np.isfinite(value) else None
-    return value

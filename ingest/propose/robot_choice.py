@@ -266,7 +266,7 @@ def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
         try:
             if key.startswith("lidar."):
                 Lidar(**{key[6:]: value})
-            elif key not in ("drive", "casters_m"):
+            elif key != "drive":
                 Robot(**{key: value})
             kept[key] = value
         except ValueError as error:

@@ -57,11 +57,9 @@ def of(text: str) -> DescribedRobot:
     return described_robot(description, 0.0, "laser")
 
 
-def test_one_axle_and_a_caster() -> None:
+def test_one_axle_and_a_lidar() -> None:
     laser = link("laser") + joint("laser", "0.3 0 0.2", kind="fixed")
-    caster = link("caster_wheel", "<sphere radius='0.02'/>")
-    caster += joint("caster_wheel", "-0.3 0 -0.13", kind="fixed")
-    found = of(robot(wheels((0.2, 0.22), (0.2, -0.22)), laser, caster))
+    found = of(robot(wheels((0.2, 0.22), (0.2, -0.22)), laser))
     assert found.values == {
         "drive": "differential",
         "wheel_radius_m": 0.1,
@@ -69,7 +67,6 @@ def test_one_axle_and_a_caster() -> None:
         "axle_x_m": 0.2,
         "mass_kg": 22.0,
         "height_m": 0.25,
-        "casters_m": [[-0.5, 0.0]],
         "lidar.z_m": 0.35,
     }
 
