@@ -12,7 +12,6 @@ from support.driven_robot import Drive, up_to_the_panel, write_bag
 from support.long import one_in
 
 from restock.cli.start import outcomes
-from restock.cli.start.decisions import fit_is_worse
 from restock.cli.start.stages import Stage
 from restock.cli.start.start import StartCommand, Way
 from restock.cli.start.work import Ended, Work
@@ -233,23 +232,6 @@ def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
         "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
     )
     assert reported.endswith(f"(pdwis) refused: {few}")
-
-
-def test_a_worse_fit_is_reported_with_its_figures() -> None:
-    def gap(*ends: tuple[str, str, float, float]) -> dict[str, Any]:
-        rows = [
-            {"condition": "nominal", "quantity": what, "source": source, "median": m, "p90": p}
-            for what, source, m, p in ends
-        ]
-        return {"paths": rows}
-
-    described = ("position", "nominal", 0.12, 0.3)
-    worse = gap(described, ("position", "calibrated", 0.26, 0.5))
-    assert "0.260 m from the log" in str(fit_is_worse(worse))
-    assert "without it 0.120 m" in str(fit_is_worse(worse))
-    assert fit_is_worse(gap(described, ("position", "calibrated", 0.13, 0.2))) is None
-    assert fit_is_worse(gap(described, ("position", "calibrated", 0.08, 0.4))) is None
-    assert fit_is_worse(gap(described, ("heading", "calibrated", 0.9, 0.9))) is None
 
 
 def test_a_lidar_that_sees_into_the_robot_stops_it(tmp_path, shell):

@@ -143,28 +143,6 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
     return f"in nominal driving it is {verdict['verdict']}: {'; '.join(verdict['reasons'])}"
 
 
-def fit_is_worse(gap: Document) -> str | None:
-    """Say why the fitted twin is farther from the logs than the described one; None if not.
-
-    By the position gap of nominal driving, of the same segments: both its median and its 90th
-    percentile.
-    """
-    ends = {
-        row["source"]: row
-        for row in gap.get("paths", ())
-        if row["condition"] == "nominal" and row["quantity"] == "position"
-    }
-    described, fitted = ends.get("nominal"), ends.get("calibrated")
-    if described is None or fitted is None:
-        return None
-    if fitted["median"] <= described["median"] or fitted["p90"] < described["p90"]:
-        return None
-    return (
-        f"with it the twin ends {fitted['median']:.3f} m from the log in nominal driving (median),"
-        f" without it {described['median']:.3f} m"
-    )
-
-
 def no_ways(to: Settings) -> str | None:
     """Say why none of the held-out routes can be driven; None if one can."""
     from restock.replay.panel.panel import Panel

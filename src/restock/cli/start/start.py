@@ -163,7 +163,9 @@ class Way:
                     "driving into it"
                 )
                 to = replace(to, kinds=tuple(kinds))
-        gap, fitted = self._fit()
+        horizon_s = decisions.horizon(to.profile)
+        fitted = self.work.do(stages.fit(to, horizon_s)).good
+        gap = self.work.do(stages.gap(to, horizon_s, fitted=fitted))
         if fitted:
             settings.append(f"env.perturbation={to.fitted}")
         nothing = floor.good and floor.document.get("episodes") == []
@@ -175,16 +177,6 @@ class Way:
             return None
         self.to = replace(to, train=tuple(settings))
         return floor
-
-    def _fit(self) -> tuple[Ended, bool]:
-        """Return the gap of the twin that is used, and whether that is the fitted one."""
-        horizon_s = decisions.horizon(self.to.profile)
-        fitted = self.work.do(stages.fit(self.to, horizon_s))
-        gap = self.work.do(stages.gap(self.to, horizon_s, fitted=fitted.good))
-        if not (fitted.good and gap.good) or (why := decisions.fit_is_worse(gap.document)) is None:
-            return gap, fitted.good
-        self._warn(f"the fit is not used: {why}")
-        return self.work.do(stages.gap(self.to, horizon_s, fitted=False)), False
 
     def _policy(self, floor: Ended | None, coverage: Document, panel: Document) -> None:
         requested, twin = self.requested, floor is not None
