@@ -33,11 +33,10 @@ from restock.ingest.profile.description import (
     read_description,
 )
 from restock.ingest.profile.signal_paths import frame_id_path, plain
-from restock.ingest.profile.tables import Clock, Frames, Input
-from restock.ingest.propose.pose_choice import named_frames, transform_topics
+from restock.ingest.profile.tables import Input
+from restock.ingest.propose.pose_choice import mount_of, named_frames
 from restock.ingest.propose.roles import Kind, own_first, shared
-from restock.ingest.steps.align import align
-from restock.ingest.steps.frames import Edges, PoseSeries, Tree, upward
+from restock.ingest.steps.frames import Edges, PoseSeries, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
 
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms
@@ -410,9 +409,7 @@ def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
     return SeenScans(said, (first, last, step[0]))
 
 
-def with_lidar(
-    footprint: Footprint, recording: Recording, edges: Edges, scan_frame: str
-) -> Footprint:
+def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint:
     """Add the lidar's place by the last of the recording's transforms, if they say it sanely.
 
     The base frame is taken for the middle of the outline. If the lidar is outside a measured one,
@@ -424,35 +421,16 @@ def with_lidar(
         for base in named_frames(BASE_FRAMES, frames)
         if base in (plain(scan_frame), *upward(plain(scan_frame), edges.parents))
     ]
-    place = _place(recording, edges, scan_frame, bases[0]) if scan_frame and bases else None
-    if place is None:
+    found = mount_of(edges, scan_frame, bases[0]) if bases else None
+    if found is None or (np.abs(found[1][:2]) >= MAX_ASIDE_M).any():
         return footprint
-    (x_m, y_m), yaw_rad, upside_down = place
-    turned = replace(footprint, lidar_yaw_rad=yaw_rad, upside_down=upside_down)
+    turn, (x_m, y_m, _) = found
+    yaw_rad = float(np.arctan2(turn[1, 0], turn[0, 0]))
+    turned = replace(footprint, lidar_yaw_rad=yaw_rad, upside_down=bool(turn[2, 2] < 0))
     if footprint.measured and abs(x_m) > footprint.length_m / 2:
         return replace(turned, lidar_source=f"{bases[0]} has it {x_m:.2f} m ahead, outside")
     source = f"of {bases[0]}, by transforms; that this is the middle is a guess"
-    return turned.with_lidar_at(x_m, y_m, source)
-
-
-def _place(
-    recording: Recording, edges: Edges, scan_frame: str, base: str
-) -> tuple[tuple[float, float], float, bool] | None:
-    """Return the lidar's place, yaw and whether it is upside down, in the base's frame."""
-    if plain(scan_frame) == base:
-        return (0.0, 0.0), 0.0, False
-    topic, static_topic = transform_topics(recording)
-    usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
-    kept = edges.only({base, scan_frame})
-    segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)
-    last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
-    times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
-    at = Tree(usual, kept, segments).place(scan_frame, times)
-    x, y = (float(way) for way in at.translation_m[0, :2])
-    yaw = float(at.yaw_rad[0])
-    if at.problem[0] != "" or max(abs(x), abs(y)) >= MAX_ASIDE_M or not np.isfinite(yaw):
-        return None
-    return (x, y), yaw, bool(at.rotation[0, 2, 2] < 0)
+    return turned.with_lidar_at(float(x_m), float(y_m), source)
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:

@@ -201,7 +201,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
     if footprint is None:
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
-        footprint = with_lidar(footprint, recording, edges, frame)
+        footprint = with_lidar(footprint, edges, frame)
     if footprint.lidar_yaw_rad is None and plain(frame).split("/")[-1] not in BASE_FRAMES:
         footprint = replace(footprint, lidar_unplaced=plain(frame))
     robot = propose_robot(

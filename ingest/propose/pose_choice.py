@@ -17,11 +17,19 @@ import numpy as np
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.description import BASE_FRAMES, FIXED_FRAMES
-from restock.ingest.profile.signal_paths import transform_fields
+from restock.ingest.profile.signal_paths import AXES, TURN, plain, transform_fields
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.roles import Roles, robots_in
 from restock.ingest.steps.align import align
-from restock.ingest.steps.frames import Edges, PoseSeries, Tree, poses_along, upward
+from restock.ingest.steps.frames import (
+    PARENT,
+    Edges,
+    PoseSeries,
+    Tree,
+    poses_along,
+    rotations,
+    upward,
+)
 from restock.ingest.steps.input_columns import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.task.task import wrap_angle, yaw_of
 
@@ -71,16 +79,47 @@ def transform_topics(recording: Recording) -> tuple[str, str]:
     return (of_foxglove[0], names[1]) if len(of_foxglove) == 1 else names
 
 
-def transform_edges(recording: Recording) -> Edges:
-    """Read the transforms of `transform_topics`; empty if it has no such topics."""
-    topic, static_topic = transform_topics(recording)
+def transform_edges(recording: Recording, frames: Frames | None = None) -> Edges:
+    """Read the transforms of these topics, else of `transform_topics`; empty if there are none."""
+    if frames is None:
+        topic, static_topic = transform_topics(recording)
+        frames = Frames(topic=topic, static_topic=static_topic)
     wanted = {
         name: fields
-        for name in (topic, static_topic)
+        for name in (frames.topic, frames.static_topic)
         if name in recording.topics and (fields := transform_fields(recording.leaves(name)))
     }
-    frames = Frames(topic=topic, static_topic=static_topic)
     return Edges.of(frames, recording.read(wanted) if wanted else {})
+
+
+def mount_of(edges: Edges, sensor: str, base: str) -> tuple[F64, F64] | None:
+    """Return rotation (3, 3) and place (3,) of a sensor's frame in the base's; None if unknown.
+
+    Of moving transforms the last counts.
+    """
+    turn, place = np.eye(3), np.zeros(3)
+    chain = chain_between(edges, sensor, base) if sensor else []
+    for name in chain:
+        fields = edges.topics[name].fields
+        step = rotations(*(np.asarray(fields[part], np.float64)[-1:] for part in TURN))[0]
+        place = step @ place + [float(np.asarray(fields[axis])[-1]) for axis in AXES]
+        turn = step @ turn
+    known = bool(chain) or plain(sensor) == plain(base)
+    return (turn, place) if known and np.isfinite([*turn, place]).all() else None
+
+
+def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
+    """Return the names in `edges.topics` of the transforms from a frame up to another, or []."""
+    chain, here = list[str](), plain(base)
+    while here != plain(fixed):
+        names = [name for name in edges.topics if name.split(" ", 1)[1] == here]
+        if not names or len(chain) > len(edges.topics):
+            return []
+        # A frame may be sent both as static and as moving: the moving one says where it is.
+        name = min(names, key=lambda name: (name in edges.static, -len(edges.topics[name])))
+        chain.append(name)
+        here = str(np.asarray(edges.topics[name].fields[PARENT], object)[-1])
+    return chain
 
 
 def transform_frames(recording: Recording, edges: Edges) -> Frames | None:

@@ -25,7 +25,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -301,17 +301,10 @@ def read_image(path: Path) -> tuple[F64, NDArray[np.bool_]]:
             if image.mode.startswith("I"):  # 16 bits: `convert` would clip them
                 return np.asarray(image).astype(np.float64) / 65535, seen
             return np.asarray(image.convert("L")).astype(np.float64) / 255, seen
-    except UnidentifiedImageError as error:
-        raise ConfigError(
-            "is not a PGM, PNG or BMP",
-            where=str(path),
-            remedy="convert it, such as with `convert map.tif map.png`",
-        ) from error
-    except FileNotFoundError as error:
-        raise ConfigError(
-            f"cannot be read: {error.strerror}",
-            where=str(path),
-            remedy="image in map.yaml is a path beside it",
-        ) from error
     except (OSError, ValueError, SyntaxError, OverflowError, Image.DecompressionBombError) as error:
-        raise ConfigError(f"cannot be read as an image: {error}", where=str(path)) from error
+        raise ConfigError(
+            f"cannot be read as a PGM, PNG or BMP: {error}",
+            where=str(path),
+            remedy="image in map.yaml is a path beside it; convert other formats, such as with"
+            " `convert map.tif map.png`",
+        ) from error

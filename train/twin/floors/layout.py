@@ -171,59 +171,39 @@ class Warehouse:
 
     def __post_init__(self) -> None:
         """Raise ConfigError if the numbers do not make a floor."""
-        where = f"layout {self.name}"
+        if wrong := self._wrong():
+            raise ConfigError(wrong[0], where=f"layout {self.name}", remedy=wrong[1])
+
+    def _wrong(self) -> tuple[str, str] | None:
+        """Return what is wrong with the numbers, and what to do; None if they make a floor."""
+        size = f"0 to {self.width_m:g} m by 0 to {self.depth_m:g} m"
         for side in (self.width_m, self.depth_m):
             if not MIN_SIDE_M <= side <= MAX_SIDE_M:
-                raise ConfigError(
-                    f"a side of {side:g} m is outside {MIN_SIDE_M:g} to {MAX_SIDE_M:g} m",
-                    where=where,
-                    remedy="cut the floor to the part that the robots drive in"
-                    if side > MAX_SIDE_M
-                    else "give width_m and depth_m in metres",
-                )
+                what = f"a side of {side:g} m is outside {MIN_SIDE_M:g} to {MAX_SIDE_M:g} m"
+                return what, "give the part that the robots drive in, in metres"
         if len(self.racks) > MAX_RACKS:
-            raise ConfigError(
-                f"{len(self.racks)} racks are more than {MAX_RACKS}",
-                where=where,
-                remedy="join racks that touch, or cut the floor",
-            )
+            what = f"{len(self.racks)} racks are more than {MAX_RACKS}"
+            return what, "join racks that touch, or cut the floor"
         areas = [("rack", rack) for rack in self.racks]
         areas += [(segment.name, segment.area) for segment in self.segments]
         areas += [(dock.name, dock.area) for dock in self.docks]
         areas += [("one-way part", rule.area) for rule in self.one_way]
-        areas += self.cross_zones
-        for what, box in areas:
+        for what, box in (*areas, *self.cross_zones):
             inside = -1e-9 <= box.x_min < box.x_max <= self.width_m + 1e-9
             if not inside or not -1e-9 <= box.y_min < box.y_max <= self.depth_m + 1e-9:
                 edges = ", ".join(f"{edge:g}" for edge in box.edges)
-                raise ConfigError(
-                    f"{what} [{edges}] is not a box within 0 to {self.width_m:g} m by 0 to"
-                    f" {self.depth_m:g} m",
-                    where=where,
-                    remedy="give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres",
-                )
+                remedy = "give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres"
+                return f"{what} [{edges}] is not a box within {size}", remedy
         if not 0.05 <= self.room_m <= 3.0:
-            raise ConfigError(
-                f"room_m is {self.room_m:g}",
-                where=where,
-                remedy="half the robot's width and a margin, .05 to 3 m",
-            )
+            return f"room_m is {self.room_m:g}", "half the robot's width and a margin, .05 to 3 m"
         if not 0.1 <= self.way_m[0] < self.way_m[1] <= 4 * MAX_SIDE_M:
-            raise ConfigError(
-                f"way_m is {self.way_m[0]:g} to {self.way_m[1]:g} m",
-                where=where,
-                remedy="the shortest and longest way of a mission, in metres",
-            )
+            what = f"way_m is {self.way_m[0]:g} to {self.way_m[1]:g} m"
+            return what, "the shortest and longest way of a mission, in metres"
         for x, y in self.goals_m + self.starts_m:
             if not (0 <= x <= self.width_m and 0 <= y <= self.depth_m):
-                raise ConfigError(
-                    f"the place [{x:g}, {y:g}] is not within 0 to {self.width_m:g} m by 0 to"
-                    f" {self.depth_m:g} m",
-                    where=where,
-                    remedy="give goals and starts in the floor's own frame, in metres",
-                )
-        if not len(self.goals):
-            raise ConfigError("has no place for a goal", where=where, remedy="give docks")
+                what = f"the place [{x:g}, {y:g}] is not within {size}"
+                return what, "give goals and starts in the floor's own frame, in metres"
+        return None if len(self.goals) else ("has no place for a goal", "give docks")
 
     @cached_property
     def goals(self) -> F64:

@@ -34,6 +34,7 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, o
 from restock.ingest.profile.description import BASE_FRAMES
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint, scans_of
+from restock.ingest.propose.pose_choice import mount_of, transform_edges
 from restock.ingest.propose.roles import KINDS, Kind, topics_for
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.needs import angle_keys
@@ -46,7 +47,7 @@ from restock.train.twin.floors.occupancy_grid import (
     out_of_frame,
 )
 from restock.train.twin.floors.placed import MIN_RETURNS, NEAR_M, RETURNS, WITHIN_M
-from restock.train.twin.survey.poses import JUMP_M, Poses, Times, mount_of, shared_clock
+from restock.train.twin.survey.poses import JUMP_M, Poses, Times, shared_clock
 
 BEAMS = 360  # at most, of a scan: more are thinned out
 SCANS = 3000  # at most, of a recording
@@ -189,8 +190,9 @@ def _mount(
     over = np.diag([1.0, -1.0, -1.0])
     scan = None if profile is None else profile.inputs.scan
     bases = [profile.frames.base] if profile is not None and profile.frames is not None else []
+    edges = transform_edges(recording)
     for base in (*bases, *BASE_FRAMES):
-        if found := mount_of(recording, frame, base):
+        if found := mount_of(edges, frame, base):
             turn, place = found
             if scan is None or scan.upside_down == (turn[2, 2] < 0):
                 return turn, place

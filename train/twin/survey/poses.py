@@ -16,12 +16,16 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.signal_paths import AXES, FRAME_ID, TURN, plain, transform_fields
+from restock.ingest.profile.signal_paths import AXES, FRAME_ID, TURN, plain
 from restock.ingest.profile.tables import Frames
-from restock.ingest.propose.pose_choice import on_map, transform_edges, transform_frames
+from restock.ingest.propose.pose_choice import (
+    chain_between,
+    on_map,
+    transform_edges,
+    transform_frames,
+)
 from restock.ingest.propose.roles import KINDS, topics_for
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.frames import PARENT, Edges, rotations
 from restock.ingest.steps.input_columns import fixes_of
 from restock.ingest.task.task import yaw_of
 
@@ -234,7 +238,7 @@ def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
 
     The poses are at the times of the moving transform that is sent most often.
     """
-    edges = _edges(recording, frames)
+    edges = transform_edges(recording, frames)
     chain = chain_between(edges, frames.base, frames.fixed)
     if not chain:
         return None
@@ -260,46 +264,6 @@ def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
     way = " -> ".join(name.split(" ", 1)[1] for name in reversed(chain))
     source = f"transforms {plain(frames.fixed)} -> {way}"
     return _poses(kept, x[sane], y[sane], yaw[sane], plain(frames.fixed), source)
-
-
-def mount_of(recording: Recording, sensor: str, base: str) -> tuple[F64, F64] | None:
-    """Return rotation (3, 3) and place (3,) of a sensor's frame in the base's; None if unknown."""
-    turn, place = np.eye(3), np.zeros(3)
-    if plain(sensor) == plain(base):
-        return turn, place
-    edges = _edges(recording, Frames(fixed=base, base=sensor)) if sensor else None
-    chain = [] if edges is None else chain_between(edges, sensor, base)
-    if edges is None or not chain:
-        return None
-    for name in chain:
-        fields = edges.topics[name].fields
-        step = rotations(*(np.asarray(fields[part], np.float64)[-1:] for part in TURN))[0]
-        place = step @ place + [float(np.asarray(fields[axis])[-1]) for axis in AXES]
-        turn = step @ turn
-    return (turn, place) if np.isfinite(turn).all() and np.isfinite(place).all() else None
-
-
-def _edges(recording: Recording, frames: Frames) -> Edges:
-    wanted = {
-        name: fields
-        for name in (frames.topic, frames.static_topic)
-        if name in recording.topics and (fields := transform_fields(recording.leaves(name)))
-    }
-    return Edges.of(frames, recording.read(wanted) if wanted else {})
-
-
-def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
-    """Return the names in `edges.topics` of the transforms from a frame up to another, or []."""
-    chain, here = list[str](), plain(base)
-    while here != plain(fixed):
-        names = [name for name in edges.topics if name.split(" ", 1)[1] == here]
-        if not names or len(chain) > len(edges.topics):
-            return []
-        # A frame may be sent both as static and as moving: the moving one says where it is.
-        name = min(names, key=lambda name: (name in edges.static, -len(edges.topics[name])))
-        chain.append(name)
-        here = str(np.asarray(edges.topics[name].fields[PARENT], object)[-1])
-    return chain
 
 
 def _planar(columns: TopicColumns) -> tuple[F64, F64, F64]:
