@@ -192,25 +192,22 @@ def read_urdf(path: Path) -> RobotText:
     Raises:
         ConfigError: it cannot be read, is no URDF, or has no wheels.
     """
-    remedy = "give the URDF of a wheeled robot, as XML in UTF-8"
     try:
         with path.open("rb") as file:
             text = file.read(4 * MAX_LETTERS + 1).decode("utf-8")
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be read: {error.strerror}", where=str(path), remedy="check the path of --urdf"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"is not a URDF: {error}", where=str(path), remedy=remedy) from error
-    found = RobotText(path.name, text, "urdf")
-    problem: str | None
-    if isinstance(description := found.description, str):
-        problem = description
+    except (OSError, UnicodeDecodeError) as error:
+        problem: str | None = f"cannot be read: {error}"
     else:
-        problem = described_robot(description, 0.0).problem
-    if problem is not None:
-        raise ConfigError(problem, where=str(path), remedy=remedy)
-    return found
+        found = RobotText(path.name, text, "urdf")
+        description = found.description
+        if isinstance(description, str):
+            problem = description
+        else:
+            problem = described_robot(description, 0.0).problem
+        if problem is None:
+            return found
+    remedy = "give the URDF of a wheeled robot, as XML in UTF-8"
+    raise ConfigError(problem, where=str(path), remedy=remedy)
 
 
 def propose_robot(

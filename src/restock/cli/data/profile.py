@@ -95,7 +95,7 @@ class ProfileCommand:
 
     def _new(self) -> int:
         from restock.ingest.containers.open_recording import recordings_in
-        from restock.ingest.propose.drives import names_of, propose_for_drives
+        from restock.ingest.propose.drives import propose_for_drives
         from restock.ingest.propose.footprint import parse_footprint
         from restock.ingest.propose.gather import Given
 
@@ -113,7 +113,7 @@ class ProfileCommand:
             stem += f"_{self.robot.strip('/')}"
         paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
         drives, unreadable = self._drives(paths)
-        chosen, unread = [drives.paths[one] for one in drives.read], drives.unread
+        chosen = [drives.paths[one] for one in drives.read]
         with ExitStack() as opened:
             recordings = [opened.enter_context(self._open(path)) for path in chosen]
             with output.progress("proposing", None) as advance:
@@ -124,12 +124,6 @@ class ProfileCommand:
             losses = _losses(recordings, proposal.toml)
         chosen.sort(key=lambda path: path != proposal.base)  # that one first
         toml = "".join(f"# LOST: {loss}\n" for loss in losses) + proposal.toml
-        if unread:
-            of = len(chosen) + len(unread)
-            output.say(
-                f"read the {len(chosen)} largest of {of:,} recordings of that kind of robot; "
-                f"not read: {visible(names_of(unread))}"
-            )
         if self.out is not None:
             write_text(self.out, toml)
             rows = f"{proposal.transitions:,} transitions of {proposal.ticks:,} ticks"
@@ -142,7 +136,7 @@ class ProfileCommand:
                     "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
                     "kinds": [asdict(kind) for kind in proposal.kinds],
                     "read": [str(path) for path in chosen],
-                    "unread": [str(path) for path in unread],
+                    "unread": [str(path) for path in drives.unread],
                     "unreadable": [str(path) for path in unreadable],
                     "losses": losses,
                     "findings": [one.as_row() for one in proposal.findings],
@@ -150,12 +144,11 @@ class ProfileCommand:
             )
         elif self.out is None:
             sys.stdout.write(toml)
-        for each in proposal.advice:
-            output.say(visible(str(each)))
-        for loss in losses:
-            output.say(f"lost: {loss}")
-        for finding in proposal.findings:
-            output.say(visible(finding.reported))
+        said = [str(each) for each in proposal.advice]
+        said += [f"lost: {loss}" for loss in losses]
+        said += [finding.reported for finding in proposal.findings]
+        for line in said:
+            output.say(visible(line))
         for problem in proposal.problems:
             names = visible(", ".join(self.paths))
             sys.stderr.write(f"restock: {names}: cannot be used yet: {problem}\n")

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 FOLDER, RECORD = "start", "stages.json"
-SMALL_BYTES = 1_000_000  # files up to this size are hashed; larger ones are known by size and time
 LAST_LINES = 20  # shown of a command that runs beside another and fails
 Dispatch = Callable[[list[str]], int]
 
@@ -189,7 +188,8 @@ class Work:
     def _stamp(self, stage: Stage) -> str:
         """Hash all that decides a result: the command, the user's files, and the stages before."""
         parts = [stage.line(), *self._stamps[-1:], *(_fingerprint(path) for path in stage.reads)]
-        self._stamps.append(_digest(os.fsencode("\n".join(parts))))
+        text = os.fsencode("\n".join(parts))
+        self._stamps.append(hashlib.blake2b(text, digest_size=12).hexdigest())
         return self._stamps[-1]
 
     def _clear(self, stage: Stage) -> None:
@@ -284,17 +284,10 @@ def _parsed(text: str) -> Any:
 
 
 def _fingerprint(path: Path) -> str:
-    """Return what a user's file or folder holds now, as a text to compare."""
+    """Return the sizes and times of a user's file or folder, as a text to compare."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     parts = []
     for file in filter(Path.is_file, files):
         status = file.stat()
-        reported = f"{status.st_size} {status.st_mtime_ns}"
-        if status.st_size <= SMALL_BYTES:
-            reported = _digest(file.read_bytes())
-        parts.append(f"{file} {reported}")
+        parts.append(f"{file} {status.st_size} {status.st_mtime_ns}")
     return "\n".join(parts)
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=12).hexdigest()
