@@ -115,7 +115,7 @@ MAY_IMPORT = {
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose ingest/task"
-        " replay/mixture replay/panel replay/trace train/dqn"
+        " replay/mixture replay/trace train/dqn"
         " train/evaluation train/run train/twin/floors train/twin/missions"
     ),
     "cli/twin": (

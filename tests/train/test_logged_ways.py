@@ -13,8 +13,7 @@ from support.stores import recording_transitions, with_clear_view, write_store
 
 from restock.arrays import F64
 from restock.cli import main
-from restock.cli.start.decisions import no_ways
-from restock.cli.start.stages import Settings
+from restock.errors import ConfigError
 from restock.ingest.store.transitions import replaced
 from restock.replay.panel.panel import Panel
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
@@ -96,17 +95,11 @@ def test_held_out_ways_are_missions_and_others_are_counted(panel: Panel) -> None
     assert 0 < held_out.logged < 36
 
 
-def test_start_says_why_no_route_of_the_logs_can_be_driven(panel: Panel) -> None:
-    to = Settings((), panel.path.parent)
-    write_floor(FLOOR, to.floor)
-    assert no_ways(to) is None
-    to.floor.unlink()
-    write_floor(replace(FLOOR, map_origin=(900.0, 0.0, 0.0)), to.floor)
-    why = no_ways(to)
-    to.floor.unlink()
-    assert why is not None
-    assert "0 of " in why
-    assert "its recording is in another frame than the floor" in why
+def test_routes_in_another_frame_than_the_floor_are_refused(panel: Panel) -> None:
+    away = replace(FLOOR, map_origin=(900.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="in another frame than the floor") as refused:
+        logged_missions(panel, (away,), ("nominal",))
+    assert "0 of " in refused.value.what
 
 
 def test_each_way_is_a_mission_of_its_recordings_floor(panel: Panel) -> None:

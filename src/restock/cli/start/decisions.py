@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from restock.cli.start.outcomes import Document, of_nominal
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import FOLDER, Ended
-from restock.errors import ConfigError, counted
+from restock.errors import counted
 from restock.files import read_json
 
 if TYPE_CHECKING:
@@ -141,19 +141,6 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
     if verdict["verdict"] == "trusted":
         return None
     return f"in nominal driving it is {verdict['verdict']}: {'; '.join(verdict['reasons'])}"
-
-
-def no_ways(to: Settings) -> str | None:
-    """Say why none of the held-out routes can be driven; None if one can."""
-    from restock.replay.panel.panel import Panel
-    from restock.train.evaluation.logged_ways import logged_missions
-    from restock.train.twin.floors.floors import open_floors
-
-    try:
-        logged_missions(Panel.open(to.panel), open_floors(str(to.floor)), ("nominal",))
-    except ConfigError as error:
-        return error.what
-    return None
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:

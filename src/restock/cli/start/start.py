@@ -194,11 +194,7 @@ class Way:
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
             if floor.good and decisions.has_goal(to.profile):
-                why = None if self.work.plan else decisions.no_ways(to)
-                if why is None:
-                    judged.append(do(stages.evaluate_on_ways(to)))
-                else:
-                    self._warn(f"no evaluation on the routes of the logs: {why}")
+                do(stages.evaluate_on_ways(to))  # fails, and says so, if no route is on the floor
             judged.append(do(stages.evaluate(to, "cloned")))
         if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
             judged.append(do(stages.judge(to)))
