@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,6 @@ from restock.ingest.propose.gather import Evidence, Given, GoalChoice, gather
 from restock.ingest.propose.pose_choice import on_map
 from restock.ingest.propose.propose import (
     Proposal,
-    RobotKind,
     propose_from,
     propose_profile,
     trial_of,
@@ -80,10 +80,10 @@ class Drives:
         ]
 
     @property
-    def robots(self) -> list[RobotKind]:
+    def robots(self) -> list[dict[str, Any]]:
         """Return every kind with all its recordings, if there are several."""
         return [
-            RobotKind(str(self.traits[kind[0]]), [str(self.paths[one]) for one in kind])
+            {"robot": str(self.traits[kind[0]]), "recordings": [str(self.paths[n]) for n in kind]}
             for kind in self.kinds
             if len(self.kinds) > 1
         ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
@@ -35,14 +36,6 @@ INSTEAD_OF_COMMANDS = (
 
 
 @dataclass(frozen=True)
-class RobotKind:
-    """Recordings of one kind of robot, and what they say of it."""
-
-    robot: str
-    recordings: list[str]
-
-
-@dataclass(frozen=True)
 class Proposal:
     """The TOML of a profile, what in it needs a person, and what it makes of the recording."""
 
@@ -55,7 +48,8 @@ class Proposal:
     problems: list[str] = field(default_factory=list)  # why it cannot be used as it is
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, if several may drive the robot
-    kinds: list[RobotKind] = field(default_factory=list)  # if there are several: its own first
+    # Of each kind, if there are several: its `robot` in words and `recordings`; its own first.
+    kinds: list[dict[str, Any]] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
 
 

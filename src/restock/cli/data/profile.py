@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from restock.ingest.propose.drives import Drives, RobotTraits
 
 # of a proposal
-_PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands")
+_PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands", "kinds")
 OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
 
 
@@ -133,8 +133,7 @@ class ProfileCommand:
                 {
                     "toml": toml,
                     **{name: getattr(proposal, name) for name in _PRINTED},
-                    "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
-                    "kinds": [asdict(kind) for kind in proposal.kinds],
+                    "advice": [asdict(each) for each in proposal.advice],
                     "read": [str(path) for path in chosen],
                     "unread": [str(path) for path in drives.unread],
                     "unreadable": [str(path) for path in unreadable],
