@@ -33,21 +33,6 @@ class Stop(Exception):
         self.why, self.remedies = why, remedies
 
 
-def fullest(recordings: list[Document]) -> str | None:
-    """Return the recording with most of what a profile needs: a command, a pose, and time."""
-    from restock.ingest.propose.roles import KINDS
-
-    def types(role: str) -> set[str]:
-        return {kind.type for kind in KINDS[role]}
-
-    def rank(row: Any) -> tuple[int, float]:
-        there = {topic["type"] for topic in row["topics"].values() if topic["messages"]}
-        roles = sum(bool(there & types(role)) for role in ("command", "pose", "wheels"))
-        return roles, row["duration_s"] or 0.0
-
-    return str(max(recordings, key=rank)["path"]) if recordings else None
-
-
 def edited(profile: Path | str | None, out: Path) -> bool:
     """Return whether a person edited the profile in the folder since it was proposed."""
     path, proposed = Path(str(profile)), out / FOLDER / "propose.json"

@@ -74,10 +74,15 @@ class Way:
             self.work.say(f"   continuing with {intact}; or {SALVAGING}")
         return readable
 
+    def _longest(self, recordings: list[Document]) -> str:
+        """Return the longest of these recordings, else the first of all."""
+        times = {row["path"]: row["duration_s"] or 0.0 for row in recordings}
+        return str(max(times, key=times.__getitem__, default=self.first))
+
     def _profile(self, readable: list[Document]) -> None:
         """Take the user's profile or propose one, and check it against a recording."""
         requested, to = self.requested, self.to
-        recording = decisions.fullest(readable) or self.first
+        recording = self._longest(readable)
         own = requested.profile is not None
         if not own and not decisions.edited(to.profile, requested.out):
             self._propose(requested.paths if len(readable) != 1 else (recording,))
@@ -87,7 +92,7 @@ class Way:
         mine = [row for row in readable if row["path"] not in left_out]
         if len(mine) < len(readable):
             self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
-            recording = decisions.fullest(mine) or recording
+            recording = self._longest(mine)
         checked = self.work.do(stages.check(to, base or recording))
         if not checked.good:
             raise Stop(f"the profile does not fit {base or recording}", f"edit {to.profile}", AGAIN)
