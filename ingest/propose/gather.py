@@ -172,8 +172,8 @@ def gather(recording: Recording, given: Given) -> Evidence:
         chosen = CommandChoice(CommandLog.read(recording, fits[0]) if fits else None)
     else:
         roles["command"], chosen = choose_command(recording, roles["command"])
-    best = {topic.name for topic, _ in roles["command"][:1]}
-    roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in best]
+    drives = {topic.name for topic, _ in roles["command"][:1]}
+    roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in drives]
     if not (roles["goal"] and roles["plan"]):
         roles["goal"] = roles["plan"] = []
     edges = transform_edges(recording)

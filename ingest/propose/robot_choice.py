@@ -192,22 +192,18 @@ def read_urdf(path: Path) -> RobotText:
     Raises:
         ConfigError: it cannot be read, is no URDF, or has no wheels.
     """
+    remedy = "give the URDF of a wheeled robot, as XML in UTF-8"
     try:
         with path.open("rb") as file:
             text = file.read(4 * MAX_LETTERS + 1).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        problem: str | None = f"cannot be read: {error}"
-    else:
-        found = RobotText(path.name, text, "urdf")
-        description = found.description
-        if isinstance(description, str):
-            problem = description
-        else:
-            problem = described_robot(description, 0.0).problem
-        if problem is None:
-            return found
-    remedy = "give the URDF of a wheeled robot, as XML in UTF-8"
-    raise ConfigError(problem, where=str(path), remedy=remedy)
+        raise ConfigError(f"cannot be read: {error}", where=str(path), remedy=remedy) from error
+    found = RobotText(path.name, text, "urdf")
+    described = found.description
+    wrong = described if isinstance(described, str) else described_robot(described, 0.0).problem
+    if wrong is not None:
+        raise ConfigError(wrong, where=str(path), remedy=remedy)
+    return found
 
 
 def propose_robot(
