@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy import ndimage
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.definitions import choose_definitions
@@ -45,7 +44,6 @@ Source = Literal["map", "scans", "corridor"]
 MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
 TURN_MARGIN_M = 0.07  # beyond the circle around its corners, when it turns
 STAND_IN = Footprint(0.7, 0.5, "the twin's default robot: the size of this robot is not known")
-NEAREST_SHARE = 0.05  # of the poses: as near as these it came, to walls that may be blurred
 MIN_BODY_M = 0.15
 MIN_SCANS = 8
 AGREEING, WELL_AGREEING = 0.5, 0.8  # of the ends of scans, on walls that they made together
@@ -139,8 +137,7 @@ def survey(
     body, notes = footprint or evidence.footprint, list(evidence.notes)
     poses = evidence.poses
     how, grid, source = _grid(evidence, by, body, str(path), notes)
-    if body is None:
-        body = _as_near_as_it_came(grid, poses) if how != "corridor" else STAND_IN
+    body = body or STAND_IN
     made = floor_of_grid(
         grid,
         name=path.stem if recording is None else f"{path.stem}: {Path(recording).stem}",
@@ -235,21 +232,6 @@ def _scanned(
 
 def _turn_m(body: Footprint) -> float:
     return float(np.hypot(body.length_m, body.width_m)) / 2 + TURN_MARGIN_M
-
-
-def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
-    """Estimate an unknown robot size: no larger than the gaps that it went through."""
-    if poses is None:
-        return STAND_IN
-    cells, inside = grid.cells_at(poses.places_m)
-    room = ndimage.distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] * grid.cell_m
-    near = float(np.quantile(room[tuple(cells[inside].T)], NEAREST_SHARE)) if inside.any() else 0.0
-    side = max(2 * (near - MARGIN_M), MIN_BODY_M)
-    if side >= STAND_IN.width_m:
-        return STAND_IN
-    return Footprint(
-        side, side, f"its size is not known, but it came within {near:.2f} m of obstacles"
-    )
 
 
 def _check_frames(
