@@ -74,8 +74,6 @@ class DemoCommand:
         console = stderr() if self.json else stdout()
         say = speaker(console)
         work = Work(self.out, main, say, plan=self.dry_run, why=WHY)
-        if not self.dry_run:
-            say(f"[bold]What you are about to see[/bold]\n\n{OPENING}")
         for stage in plan:
             ended = work.do(stage)
             if not ended.good:
@@ -232,22 +230,6 @@ def tell(to: Settings, evaluated: Document, console: Console) -> None:
     show("One rare event, from its message to an update", rare_event(to))
     show("What to try next", NEXT.format(store=quoted(to.store), run=quoted(to.run)).splitlines())
 
-
-OPENING = """\
-Recordings of a robot in a warehouse become a policy. Most of the driving is in
-an easy aisle. Wet floors, blocked aisles and people who step out are rare, and
-a learner hardly sees them.
-
-  1. Recordings become rows, each labelled with what happened at that moment.
-  2. Rare conditions get quotas, so that every batch contains all of them.
-  3. A network learns from the logs alone: the policy before fine-tuning.
-  4. Another one continues in a simulation, the twin: the policy after it.
-  5. A third one continues, too, but is fed uniformly, with the logs as they are.
-  6. All drive the same missions as the robot's scripted planner.
-
-At the end you see the policies before and after, what the critic was fed of
-each condition, one rare event followed from the recording's message
-to the update that learned from it, and what to try with your own recordings."""
 
 NEXT = """\
 restock start BAG --out mine
