@@ -67,20 +67,6 @@ class Footprint:
         """Return whether the lidar is so far beside the middle that its input gives its place."""
         return abs(self.lidar_y_m) > MIN_ASIDE_M
 
-    def with_lidar_at(self, x_m: float, y_m: float, source: str) -> Footprint:
-        """Place the lidar; a guessed outline is enlarged to contain it."""
-        length_m, width_m = self.length_m, self.width_m
-        if not self.measured:
-            length_m, width_m = max(length_m, 2 * abs(x_m)), max(width_m, 2 * abs(y_m))
-        return replace(
-            self,
-            length_m=length_m,
-            width_m=width_m,
-            lidar_x_m=x_m,
-            lidar_y_m=y_m,
-            lidar_source=source,
-        )
-
     @property
     def sane(self) -> bool:
         low, high = SIZES_M
@@ -429,8 +415,17 @@ def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint
     turned = replace(footprint, lidar_yaw_rad=yaw_rad, upside_down=bool(turn[2, 2] < 0))
     if footprint.measured and abs(x_m) > footprint.length_m / 2:
         return replace(turned, lidar_source=f"{bases[0]} has it {x_m:.2f} m ahead, outside")
-    source = f"of {bases[0]}, by transforms; that this is the middle is a guess"
-    return turned.with_lidar_at(float(x_m), float(y_m), source)
+    length_m, width_m = footprint.length_m, footprint.width_m
+    if not footprint.measured:  # a guess holds the lidar
+        length_m, width_m = max(length_m, 2 * abs(x_m)), max(width_m, 2 * abs(y_m))
+    return replace(
+        turned,
+        length_m=length_m,
+        width_m=width_m,
+        lidar_x_m=float(x_m),
+        lidar_y_m=float(y_m),
+        lidar_source=f"of {bases[0]}, by transforms; that this is the middle is a guess",
+    )
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
