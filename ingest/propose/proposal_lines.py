@@ -27,7 +27,6 @@ from restock.ingest.propose.roles import (
     LATCHED,
     REQUIRED,
     Kind,
-    clouds_alone,
     robots_in,
     usable_topics,
 )
@@ -137,8 +136,13 @@ def advice_of(seen: Evidence) -> Iterator[Advice]:
         known = shipped()
         names = ", ".join(unseen([known[name] for name in _conditions(seen)[0]]))
         yield Advice("conditions", f"no lidar: {names} are unknown (neither true nor false)")
-        if clouds := clouds_alone(seen.recording):
-            yield Advice("inputs.scan", clouds)
+        if (cloud := _cloud(seen)) is not None:
+            yield Advice(
+                "inputs.scan",
+                f"{cloud} is a point cloud, of which a slice can be read as a scan: uncomment"
+                " [inputs.scan], set its height_m to what the robot can run into, and remove"
+                " `sectors = 0` from [task]",
+            )
         return
     if not footprint.measured:
         yield Advice("task.body", f"{footprint.source}, or give --footprint LENGTHxWIDTH")
@@ -155,6 +159,12 @@ def advice_of(seen: Evidence) -> Iterator[Advice]:
             "the lidar hangs upside down by its frame, so its scans are turned over; if its driver"
             " does that already, left and right are now swapped: remove upside_down",
         )
+
+
+def _cloud(seen: Evidence) -> str | None:
+    """Return the first topic of point clouds that can be read as scans."""
+    topics = usable_topics(seen.recording).values()
+    return next((one.name for one in topics if one.type == CLOUD), None)
 
 
 def _command_advice(seen: Evidence) -> Iterator[Advice]:
@@ -324,11 +334,10 @@ def _unfilled_lines(role: str, seen: Evidence) -> list[str]:
         return ["# [inputs.wheels]  # no usable odometry; instead: speeds from poses", *by_hand]
     fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
     lines = [f"# [inputs.{role}]  # nothing usable; instead: {fallback}"]
-    clouds = [one for one in usable_topics(seen.recording).values() if one.type == CLOUD]
-    if role == "scan" and clouds:
+    if role == "scan" and (cloud := _cloud(seen)) is not None:
         fields = ", ".join(f'{key} = "{path}"' for key, path in SCAN_OF_CLOUD.items())
         lines += [
-            f'# topic = "{clouds[0].name}"',
+            f'# topic = "{cloud}"',
             f'# type = "{CLOUD}"',
             f"# fields = {{ {fields} }}",
             "# height_m = [LOW, HIGH]  # above the lidar: what the robot can run into",

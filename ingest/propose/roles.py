@@ -11,7 +11,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import TopicInfo
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
 from restock.ingest.profile.signal_paths import last_part
-from restock.ingest.profile.tables import CLOUD, Input
+from restock.ingest.profile.tables import Input
 from restock.ingest.steps.needs import field_paths
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
@@ -81,7 +81,6 @@ _MEASURED = (
     ),
 )
 
-CLOUDS = (CLOUD, "sensor_msgs/msg/PointCloud", "foxglove.PointCloud")
 MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
 
 _TWISTS = (
@@ -356,21 +355,6 @@ def topics_for(recording: Recording, kinds: tuple[Kind, ...]) -> list[tuple[Topi
                 order = (others, later, rank, place, -topic.expected, topic.name)
                 fitting.append((order, topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
-
-
-def clouds_alone(recording: Recording) -> str:
-    """Say what to do about the point clouds of a robot without a laser scan; "" if it has none."""
-    clouds = [one for one in usable_topics(recording).values() if one.type in CLOUDS]
-    if not clouds:
-        return ""
-    first = min(clouds, key=lambda one: one.type != CLOUD)
-    if first.type != CLOUD:
-        return f"{first.name} cannot be read as a scan: record it as {CLOUD}, or a laser scan"
-    return (
-        f"{first.name} is a point cloud, of which a slice can be read as a scan: uncomment"
-        " [inputs.scan], set its height_m to what the robot can run into, and remove"
-        " `sectors = 0` from [task]"
-    )
 
 
 def several_commands(recording: Recording) -> list[str]:
