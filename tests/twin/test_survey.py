@@ -213,9 +213,15 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("shape", "resolution", "origin", "data", "message"),
     [
-        ((0, 0), 0.05, (0.0, 0.0, 0.0), np.zeros(0, np.int8), "an empty map of 0 x 0"),
-        ((4, 4), 0.05, (float("nan"), 0.0, 0.0), None, "an origin at nan"),
-        ((60000, 60000), 0.05, (0.0, 0.0, 0.0), np.zeros(3, np.int8), "more than the 40,000,000"),
+        ((0, 0), 0.05, (0.0, 0.0, 0.0), np.zeros(0, np.int8), "its map of 0 x 0 cells"),
+        ((4, 4), 0.05, (float("nan"), 0.0, 0.0), None, "values, from nan"),
+        (
+            (60000, 60000),
+            0.05,
+            (0.0, 0.0, 0.0),
+            np.zeros(3, np.int8),
+            "1 to 40,000,000 cells",
+        ),
         ((90, 90), 0.05, (0.0, 0.0, 0.0), np.full(8100, -1, np.int8), "8,100 unknown"),
     ],
 )

@@ -31,7 +31,6 @@ from restock.train.twin.floors.cells import (
 from restock.train.twin.floors.layout import (
     MAX_RACKS,
     MAX_SIDE_M,
-    MIN_SIDE_M,
     ROOM_M,
     WAY_M,
     Rect,
@@ -276,20 +275,6 @@ def floor_of_grid(
     columns, rows = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
     window = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
     grid, free = grid.cut(*map(int, window)), free[window[0] : window[1], window[2] : window[3]]
-    if max(free.shape) * grid.cell_m > MAX_SIDE_M:
-        raise ConfigError(
-            f"its free part is {free.shape[0] * grid.cell_m:.1f} x"
-            f" {free.shape[1] * grid.cell_m:.1f} m, more than {MAX_SIDE_M:g} m",
-            where=where,
-            remedy="cut the map to the part that the robots drive in",
-        )
-    if min(free.shape) * grid.cell_m < MIN_SIDE_M:
-        raise ConfigError(
-            f"the largest part that a robot fits in is {free.shape[0] * grid.cell_m:.1f} x"
-            f" {free.shape[1] * grid.cell_m:.1f} m: not a floor",
-            where=where,
-            remedy=_NO_ROOM_REMEDY,
-        )
     free, cell_m, racks = _racks(free, grid.cell_m, where, notes)
     reachable = drivable_part(free, cell_m, room_m, _cells_in(grid, visited_m, cell_m))
     if not reachable.any():

@@ -90,22 +90,13 @@ def recorded_map(recording: Recording) -> tuple[OccupancyGrid, str] | None:
     yaw = float(yaw_of(*(np.array([float(value)]) for value in values[5:]))[0])
     data = fields["data"]
     cells = np.asarray(data[len(data) - 1] if isinstance(data, Ragged) else data[-1]).ravel()
-    where = f"{recording.path}, {topic.name}"
-    wrong = ""
-    if width < 1 or height < 1:
-        wrong = f"an empty map of {width:.0f} x {height:.0f} cells"
-    elif width * height > MAX_CELLS:
-        wrong = f"{width:,.0f} x {height:,.0f} cells, more than the {MAX_CELLS:,} that can be read"
-    elif len(cells) != width * height:
-        wrong = f"{len(cells):,} cells of data for {width:.0f} x {height:.0f}"
-    elif not 0.001 <= cell_m <= 1:
-        wrong = f"a resolution of {cell_m:g} m, which must be from .001 to 1 m"
-    elif not (np.abs([x, y, yaw]) <= FURTHEST_M).all():
-        wrong = f"an origin at {x:g}, {y:g}, turned by {yaw:g} rad"
-    if wrong:
+    sane = 1 <= width * height <= MAX_CELLS and len(cells) == width * height
+    if not (sane and 0.001 <= cell_m <= 1 and (np.abs([x, y, yaw]) <= FURTHEST_M).all()):
         raise RecordingError(
-            f"its map has {wrong}",
-            where=where,
+            f"its map of {width:,.0f} x {height:,.0f} cells of {cell_m:g} m, with {len(cells):,}"
+            f" values, from {x:g}, {y:g} and turned by {yaw:g} rad, cannot be used: it must have 1"
+            f" to {MAX_CELLS:,} cells of .001 to 1 m",
+            where=f"{recording.path}, {topic.name}",
             remedy="give the map as a file (--map map.yaml), or --by scans, or --by corridor",
         )
     percent = cells.astype(np.int16).reshape(int(height), int(width)).T
