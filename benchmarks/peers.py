@@ -6,10 +6,10 @@
 Stable-Baselines3, Tianshou (each where it is installed) and CleanRL's DQN in one file, by the
 examples in docs/examples as they are: network, learning rate, batch, discount, ring, exploration,
 updates per step and target are those of `restock train`, as far as each can follow; each example
-says what it lacks. Each runs without logs, and with the sample logs in its buffer, of which it then
-learns first, too. Restock's default recipe has the same logs and no teacher, the navigation stack's
-planner or the twin's operator. The logs are one panel for all: `coverage`, without a limit on
-draws.
+says what it lacks. Each runs without logs and, but for Tianshou's, with the sample logs in its
+buffer, of which it then learns first, too. Restock's default recipe has the same logs and no
+teacher, the navigation stack's planner or the twin's operator. The logs are one panel for all:
+`coverage`, without a limit on draws.
 
 A run is a process with one thread that ends after so many CPU seconds, its imports not counted.
 Nobody chooses a policy on the way: the last one drives `--missions` of each kind that nobody
@@ -53,7 +53,6 @@ ARMS: dict[str, tuple[str, bool]] = {  # example, or Restock's teacher; whether 
     "Tianshou": ("tianshou_dqn", False),
     "CleanRL, logs": ("cleanrl_dqn", True),
     "Stable-Baselines3, logs": ("sb3_mixture", True),
-    "Tianshou, logs": ("tianshou_dqn", True),
     "Restock, no teacher": ("none", True),
     "Restock, planner": ("planner", True),
     "Restock, operator": ("operator", True),

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from restock.train.judge.diagnose import diagnose as diagnose
     from restock.train.libraries.sb3_buffer import MixtureReplayBuffer as MixtureReplayBuffer
     from restock.train.libraries.sb3_buffer import dqn_critic as dqn_critic
-    from restock.train.libraries.tianshou_buffer import (
-        MixtureVectorReplayBuffer as MixtureVectorReplayBuffer,
-    )
     from restock.train.prepare import train as train
     from restock.train.run.replay_audit import replay_audit as replay_audit
     from restock.train.run.run import Run as Run

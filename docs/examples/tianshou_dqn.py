@@ -1,7 +1,6 @@
-"""Tianshou's collectors and DQN in the twin, unchanged; with --panel on logs and fresh rows.
+"""Tianshou's collectors and DQN in the twin, unchanged.
 
     python docs/examples/tianshou_dqn.py --steps 200000
-    python docs/examples/tianshou_dqn.py --panel panel/ --run runs/tianshou
 
 The settings are the defaults of `restock train`; the comments name its keys (docs/train.md). There
 is no warm-up and no teacher, and a hard target in place of Polyak averaging, as old in the mean:
@@ -22,14 +21,11 @@ from tianshou.trainer import OffPolicyTrainerParams
 from tianshou.utils.net.common import Net
 
 import restock  # noqa: F401 - registers restock/Warehouse-v0
-from restock.train import MixtureVectorReplayBuffer
 
 
 def main(
     steps: int = 200_000,
     num_envs: int = 32,  # env.num_envs
-    panel: str | None = None,
-    run: str | None = None,
     seed: int = 0,
 ) -> dict:
     envs = DummyVectorEnv([lambda: gym.make("restock/Warehouse-v0") for _ in range(num_envs)])
@@ -51,17 +47,13 @@ def main(
         gamma=0.99,  # loss.discount
         n_step_return_horizon=3,  # loss.n_step
         is_double=True,  # loss.double
-        # loss.huber_delta; Tianshou does not use a panel's importance weights together with it
-        huber_loss_delta=10.0 if panel is None else None,
+        huber_loss_delta=10.0,  # loss.huber_delta
         target_update_freq=400,  # target = {rule = "polyak", tau = 0.005}
     )
-    if panel is None:
-        buffer = VectorReplayBuffer(100_000, num_envs)  # replay.ring_capacity
-    else:
-        buffer = MixtureVectorReplayBuffer(100_000, num_envs, panel=panel, run=run, seed=seed)
+    buffer = VectorReplayBuffer(100_000, num_envs)  # replay.ring_capacity
     collector = Collector[CollectStats](algorithm, envs, buffer, exploration_noise=True)
     collector.reset()
-    first = 1.0 if panel is None else 0.2  # epsilon.start, without logs and with them
+    first = 1.0  # epsilon.start
 
     def explore(epoch: int, env_step: int) -> None:
         done = min(env_step / 20_000, 1.0)  # epsilon.steps
@@ -83,8 +75,6 @@ def main(
             verbose=False,
         )
     )
-    if panel is not None:
-        buffer.close()
     return {
         "env_steps": result.train_step,
         "updates": algorithm._iter,  # result.update_step counts collections
@@ -95,7 +85,4 @@ def main(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=200_000)
-    parser.add_argument("--panel")
-    parser.add_argument("--run")
-    given = parser.parse_args()
-    print(json.dumps(main(given.steps, panel=given.panel, run=given.run)))  # noqa: T201
+    print(json.dumps(main(parser.parse_args().steps)))  # noqa: T201

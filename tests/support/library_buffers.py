@@ -1,4 +1,4 @@
-"""Other libraries' DQNs trained on a mixture, for the contract of their buffers."""
+"""Stable-Baselines3's DQN trained on a mixture, for the contract of its buffer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import torch
 
 import restock  # noqa: F401 - registers the environment
 from restock.ingest.profile.profile import load_profile
@@ -17,7 +16,6 @@ from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 TASK = load_profile("warehouse_amr").task
-DISCOUNT = 0.99
 MIXTURE = """
 discount = 0.99
 n_step = {n_step}
@@ -50,7 +48,6 @@ def run_tables(run: Path) -> dict[str, list[dict[str, Any]]]:
 class TrainedBuffer:
     """A buffer after some updates on logs alone, and more on logs and fresh rows, half and half."""
 
-    library: str
     algorithm: Any
     buffer: Any
     run: Path
@@ -67,9 +64,8 @@ class TrainedBuffer:
 
     def slots_of(self, episode: int) -> np.ndarray:
         """Where the rows of a fresh episode are."""
-        fresh = self.feed.fresh
-        filled = getattr(fresh, "filled", np.arange(fresh.capacity) < len(fresh))
-        return np.flatnonzero(filled & (fresh.meta["episode"] == episode))
+        ring = self.feed.ring
+        return np.flatnonzero(ring.meta["episode"][: len(ring)] == episode)
 
     @property
     def tables(self) -> dict[str, list[dict[str, Any]]]:
@@ -117,68 +113,4 @@ def trained_sb3(folder: Path, steps: int = 520) -> TrainedBuffer:
     model.learn(steps, reset_num_timesteps=False)
     buffer.close()
     counts = model.num_timesteps, model._n_updates
-    return TrainedBuffer(
-        "stable-baselines3", model, buffer, folder / "run", panel, store, *counts, 40
-    )
-
-
-def tianshou_dqn(n_step: int = 1) -> Any:
-    """Tianshou's DQN for the warehouse."""
-    from tianshou.algorithm import DQN
-    from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
-    from tianshou.algorithm.optim import AdamOptimizerFactory
-    from tianshou.utils.net.common import Net
-
-    torch.manual_seed(0)
-    actions = gymnasium.spaces.Discrete(len(TASK.actions))
-    net = Net(
-        state_shape=(TASK.observation_size,), action_shape=len(TASK.actions), hidden_sizes=[32]
-    )
-    return DQN(
-        policy=DiscreteQLearningPolicy(model=net, action_space=actions, eps_training=0.5),
-        optim=AdamOptimizerFactory(lr=1e-3),
-        gamma=DISCOUNT,
-        n_step_return_horizon=n_step,
-        target_update_freq=20,
-    )
-
-
-def trained_tianshou(folder: Path) -> TrainedBuffer:
-    """Return a DQN after 30 updates on logs, and some on logs and 500 fresh steps."""
-    pytest.importorskip("tianshou")
-    from tianshou.algorithm.algorithm_base import policy_within_training_step
-    from tianshou.data import Collector, CollectStats
-    from tianshou.env import DummyVectorEnv
-    from tianshou.trainer import OffPolicyTrainerParams
-
-    from restock.train.libraries.tianshou_buffer import MixtureVectorReplayBuffer
-
-    store = make_store(folder)
-    panel = make_panel(store, folder / "panel", post="full")
-    envs = DummyVectorEnv([lambda: gymnasium.make("restock/Warehouse-v0")] * 2)
-    envs.seed(0)
-    buffer = MixtureVectorReplayBuffer(
-        1000, 2, panel=panel, run=folder / "run", logs_share=0.5, audit_share=0.3, log_every=25
-    )
-    algorithm = tianshou_dqn()
-    with policy_within_training_step(algorithm.policy):
-        for _ in range(30):
-            algorithm.update(buffer, 64)
-    collector = Collector[CollectStats](algorithm, envs, buffer, exploration_noise=True)
-    collector.reset()
-    stats = algorithm.run_training(
-        OffPolicyTrainerParams(
-            training_collector=collector,
-            max_epochs=1,
-            epoch_num_steps=504,
-            collection_step_num_env_steps=24,
-            update_step_num_gradient_steps_per_sample=0.1,
-            batch_size=64,
-            show_progress=False,
-            verbose=False,
-        )
-    )
-    buffer.close()
-    # Two gradient steps a collection.
-    counts = stats.train_step, 2 * stats.update_step + 30
-    return TrainedBuffer("tianshou", algorithm, buffer, folder / "run", panel, store, *counts, 30)
+    return TrainedBuffer(model, buffer, folder / "run", panel, store, *counts, 40)

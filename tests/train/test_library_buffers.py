@@ -1,4 +1,4 @@
-"""The contract of every library's buffer: logs by quota and fresh rows, with a record of which."""
+"""The buffer in a library's training loop: logs by quota and fresh rows, with a record of which."""
 
 import hashlib
 import json
@@ -6,8 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from support.library_buffers import TrainedBuffer, trained_sb3, trained_tianshou
-from support.long import one_in
+from support.library_buffers import TrainedBuffer, trained_sb3
 
 from restock.replay.store.store import Store
 from restock.train.feed.batch_record import STOPPED, NotFinite
@@ -15,18 +14,14 @@ from restock.train.feed.batch_record import STOPPED, NotFinite
 pytestmark = pytest.mark.long
 
 
-@pytest.fixture(
-    scope="module", params=one_in(2, [trained_sb3, trained_tianshou]), ids=["sb3", "tianshou"]
-)
-def trained(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> TrainedBuffer:
-    return request.param(tmp_path_factory.mktemp("library"))
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedBuffer:
+    return trained_sb3(tmp_path_factory.mktemp("library"))
 
 
 def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
     feed, tables, size = trained.feed, trained.tables, trained.batch_size
-    assert feed.env_steps == trained.env_steps == {"tianshou": 504}.get(trained.library, 520)
+    assert feed.env_steps == trained.env_steps == 520
     assert feed.batches == trained.updates > 2 * trained.offline_updates
     offline = [row for row in tables["strata"] if row["phase"] == "offline"]
     assert {row["source"] for row in offline} == {"logs"}
@@ -80,9 +75,7 @@ def test_the_quotas_are_met_exactly(trained: TrainedBuffer) -> None:
 def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> None:
     audit, panel = trained.tables["audit"], trained.panel
     assert {row["source"] for row in audit} == {"logs", "fresh"}
-    assert all(np.isfinite(row["td"]) for row in audit)  # Tianshou hands its TD errors back
-    if trained.library == "stable-baselines3":
-        assert all(np.isfinite(row["q"]) for row in audit)
+    assert all(np.isfinite(row["td"]) and np.isfinite(row["q"]) for row in audit)
     place = {int(t): i for i, t in enumerate(panel.meta["transition_id"].to_pylist())}
     with Store(trained.store) as opened:
         conditions = dict(
@@ -101,18 +94,17 @@ def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> No
             assert row["age_days"] >= 0
         else:
             assert 0 <= row["age_env_steps"] < trained.env_steps
-            assert row["behaviour_policy"] == trained.library
+            assert row["behaviour_policy"] == "stable-baselines3"
             assert row["weight"] == 1
 
 
 def test_ended_episodes_are_labelled(trained: TrainedBuffer) -> None:
-    ended, fresh = trained.tables["episodes"], trained.feed.fresh
+    ended, ring = trained.tables["episodes"], trained.feed.ring
     assert len(ended) >= 2  # two environments, 250 steps each, 240 at most an episode
     for row in ended:
         slots = trained.slots_of(row["episode"])
         assert len(slots) == row["steps"]
-        codes = fresh.condition(slots)
+        codes = ring.condition(slots)
         assert (codes >= 0).all()
-        conditions = {fresh.conditions[code] for code in codes} - {"nominal"}
+        conditions = {ring.conditions[code] for code in codes} - {"nominal"}
         assert conditions <= set(row["conditions"])
-    assert trained.feed.labels.unlabelled_episodes == 0

@@ -1,31 +1,29 @@
-"""Draw, label and record the rows of another library's replay buffer: logs by quota, and fresh.
+"""Draw, label and record the rows of Stable-Baselines3's replay buffer: logs by quota, and fresh.
 
-The library owns the training loop. Its buffer is a subclass (`restock.train.libraries.sb3_buffer`,
-`restock.train.libraries.tianshou_buffer`) that asks this class for rows of the panel, tells it
-every step and every batch, and so leaves a run directory with the same tables as `restock train`
-does: `strata`, `ages`, `policies`, `sampled_episodes`, `episodes`, `audit` and `progress`.
+The library owns the training loop. Its buffer (`restock.train.libraries.sb3_buffer`) asks this
+class for rows of the panel, tells it every step and every batch, and so leaves a run directory with
+the same tables as `restock train` does: `strata`, `ages`, `policies`, `sampled_episodes`,
+`episodes`, `audit` and `progress`.
 
-Of fresh rows that the library keeps, only the `info` of each step is seen. The twin's single
-environment gives the signals at t and at t + 1 in it, so an episode that ended is labelled by the
-very conditions, over the very signals, that label logs.
+The twin's single environment gives the signals at t and at t + 1 in the `info` of each step, so an
+episode that ended is labelled by the very conditions, over the very signals, that label logs.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Bools, Ints
+from restock.arrays import F32, Ints
 from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
@@ -33,7 +31,7 @@ from restock.ingest.task.schema import signal_arrays
 from restock.ingest.task.task import STORED_SIGNALS
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
-from restock.replay.sampling.ring import META, NONE, StratumSlots
+from restock.replay.sampling.ring import FreshRing
 from restock.replay.sampling.rules import RULES
 from restock.train.dqn.algorithm import Loss
 from restock.train.feed.batch_record import FeedRecord, NotFinite, check_fed, row_ids
@@ -45,41 +43,38 @@ from restock.train.run.run import Rows, Run, check_free, now_ns, panel_document,
 from restock.train.run.run_profile import profile_document, profile_of_panel
 from restock.train.run.run_tables import TABLES
 
+SB3 = "stable-baselines3"
 PROFILE = "warehouse_amr"
 _NO_ROWS: Ints = np.empty(0, np.int64)
 _GO_ON = (
     "choose another `run`; to go on in this one, load the replay buffer that was saved with it"
-    " (Stable-Baselines3: model.load_replay_buffer)"
+    " (model.load_replay_buffer)"
 )
 NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 
-class FeedOptions(TypedDict, total=False):
-    """Keyword options of every library's buffer, all optional.
+@dataclass(frozen=True)
+class FeedOptions:
+    """Keyword options of the buffer."""
 
-    Defaults: no run, the panel's own share and profile (without a panel warehouse_amr), seed 0, a
-    hundredth of the batches, 500 batches.
-    """
-
-    run: str | Path | None  # the run directory to make; None, the default: no record is kept
-    logs_share: float | None  # of a batch; default the panel's own
-    profile: str  # whose task and conditions the environment has; default the panel's own
-    seed: int  # of the draws and of which batches are audited; default 0
-    audit_share: float  # of all batches, each row of which is written down; default 0.01
-    log_every: int  # batches summed into one row of each table; default 500
+    run: str | Path | None = None  # the run directory to make; None: no record is kept
+    logs_share: float | None = None  # of a batch; None: the panel's own
+    # Whose task and conditions the environment has; None: the panel's, without one warehouse_amr's.
+    profile: str | None = None
+    seed: int = 0  # of the draws and of which batches are audited
+    audit_share: float = 0.01  # of all batches, each row of which is written down
+    log_every: int = 500  # batches summed into one row of each table
     # What else makes the run what it is, by the keys of `restock train`: target, loss, optimizer, …
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 class MixedFeed:
-    """The part of the buffers that does not depend on the library.
+    """The rows of a panel and of a ring of fresh ones, drawn as the panel's mixture says.
 
     Args:
-        library: the distribution whose loop this is, e.g. "stable-baselines3".
-        num_envs: N.
-        observation_size: D, of the library's environment.
+        capacity, num_envs, observation_size, n_step: of the ring, `ring`.
+        discount: of its rows; None: the panel's, without one .99.
         panel: None for fresh rows alone.
-        run, logs_share, profile, seed, audit_share, log_every, settings: see `FeedOptions`.
 
     A panel of a table of any task has no profile: of fresh rows, the environment then names the
     condition of each step in `info["condition"]`.
@@ -92,32 +87,25 @@ class MixedFeed:
 
     def __init__(
         self,
-        library: str,
+        capacity: int,
         num_envs: int,
         observation_size: int,
-        *,
         panel: Panel | None,
-        run: str | Path | None = None,
-        logs_share: float | None = None,
-        profile: str | None = None,
-        seed: int = 0,
-        audit_share: float = 0.01,
-        log_every: int = 500,
-        settings: Mapping[str, Any] = MappingProxyType({}),
+        options: FeedOptions,
+        *,
+        n_step: int = 1,
+        discount: float | None = None,
     ) -> None:
-        definition, self.panel = environment_profile(profile, panel), panel
-        if logs_share is not None and not 0 <= logs_share <= 1:
-            raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
-        self.logs_share = logs_share
+        self.panel, self.options = panel, options
+        share = options.logs_share
+        if share is not None and not 0 <= share <= 1:
+            raise ConfigError(f"logs_share must be in [0, 1], got {share:g}")
+        profile = environment_profile(options.profile, panel)
         if panel is not None:
-            _check(panel, definition, observation_size)
-        began_ns = now_ns()
-        self.logs = Logs.of_panel(panel, as_of_ns=began_ns) if panel is not None else None
-        self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
-        self.rng = np.random.default_rng([seed, 1])
-        self.labels = labels_of(definition, panel, num_envs)
-        self.num_envs, self.library = num_envs, library
-        self.action_names = definition.task.action_names if definition is not None else None
+            _check(panel, profile, observation_size)
+        self.logs = Logs.of_panel(panel, as_of_ns=now_ns()) if panel is not None else None
+        self.rng = np.random.default_rng([options.seed, 1])
+        self.labels = labels_of(profile, panel, num_envs)
         self.env_steps = self.batches = self.invalid_steps = 0
         self.episode_labels = EpisodeLabels()
         self._sampler: LoggedSampler | None = None
@@ -126,34 +114,29 @@ class MixedFeed:
         self._open = 0  # batches since the last rows were written
         self._episodes: dict[int, dict[str, Any]] = {}
         self._begun = time.monotonic()
+        if discount is None:
+            discount = panel.discount if panel is not None else 0.99
+        self.ring = FreshRing(
+            capacity,
+            num_envs,
+            observation_size,
+            discount=discount,
+            n_step=n_step,
+            conditions=self.labels.names,
+            behaviour_policies=(SB3,),
+        )
         self.run: Run | None = None
-        if run is not None:
-            check_free(Path(run), _GO_ON)
-            config = {
-                "logs_share": logs_share,
-                "seed": seed,
-                "audit_share": audit_share,
-                "num_envs": num_envs,
-                **settings,
-            }
-            self.run = create_run(
-                Path(run), {"name": library}, definition, self.panel, config, seeds={"run": seed}
-            )
         self.record: FeedRecord | None = None
-        self.fresh: Any = None
-
-    def keep_record(self, fresh: Any) -> None:
-        """Set the fresh rows to record: a `FreshRing` or a `FreshMeta`."""
-        self.fresh = fresh
-        if self.run is not None:
+        if options.run is not None:
+            self.run = _create_run(Path(options.run), profile, panel, num_envs, options)
             tables: Any = PartialTables(self.run)
             self.record = FeedRecord(
                 tables,
                 self.logs,
-                fresh,
-                audit_share=self.audit_share,
-                seed=self.seed,
-                actions=self.action_names,
+                self.ring,
+                audit_share=options.audit_share,
+                seed=options.seed,
+                actions=profile.task.action_names if profile is not None else None,
                 labels=self.episode_labels,
             )
 
@@ -175,7 +158,7 @@ class MixedFeed:
     def label(self, *, all_of_them: bool = False) -> None:
         """Label the episodes that ended."""
         for labelled in self.labels.label(all_of_them=all_of_them):
-            self.fresh.set_labels(labelled.key, labelled.codes)
+            self.ring.set_labels(labelled.key, labelled.codes)
             self.episode_labels.note(labelled.key, labelled.codes)
             if labelled.key in self._episodes:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
@@ -193,34 +176,37 @@ class MixedFeed:
             others = ", ".join(name for name, rule in RULES.items() if not rule.follows_td)
             raise MixtureError(
                 "the mixture's draws depend on TD errors, and this buffer gets none",
-                remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix with"
-                f" a `within` of {others}",
+                remedy="set `critic`, e.g. to dqn_critic(model); or mix with a `within` of"
+                f" {others}",
             )
         if self._sampler is None:
-            self._sampler = self.logs.sampler(batch_size, self.logs_share, self.seed)
+            self._sampler = self.logs.sampler(
+                batch_size, self.options.logs_share, self.options.seed
+            )
         count = batch_size
-        if len(self.fresh):
+        if len(self.ring):
             self._sampler.move_to(self.env_steps)
             count = round(batch_size * self._sampler.controller.logs_share)
         drawing = self._sampler.draw(count) if count else NO_LOGS
-        if not len(self.fresh) and len(drawing.rows) < batch_size:
+        if not len(self.ring) and len(drawing.rows) < batch_size:
             raise MixtureError(
                 f"every row of the panel was drawn {self._sampler.controller.max_replays} times",
                 remedy="collect steps, or mix with more draws per row",
             )
         return drawing
 
-    def sample_fresh(self, slots: Ints, count: int) -> Ints:
-        """Draw `count` of the filled `slots` (n,) uniformly, of those young enough for the mixture.
+    def draw_fresh(self, count: int) -> Ints:
+        """Draw `count` slots of the ring uniformly, of those young enough for the mixture.
 
         Raises:
             MixtureError: there is none.
         """
         if not count:
             return _NO_ROWS
+        slots = np.arange(len(self.ring))
         most = self.panel.header.mixture.max_age_env_steps if self.panel is not None else None
         if most is not None:
-            slots = slots[self.fresh.meta["env_step"][slots] >= self.env_steps - most]
+            slots = slots[self.ring.meta["env_step"][slots] >= self.env_steps - most]
         if not len(slots):
             raise MixtureError(
                 "there is no fresh row to draw" + (f" younger than {most} steps" if most else ""),
@@ -234,14 +220,13 @@ class MixedFeed:
         drawing: BatchDraw,
         slots: Ints,
         *,
-        weight: F32 | None = None,
         td: F32 | None = None,
         q: F32 | None = None,
     ) -> None:
         """Record the batch of one update, logs first: packed rows (B, W) and what is known of them.
 
-        `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
-        Priorities follow `td` where it is known.
+        `td` (Q - target) and `q` (B,) are null in the tables if they are unknown. Priorities follow
+        `td` where it is known.
 
         Raises:
             NotFinite: a row or a TD error is NaN or infinite; names the rows.
@@ -268,7 +253,7 @@ class MixedFeed:
         unknown = np.full(len(packed), np.nan, np.float32)
         batch = ReplayBatch(
             lambda: torch.from_numpy(packed),
-            weight=None if weight is None else torch.from_numpy(weight),
+            weight=None,
             log_rows=drawing.rows,
             log_stratum=drawing.strata,
             slots=slots,
@@ -281,7 +266,7 @@ class MixedFeed:
         )
         self.record.batch(self.batches, self.env_steps, batch, loss, last_sync=None)
         self._open += 1
-        if self._open >= self.log_every:
+        if self._open >= self.options.log_every:
             self._close_interval()
 
     def evaluated(self, episodes: Rows = (), steps: Rows = ()) -> None:
@@ -301,7 +286,7 @@ class MixedFeed:
         self.run.flush()
 
     def _row_ids(self, drawing: BatchDraw, slots: Ints) -> list[dict[str, Any]]:
-        meta = self.fresh.meta
+        meta = self.ring.meta
         return row_ids(self.logs, drawing.rows, meta["episode"][slots], meta["episode_step"][slots])
 
     def flush(self) -> None:
@@ -326,7 +311,7 @@ class MixedFeed:
                 "wall_s": time.monotonic() - self._begun,
                 "phase": self._phase,
                 "updates": self._open,
-                "ring_rows": len(self.fresh),
+                "ring_rows": len(self.ring),
                 "episodes": len(self._episodes),
                 **means,
             }
@@ -335,10 +320,10 @@ class MixedFeed:
         self._open, self._episodes = 0, {}
         self.run.flush()
 
-    def give_up(self, keys: Ints) -> None:
-        """Expect no more steps of these episodes (N,), which were under way."""
+    def begin_episodes(self) -> None:
+        """Expect no more steps of the episodes that were under way."""
         self.labels.forget()
-        for key in keys.tolist():
+        for key in self.ring.begin_episodes().tolist():
             self.episode_labels.give_up(key)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -348,13 +333,6 @@ class MixedFeed:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._begun = time.monotonic() - self._begun
-
-    def fresh_meta(self, capacity: int) -> FreshMeta:
-        """Make metadata beside a buffer that the library keeps."""
-        name = self.library
-        return FreshMeta(
-            capacity, self.num_envs, conditions=self.labels.names, behaviour_policy=name
-        )
 
 
 def environment_profile(name: str | None, panel: Panel | None) -> Profile | None:
@@ -367,14 +345,13 @@ def environment_profile(name: str | None, panel: Panel | None) -> Profile | None
     return load_profile(name or PROFILE)
 
 
-def labels_of(
-    profile: Profile | None, panel: Panel | None, num_envs: int
-) -> InfoLabels | NamedLabels:
+def labels_of(profile: Profile | None, panel: Panel | None, num_envs: int) -> FreshLabels:
     """Return what labels fresh episodes: the profile's conditions, else the environment itself."""
     if profile is None:
-        return NamedLabels(panel.header.conditions if panel is not None else [NOMINAL], num_envs)
+        names = panel.header.conditions if panel is not None else [NOMINAL]
+        return FreshLabels(None, num_envs, names)
     signals, lidar = profile.signals, profile.task.lidar
-    return InfoLabels(conditions_in_twin(profile.conditions, signals, lidar=lidar)[0], num_envs)
+    return FreshLabels(conditions_in_twin(profile.conditions, signals, lidar=lidar)[0], num_envs)
 
 
 def _check(panel: Panel, profile: Profile | None, observation_size: int) -> None:
@@ -402,21 +379,15 @@ def _check(panel: Panel, profile: Profile | None, observation_size: int) -> None
 _INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
 
 
-def create_run(
+def _create_run(
     path: Path,
-    library: Mapping[str, Any],
     profile: Profile | None,
     panel: Panel | None,
-    config: Any,
-    *,
-    seeds: Mapping[str, int],
-    **more: Any,
+    num_envs: int,
+    options: FeedOptions,
 ) -> Run:
-    """Make the run of a library by its distribution's `name`, and write its `config.json`.
-
-    Raises RunError when something is at `path` already.
-    """
-    name = library["name"]
+    """Make the run and write its `config.json`. Raises RunError when something is at `path`."""
+    check_free(path, _GO_ON)
     mixed = None
     if panel is not None:
         strata = {stratum.name: stratum.share for stratum in panel.strata}
@@ -433,13 +404,18 @@ def create_run(
         path,
         {
             "created_ns": now_ns(),
-            "library": {"version": version(name), **library},
-            "config": config,
+            "library": {"version": version(SB3), "name": SB3},
+            "config": {
+                "logs_share": options.logs_share,
+                "seed": options.seed,
+                "audit_share": options.audit_share,
+                "num_envs": num_envs,
+                **options.settings,
+            },
             "panel": mixed,
-            **more,
             **about,
-            "seeds": seeds,
-            "versions": software_versions() | {name: version(name)},
+            "seeds": {"run": options.seed},
+            "versions": software_versions() | {SB3: version(SB3)},
         },
     )
 
@@ -493,97 +469,6 @@ _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")
 _NAMES = tuple(signal.name for signal in STORED_SIGNALS)
 
 
-class FreshMeta:
-    """Metadata beside `capacity` slots that N environments' steps are written to, a step a slot.
-
-    Has what a `FreshRing` has for the record of batches: `meta`, `conditions`, `condition`,
-    `by_condition`, `strata`, `stratum`, `behaviour_policies` and its length.
-    """
-
-    def __init__(
-        self, capacity: int, num_envs: int, *, conditions: Sequence[str], behaviour_policy: str
-    ) -> None:
-        self.capacity, self.num_envs = capacity, num_envs
-        self.conditions = tuple(conditions)
-        self.behaviour_policies = (behaviour_policy,)
-        self.meta: dict[str, NDArray[Any]] = {
-            name: np.zeros(capacity, dtype) for name, dtype in META.items()
-        }
-        self.meta["action_probability"][:] = np.nan
-        self.meta["teacher_action"][:] = -1
-        self.strata = self.conditions  # nothing else tells these rows apart
-        self.by_condition = StratumSlots(capacity, len(self.conditions))
-        self.filled = np.zeros(capacity, np.bool_)
-        self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)
-        self._episode_step: Ints = np.zeros(num_envs, np.int64)
-        self._next_key = num_envs
-        self._slots: dict[int, list[int]] = {key: [] for key in range(num_envs)}
-
-    def __len__(self) -> int:
-        return int(self.filled.sum())
-
-    def write(
-        self,
-        slots: Ints,
-        envs: Ints,
-        ended: Bools,
-        *,
-        env_step: int,
-        gradient_step: int,
-    ) -> Ints:
-        """Write one step of `envs` (n,) to `slots` (n,); return their episodes' keys (n,)."""
-        self.by_condition.move(slots, NONE)
-        keys = self.episode_key[envs].copy()
-        now = {
-            "env_step": env_step,
-            "gradient_step": gradient_step,
-            "policy_version": gradient_step,
-            "episode": keys,
-            "episode_step": self._episode_step[envs],
-            "horizon": 1,
-        }
-        for name, value in now.items():
-            self.meta[name][slots] = value
-        self.filled[slots] = True
-        for slot, key in zip(slots.tolist(), keys.tolist(), strict=True):
-            self._slots[key].append(slot)
-        self._episode_step[envs] = np.where(ended, 0, self._episode_step[envs] + 1)
-        begun = envs[ended]
-        self.episode_key[begun] = self._next_key + np.arange(len(begun))
-        self._slots |= {int(key): [] for key in self.episode_key[begun]}
-        self._next_key += len(begun)
-        return keys
-
-    def set_labels(self, episode_key: int, codes: Ints) -> int:
-        """Label an ended episode's rows, as a ring does; returns how many were still there."""
-        # Once each: an episode longer than the buffer overwrites its own.
-        slots = np.unique(np.array(self._slots.pop(episode_key, []), np.int64))
-        slots = slots[self.meta["episode"][slots] == episode_key]  # the others were overwritten
-        steps = self.meta["episode_step"][slots]
-        for code in np.unique(codes[steps]):
-            self.by_condition.move(slots[codes[steps] == code], int(code))
-        return len(slots)
-
-    @property
-    def stratum(self) -> NDArray[np.int16]:
-        """Return the stratum of each slot (capacity,): its condition's code."""
-        return self.by_condition.stratum
-
-    def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
-        """Return the condition code of each slot (n,); -1 where it has no label yet."""
-        codes: NDArray[np.int16] = self.by_condition.stratum[slots]
-        return codes
-
-    def forget(self) -> None:
-        """Forget all rows after the library emptied its buffer."""
-        self.by_condition.move(np.flatnonzero(self.filled), NONE)
-        self.filled[:] = False
-        self._episode_step[:] = 0
-        self.episode_key = self._next_key + np.arange(self.num_envs, dtype=np.int64)
-        self._next_key += self.num_envs
-        self._slots = {int(key): [] for key in self.episode_key}
-
-
 @dataclass(frozen=True)
 class Labelled:
     """An episode's labels: the code of each step's condition, nominal last."""
@@ -593,56 +478,28 @@ class Labelled:
     conditions: list[str]  # that held at some step
 
 
-class NamedLabels:
-    """Labels of N environments' episodes whose infos name the `condition` of each step.
+class FreshLabels:
+    """Labels of N environments' episodes, by the infos of their steps.
 
-    An episode with a step of no known condition is not labelled, and counted.
+    Args:
+        conditions: that label the infos' signals; None: each info names its step's `condition`.
+        names: of the conditions that infos may name.
+
+    An episode with a step whose info lacks signals, or names no known condition, has no labels.
     """
 
-    def __init__(self, names: Sequence[str], num_envs: int) -> None:
+    def __init__(
+        self, conditions: Sequence[Condition] | None, num_envs: int, names: Sequence[str] = ()
+    ) -> None:
+        self.conditions: list[Condition] | None = None
         self.names = tuple(names)
-        self._running: list[list[str | None]] = [[] for _ in range(num_envs)]
-        self._ended: list[Labelled] = []
-        self.unlabelled_episodes = 0
-
-    def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> bool:
-        """Take one environment's step, as `InfoLabels.step` does."""
-        self._running[env].append(info.get("condition"))
-        if not ended:
-            return True
-        steps, self._running[env] = self._running[env], []
-        codes = [self.names.index(name) for name in steps if name in self.names]
-        if whole := len(codes) == len(steps):
-            held = sorted({name for name in steps if name is not None} - {NOMINAL})
-            self._ended.append(Labelled(key, np.array(codes, np.int64), held))
-        self.unlabelled_episodes += not whole
-        return whole
-
-    def forget(self) -> None:
-        """Forget the episodes under way: they stay unlabelled."""
-        self.unlabelled_episodes += sum(bool(steps) for steps in self._running)
-        self._running = [[] for _ in self._running]
-
-    def label(self, *, all_of_them: bool = False) -> list[Labelled]:
-        """Return the labels of the episodes that ended since the last call."""
-        ended, self._ended = self._ended, []
-        return ended
-
-
-class InfoLabels:
-    """Labels of N environments' episodes.
-
-    Steps whose info has no `signals` are not labelled; `unlabelled_episodes` counts their episodes.
-    """
-
-    def __init__(self, conditions: Sequence[Condition], num_envs: int) -> None:
-        self.conditions = sorted(conditions, key=lambda c: (c.priority, c.name))
-        self.names = (*(condition.name for condition in self.conditions), NOMINAL)
-        self._codes = {name: code for code, name in enumerate(self.names)}
-        self._worth_a_query = min(EPISODES_PER_QUERY, num_envs)
-        self._running: list[list[dict[str, Any]]] = [[] for _ in range(num_envs)]
-        self._ended: list[tuple[int, list[dict[str, Any]]]] = []
-        self.unlabelled_episodes = 0
+        self._enough = 1  # ended episodes to label at once
+        if conditions is not None:
+            self.conditions = sorted(conditions, key=lambda c: (c.priority, c.name))
+            self.names = (*(condition.name for condition in self.conditions), NOMINAL)
+            self._enough = min(EPISODES_PER_QUERY, num_envs)
+        self._running: list[list[Any]] = [[] for _ in range(num_envs)]
+        self._ended: list[tuple[int, list[Any]]] = []  # key, and what is known of each step
 
     def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> bool:
         """Take one environment's step; `key` names its episode.
@@ -650,32 +507,52 @@ class InfoLabels:
         Returns whether the episode will have labels, as far as is known.
         """
         steps = self._running[env]
-        before, after = info.get("signals_before"), info.get("signals")
-        if before is not None and after is not None:
-            row = {name: before[name] for name in _NAMES}
-            steps.append(row | {name: after[name] for name in _COMMANDS})
+        steps.append(self._known(info))
         if not ended:
             return True
-        whole = bool(steps) and after is not None
-        if whole and after is not None:
-            steps.append({name: after[name] for name in _NAMES})
-            self._ended.append((key, steps))
-        else:
-            self.unlabelled_episodes += 1
         self._running[env] = []
-        return whole
+        if any(step is None for step in steps):
+            return False
+        if self.conditions is not None:
+            steps.append({name: info["signals"][name] for name in _NAMES})
+        self._ended.append((key, steps))
+        return True
+
+    def _known(self, info: Mapping[str, Any]) -> Any:
+        """Return the signals of a step with its command, or its condition; None if unknown."""
+        if self.conditions is None:
+            name = info.get("condition")
+            return name if name in self.names else None
+        before, after = info.get("signals_before"), info.get("signals")
+        if before is None or after is None:
+            return None
+        row = {name: before[name] for name in _NAMES}
+        return row | {name: after[name] for name in _COMMANDS}
 
     def forget(self) -> None:
         """Forget the episodes under way: they stay unlabelled."""
-        self.unlabelled_episodes += sum(bool(steps) for steps in self._running)
         self._running = [[] for _ in self._running]
 
     def label(self, *, all_of_them: bool = False) -> list[Labelled]:
         """Label the ended episodes, once enough wait to be worth a query."""
         waiting = self._ended
-        if not waiting or (len(waiting) < self._worth_a_query and not all_of_them):
+        if not waiting or (len(waiting) < self._enough and not all_of_them):
             return []
         self._ended = []
+        if self.conditions is None:
+            return [
+                Labelled(
+                    key,
+                    np.array([self.names.index(name) for name in steps], np.int64),
+                    sorted(set(steps) - {NOMINAL}),
+                )
+                for key, steps in waiting
+            ]
+        return self._by_conditions(waiting, self.conditions)
+
+    def _by_conditions(
+        self, waiting: Sequence[tuple[int, list[Any]]], conditions: Sequence[Condition]
+    ) -> list[Labelled]:
         rows = [row for _, steps in waiting for row in steps]
         lengths = [len(steps) for _, steps in waiting]
         columns: dict[str, Any] = {
@@ -687,9 +564,10 @@ class InfoLabels:
             for signal in STORED_SIGNALS
         }
         columns |= signal_arrays(signals)
-        held = label(pa.table(columns), self.conditions)
-        codes = np.array([self._codes[n] for n in primary(held, self.conditions)], np.int64)
-        if not self.conditions:
+        held = label(pa.table(columns), conditions)
+        place = {name: code for code, name in enumerate(self.names)}
+        codes = np.array([place[n] for n in primary(held, conditions)], np.int64)
+        if not conditions:
             codes = np.zeros(len(rows), np.int64)
         labelled, begin = [], 0
         for (key, _), length in zip(waiting, lengths, strict=True):

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,7 +41,6 @@ from restock.replay.store.store import Store
 from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed
 
 Critic = Callable[[ReplayBufferSamples], tuple[torch.Tensor, torch.Tensor]]
-SB3 = "stable-baselines3"
 
 
 class MixtureReplayBuffer(ReplayBuffer):
@@ -81,7 +80,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         discount: float | None = None,
         ignore_weights: bool = False,
         commands: NDArray[Any] | None = None,
-        **options: Unpack[FeedOptions],
+        **options: Any,
     ) -> None:
         if optimize_memory_usage:
             raise MixtureError("optimize_memory_usage is unsupported with a mixture")
@@ -91,7 +90,8 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size, n_envs * n_step)
         self.continuous = isinstance(action_space, spaces.Box)
         self._panel, self._commands, self._ignore_weights = panel, commands, ignore_weights
-        self._n_step, self._discount, self._options = n_step, discount, options
+        self._n_step, self._discount = n_step, discount
+        self._options = FeedOptions(**options)
         self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
         self._waiting_actions: dict[tuple[int, int], F32] = {}
         self._steps = np.zeros(n_envs, np.int64)  # of the running episodes
@@ -113,26 +113,20 @@ class MixtureReplayBuffer(ReplayBuffer):
                 " ignore_weights=True",
             )
         self._log_actions = self._logged_actions(panel, self._commands)
-        size = int(np.prod(self.obs_shape))
-        return MixedFeed(SB3, self.n_envs, size, panel=panel, **self._options)
-
-    @cached_property
-    def ring(self) -> FreshRing:
-        """Return the fresh rows, packed like the panel's."""
-        panel, discount = self.feed.panel, self._discount
-        if discount is None:
-            discount = panel.discount if panel is not None else 0.99
-        ring = FreshRing(
+        return MixedFeed(
             self.buffer_size,
             self.n_envs,
             int(np.prod(self.obs_shape)),
-            discount=discount,
+            panel,
+            self._options,
             n_step=self._n_step,
-            conditions=self.feed.labels.names,
-            behaviour_policies=(SB3,),
+            discount=self._discount,
         )
-        self.feed.keep_record(ring)
-        return ring
+
+    @property
+    def ring(self) -> FreshRing:
+        """Return the fresh rows, packed like the panel's."""
+        return self.feed.ring
 
     def _logged_actions(self, panel: Panel | None, commands: NDArray[Any] | None) -> F32 | None:
         """Return actions (n, A) as Stable-Baselines3 keeps them: indices or scaled commands."""
@@ -214,7 +208,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         """Return a batch: logs first, then fresh rows."""
         feed, ring = self.feed, self.ring
         drawing = feed.draw_logs(batch_size)
-        slots = feed.sample_fresh(np.arange(len(ring)), batch_size - len(drawing.rows))
+        slots = feed.draw_fresh(batch_size - len(drawing.rows))
         parts, actions = [ring.rows[slots]], [self._fresh_actions[slots]]
         if feed.panel is not None and self._log_actions is not None:
             parts.insert(0, feed.panel.rows[drawing.rows])
@@ -258,8 +252,8 @@ class MixtureReplayBuffer(ReplayBuffer):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Begin new episodes, as the environments do when a loaded model goes on."""
         vars(self).update(state)
-        if "ring" in vars(self):
-            self.feed.give_up(self.ring.begin_episodes())
+        if "feed" in vars(self):
+            self.feed.begin_episodes()
         self._waiting_actions.clear()
         self._steps[:] = 0
 
