@@ -5,6 +5,5 @@ FORMATS: dict[str, tuple[str, str, str]] = {
     "minari": ("minari_hdf5", "minari", ""),
     "d3rlpy": ("one_file", "h5py", ".h5"),
     "lerobot": ("lerobot_v3", "", ""),
-    "lerobot-video": ("lerobot_v3", "av", ""),
     "parquet": ("one_file", "", ".parquet"),
 }

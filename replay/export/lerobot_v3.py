@@ -2,22 +2,19 @@
 
     meta/info.json  meta/stats.json  meta/tasks.parquet
     meta/episodes/chunk-000/file-000.parquet    one row an episode: where it is, and its statistics
-    data/chunk-000/file-000.parquet             one row a frame
+    data/chunk-000/file-000.parquet             one row a frame, a row group an episode
     meta/restock.json                           where it is from
 
 A frame is an observation and the action taken there. The layout has no frame for the observation
 after the last action, so `next.observation.state` keeps it in every frame (not if a query chooses
-the state). A camera's frame in force at a step is its `observation.images.CAMERA`: a file in the
-table or, as video, a frame of `videos/observation.images.CAMERA/chunk-000/file-000.mp4`.
+the state). A camera's frame in force at a step is its `observation.images.CAMERA`, a file in the
+table.
 """
 
 from __future__ import annotations
 
-import io
 import json
-import os
-from collections.abc import Iterator, Sequence
-from fractions import Fraction
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,47 +23,35 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.errors import StoreError
 from restock.replay.export.images import ImageFeature, pictures
 from restock.replay.export.selection import Selection
 from restock.replay.export.trajectory import STATE, Counts, Trajectory, fixed_lists
 
 CODEBASE_VERSION = "v3.0"
-CHUNK_FILES, DATA_FILE_MB, VIDEO_FILE_MB = 1000, 100, 200
 TASK = "Drive along the planned route to its goal without touching anything."
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 OWN = "restock."  # columns about a frame, not of it: without statistics
 PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+FILE = PATTERN.format(chunk_index=0, file_index=0)  # the only one
 
 PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # as `datasets` has images
 Stats = dict[str, dict[str, NDArray[np.float64]]]
 
 
-def write_lerobot_video(
+def write_lerobot(
     selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
-    """Write the directory `out`, with frames of cameras as video."""
-    return write_lerobot(selection, trajectories, out, counts, as_video=True)
-
-
-def write_lerobot(
-    selection: Selection,
-    trajectories: Iterator[Trajectory],
-    out: Path,
-    counts: Counts,
-    *,
-    as_video: bool = False,
-) -> list[str]:
     """Write the directory `out`."""
-    (out / "meta").mkdir(parents=True)
-    data = _DataFiles(out)
+    data, about_episodes = (out / name / FILE for name in ("data", "meta/episodes"))
+    for path in (data, about_episodes):
+        path.parent.mkdir(parents=True)
+    writer: pq.ParquetWriter | None = None
     episodes: list[dict[str, Any]] = []
     every: list[Stats] = []
     frames = 0
     features: dict[str, dict[str, Any]] = {}
     fps = 1 / selection.task.control_period_s
     cameras = [ImageFeature(camera) for camera in selection.cameras]
-    videos = {one.name: _VideoFiles(out, one, fps) for one in cameras if as_video}
     for number, trajectory in enumerate(trajectories):
         columns = _frames(trajectory, number, frames, fps)
         features = features or _features(selection, columns)
@@ -76,14 +61,12 @@ def write_lerobot(
             if not name.startswith(OWN)
         }
         images: dict[str, pa.Array] = {}
-        filmed: dict[str, Any] = {}
         for feature, rows, some in pictures(selection.store, trajectory, cameras):
-            if as_video:
-                filmed |= videos[feature.name].add([row["bytes"] for row in rows])
-            else:
-                images[feature.name] = pa.array(rows, PICTURE)
+            images[feature.name] = pa.array(rows, PICTURE)
             stats[feature.name] = _image_stats(some)
-        place = data.add(_table(columns, images))
+        table = _table(columns, images)
+        writer = writer or pq.ParquetWriter(data, table.schema)
+        writer.write_table(table)
         every.append(stats)
         length = len(trajectory)
         episodes.append(
@@ -93,9 +76,8 @@ def write_lerobot(
                 "length": length,
                 "dataset_from_index": frames,
                 "dataset_to_index": frames + length,
-                "data/chunk_index": place[0],
-                "data/file_index": place[1],
-                **filmed,
+                "data/chunk_index": 0,
+                "data/file_index": 0,
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
                 "restock/episode_id": trajectory.episode_id,
@@ -111,12 +93,9 @@ def write_lerobot(
             }
         )
         frames += length
-    data.close()
-    for video in videos.values():
-        video.close()
-    path = out / "meta/episodes" / PATTERN.format(chunk_index=0, file_index=0)
-    path.parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist(episodes), path)
+    if writer is not None:
+        writer.close()
+    pq.write_table(pa.Table.from_pylist(episodes), about_episodes)
     _write_tasks(out / "meta/tasks.parquet")
     _write_json(out / "meta/stats.json", _json(_together(every)))
     _write_json(out / "meta/restock.json", selection.provenance | {"counts": counts.describe()})
@@ -128,129 +107,17 @@ def write_lerobot(
             "total_episodes": len(episodes),
             "total_frames": frames,
             "total_tasks": 1,
-            "chunks_size": CHUNK_FILES,
-            "data_files_size_in_mb": DATA_FILE_MB,
-            "video_files_size_in_mb": VIDEO_FILE_MB,
+            "chunks_size": 1000,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
             "fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps,
             "splits": {"train": f"0:{len(episodes)}"},
             "data_path": f"data/{PATTERN}",
-            "video_path": f"videos/{{video_key}}/{PATTERN[:-8]}.mp4" if videos else None,
-            "features": features
-            | {camera.name: camera.describe() for camera in cameras}
-            | {name: files.describe() for name, files in videos.items()},
+            "video_path": None,
+            "features": features | {camera.name: camera.describe() for camera in cameras},
         },
     )
-    if as_video:
-        return [f"{camera.name}: video, which loses detail" for camera in cameras]
     return [camera.note() for camera in cameras]
-
-
-class _DataFiles:
-    """Frames in files of about DATA_FILE_MB; an episode is never split."""
-
-    def __init__(self, out: Path) -> None:
-        self._out, self._bytes = out, 0
-        self._place = (0, 0)
-        self._writer: pq.ParquetWriter | None = None
-
-    def add(self, table: pa.Table) -> tuple[int, int]:
-        """Append an episode; returns the chunk and the file it is in."""
-        if self._bytes and self._bytes + table.nbytes > DATA_FILE_MB * 2**20:
-            self.close()
-            self._place = _after(self._place)
-            self._bytes = 0
-        if self._writer is None:
-            name = PATTERN.format(chunk_index=self._place[0], file_index=self._place[1])
-            path = self._out / "data" / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(path, table.schema)
-        self._writer.write_table(table)
-        self._bytes += table.nbytes
-        return self._place
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-
-
-def _after(place: tuple[int, int]) -> tuple[int, int]:
-    chunk, file = place
-    return (chunk, file + 1) if file + 1 < CHUNK_FILES else (chunk + 1, 0)
-
-
-class _VideoFiles:
-    """A camera's frames in files of about VIDEO_FILE_MB; an episode is never split."""
-
-    def __init__(self, out: Path, feature: ImageFeature, fps: float) -> None:
-        self._folder, self._feature, self._fps = out / "videos" / feature.name, feature, fps
-        self._place, self._frames, self._bytes = (0, 0), 0, 0
-        self._file: Any = None
-        self._stream: Any = None
-
-    def add(self, pictures: Sequence[bytes]) -> dict[str, Any]:
-        """Append an episode; returns where it is, as `meta/episodes` has it.
-
-        Raises:
-            StoreError: its pictures have an odd width or height.
-        """
-        import av
-        from PIL import Image
-
-        if self._file is not None and self._bytes > VIDEO_FILE_MB * 2**20:
-            self.close()
-            self._place = _after(self._place)
-        if self._file is None:
-            self._open()
-        for picture in pictures:
-            with Image.open(io.BytesIO(picture)) as image:
-                frame = av.VideoFrame.from_image(image.convert("RGB"))
-            self._write(self._stream.encode(frame))
-        begin, self._frames = self._frames, self._frames + len(pictures)
-        key = f"videos/{self._feature.name}"
-        return {
-            f"{key}/chunk_index": self._place[0],
-            f"{key}/file_index": self._place[1],
-            f"{key}/from_timestamp": begin / self._fps,
-            f"{key}/to_timestamp": self._frames / self._fps,
-        }
-
-    def _open(self) -> None:
-        import av
-
-        height, width = self._feature.shape or (0, 0)
-        if height % 2 or width % 2:
-            raise StoreError(
-                f"camera {self._feature.camera!r} has pictures of {width} x {height} pixels, and"
-                " video needs even numbers",
-                remedy="export it as images: --to lerobot",
-            )
-        name = PATTERN.format(chunk_index=self._place[0], file_index=self._place[1])
-        path = (self._folder / name).with_suffix(".mp4")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        os.environ.setdefault("SVT_LOG", "1")  # errors alone: it writes to stderr by itself
-        self._frames, self._bytes, self._file = 0, 0, av.open(str(path), "w")
-        rate = Fraction(self._fps).limit_denominator(1000)
-        self._stream = self._file.add_stream("libsvtav1", rate, options={"g": "2", "crf": "30"})
-        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
-
-    def _write(self, packets: Any) -> None:
-        self._bytes += sum(packet.size for packet in packets)
-        self._file.mux(packets)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the feature's entry in info.json."""
-        height, width = self._feature.shape or (0, 0)
-        about = {"height": height, "width": width, "codec": "av1", "pix_fmt": "yuv420p"}
-        about |= {"is_depth_map": False, "fps": self._fps, "channels": 3}
-        info = {f"video.{key}": value for key, value in about.items()} | {"has_audio": False}
-        return self._feature.describe() | {"dtype": "video", "info": info}
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._write(self._stream.encode())
-            self._file.close()
-            self._file = None
 
 
 def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[str, Any]:

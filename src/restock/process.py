@@ -184,7 +184,7 @@ EXTRAS = {
     **dict.fromkeys(("altair", "scipy", "vl_convert"), "pages"),
     **dict.fromkeys(("gymnasium", "mujoco", "safetensors", "tensorboard", "torch"), "train"),
     **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
-    **dict.fromkeys(("av", "h5py", "minari", "stable_baselines3", "tianshou"), "libraries"),
+    **dict.fromkeys(("h5py", "minari", "stable_baselines3", "tianshou"), "libraries"),
     **dict.fromkeys(("wandb", "mlflow"), "track"),
     "mcp": "mcp",
 }

@@ -58,7 +58,6 @@ NEEDS = {  # command line -> the extra that it names
     "coverage gaps STORE": "pages",
     "coverage STORE --out page.html": "pages",
     "export panel --to minari --out minari": "libraries",
-    "export panel --to lerobot-video --out film": "libraries",
     "export RUN --to onnx --out policy.onnx": "train",
     "train --panel panel --out new": "train",
     "eval RUN": "train",

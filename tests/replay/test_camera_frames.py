@@ -118,49 +118,6 @@ def test_lerobot_itself_reads_the_images(store_path, tmp_path):
     np.testing.assert_allclose(images["observation.images.front"]["corner"], expected, atol=0.05)
 
 
-def test_lerobot_video_has_the_frames_in_order(store_path, tmp_path, monkeypatch):
-    av = pytest.importorskip("av", reason="PyAV is not installed: restock[libraries]")
-    monkeypatch.setattr("restock.replay.export.lerobot_v3.VIDEO_FILE_MB", -1)  # a file an episode
-    query = "FROM transitions WHERE step_index != 9"  # two trajectories
-    export_dataset(store_path, "lerobot-video", tmp_path / "a", query=query)
-    info = json.loads((tmp_path / "a/meta/info.json").read_text())
-    feature = info["features"]["observation.images.front"]
-    assert (feature["dtype"], feature["shape"]) == ("video", [32, 48, 3])
-    assert feature["info"]["video.codec"] == "av1"
-    (data,) = (tmp_path / "a/data").rglob("*.parquet")
-    assert "observation.images.front" not in pq.read_schema(data).names
-    assert "observation.images.front" in json.loads((tmp_path / "a/meta/stats.json").read_text())
-    (episodes,) = (tmp_path / "a/meta/episodes").rglob("*.parquet")
-    left = [step for step in range(29) if step != 9]
-    for episode in pq.ParquetFile(episodes).read().to_pylist():
-        place = {
-            f"{part}_index": episode[f"videos/observation.images.rear/{part}_index"]
-            for part in ("chunk", "file")
-        }
-        path = info["video_path"].format(video_key="observation.images.rear", **place)
-        with av.open(str(tmp_path / "a" / path)) as video:
-            shown = [(float(f.time), f.to_ndarray(format="rgb24")) for f in video.decode(video=0)]
-        begin, end = (
-            episode[f"videos/observation.images.rear/{name}_timestamp"] for name in ("from", "to")
-        )
-        assert (begin, len(shown)) == (0.0, episode["length"])
-        assert end == pytest.approx(len(shown) / info["fps"])
-        times = np.arange(len(shown)) / info["fps"]
-        np.testing.assert_allclose([time for time, _ in shown], times, atol=1e-4)
-        steps = left[episode["dataset_from_index"] : episode["dataset_to_index"]]
-        for step, (_, image) in zip(steps, shown, strict=True):
-            assert np.abs(image.astype(int) - picture(2 * step)).mean() < 3
-
-
-def test_pictures_of_odd_size_are_no_video(tmp_path):
-    pytest.importorskip("av", reason="PyAV is not installed: restock[libraries]")
-    files = [file_of(picture(number)[:31]) for number in range(60)]
-    store = stored(tmp_path, {FRONT: compressed(files)})
-    with pytest.raises(StoreError, match="48 x 31 pixels, and video needs even numbers"):
-        export_dataset(store, "lerobot-video", tmp_path / "a")
-    assert not (tmp_path / "a").exists()
-
-
 def test_steps_without_a_frame_are_left_out_and_counted(tmp_path):
     times = 2 + np.arange(40) * 0.1  # the camera is late by two seconds
     files = [file_of(picture(number)) for number in range(40)]

@@ -189,7 +189,6 @@ def provenance_in(to: str, out: Path) -> Any:
     text: Callable[[], Any] = {
         "parquet": lambda: pq.read_metadata(out).metadata[b"restock"],
         "lerobot": lambda: (out / "meta/restock.json").read_text(),
-        "lerobot-video": lambda: (out / "meta/restock.json").read_text(),
         "minari": lambda: json.loads((out / "metadata.json").read_text())["restock"],
         "d3rlpy": lambda: __import__("h5py").File(out)["restock"].attrs["provenance"],
     }[to]
@@ -344,16 +343,13 @@ def test_a_state_that_cannot_be_exported(store_path, tmp_path, to, state, words)
     assert not out.exists()
 
 
-def test_lerobots_layout_is_complete_without_lerobot(store_path, tmp_path, monkeypatch):
-    monkeypatch.setattr("restock.replay.export.lerobot_v3.DATA_FILE_MB", 0.05)  # several files
-    monkeypatch.setattr("restock.replay.export.lerobot_v3.CHUNK_FILES", 2)
+def test_lerobots_layout_is_complete_without_lerobot(store_path, tmp_path):
     out = tmp_path / "a"
     document = export_dataset(store_path, "lerobot", out)
     info = json.loads((out / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     assert info["total_frames"] == document["transitions"]
     episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert (out / "data/chunk-001/file-000.parquet").is_file()
     for episode in episodes:
         path = info["data_path"].format(
             chunk_index=episode["data/chunk_index"], file_index=episode["data/file_index"]
@@ -487,9 +483,8 @@ def test_a_missing_library_is_named_with_its_command(store_path, tmp_path, monke
     find = importlib.util.find_spec
 
     def absent(name: str, package: str | None = None) -> Any:
-        return None if name in ("h5py", "av") else find(name, package)
+        return None if name == "h5py" else find(name, package)
 
     monkeypatch.setattr(importlib.util, "find_spec", absent)
-    for to, out in (("d3rlpy", "logs.h5"), ("lerobot-video", "logs")):
-        with pytest.raises(ConfigError, match=re.escape(install_command("libraries"))):
-            export_dataset(store_path, to, tmp_path / out)
+    with pytest.raises(ConfigError, match=re.escape(install_command("libraries"))):
+        export_dataset(store_path, "d3rlpy", tmp_path / "logs.h5")

@@ -29,8 +29,7 @@ class ExportCommand:
     source: Annotated[Path, Positional("SOURCE")]
     """A store or a panel; for onnx, a run; for run, a folder of runs."""
     to: Annotated[str, Option(choices=TO)]
-    """The format. minari, lerobot and lerobot-video (frames as MP4) write directories, the others
-    files (d3rlpy: .h5)."""
+    """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, Option("OUT")]
     """The file or directory to write, which must not exist yet."""
     panel: Annotated[Path | None, Positional("[PANEL]")] = None
