@@ -113,7 +113,7 @@ def chosen_cameras(store: Store, named: Sequence[str] | None) -> list[str]:
 
 
 def pictures(
-    store: Store | None, trajectory: Trajectory, features: Sequence[ImageFeature]
+    store: Store, trajectory: Trajectory, features: Sequence[ImageFeature]
 ) -> Iterator[tuple[ImageFeature, list[dict[str, Any]], NDArray[np.uint8]]]:
     """Yield each camera's pictures of a trajectory, one per step (T).
 
@@ -123,7 +123,7 @@ def pictures(
     Raises:
         StoreError: as `ImageFeature.picture`, or a damaged frame.
     """
-    if store is None:
+    if not features:
         return
     ids = [int(one) for one in trajectory.carried["transition_id"]]
     sampled = {ids[place] for place in np.linspace(0, len(ids) - 1, SAMPLES).astype(int)}

@@ -37,7 +37,7 @@ def write_minari(
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(selection.task.actions))
     if selection.continuous:
-        low, high = np.array(selection.command_range, np.float32)
+        low, high = (end.astype(np.float32) for end in selection.command_range)
         action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
     storage = MinariStorage.new(
         out.absolute(),  # Minari joins a relative path to itself

@@ -1,9 +1,8 @@
-"""What is exported: a panel, or the rows of a query to a store, in order."""
+"""What is exported: the rows of a query to a store, or those that a panel took from it."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,20 +14,19 @@ import numpy as np
 import pyarrow as pa
 
 from restock import __version__
+from restock.arrays import F64
 from restock.errors import PanelError, QueryError, StoreError
 from restock.ingest.task.task import Task
 from restock.replay.export.images import chosen_cameras
 from restock.replay.export.trajectory import (
     CARRIED,
     COMMAND,
-    NEXT_IS_NEXT,
     REQUIRED,
     STATE,
     missing_columns,
 )
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import open_place
-from restock.replay.plan.candidates import LATER
 from restock.replay.store.parquet_views import literal
 from restock.replay.store.query import fetch, interruptible
 from restock.replay.store.query import query as run_query
@@ -36,10 +34,7 @@ from restock.replay.store.store import Store
 
 BATCH_ROWS = 16_384
 EVERYTHING = "FROM transitions"
-FROM_THE_STORE = (
-    "export its rows from the store: restock export STORE PANEL --query"
-    ' "FROM transitions SEMI JOIN panel.rows USING (transition_id)"'
-)
+OF_PANEL = "FROM transitions SEMI JOIN panel.rows USING (transition_id)"
 
 
 @dataclass(frozen=True)
@@ -50,9 +45,9 @@ class Selection:
     batches: Iterator[pa.RecordBatch]
     task: Task
     continuous: bool
-    command_range: tuple[tuple[float, float], tuple[float, float]]  # low, high; of the actions
+    command_range: tuple[F64, F64]  # low and high (2,) of the actions
     provenance: dict[str, Any]  # of the data set, as JSON
-    store: Store | None = None  # that the rows are of, where frames of cameras go with them
+    store: Store  # that the rows are of
     cameras: tuple[str, ...] = ()  # each row has a frame of each
     left_out: Mapping[str, int] = field(default_factory=dict)  # rows, by reason
     by_name: bool = False  # each row has a state of chosen numbers
@@ -71,7 +66,7 @@ def open_selection(
     continuous: bool = False,
     cameras: Sequence[str] | None = (),
 ) -> Iterator[Selection]:
-    """Yield the rows of a panel, or of a query to a store.
+    """Yield the rows of a query to a store, or those that a panel took from its store.
 
     Args:
         path: a store, at a version if it is `store@12`, or a panel.
@@ -84,17 +79,16 @@ def open_selection(
         StoreError, PanelError: nothing there, rows of several tasks, no rows, no such camera.
         QueryError: a query that does not run or lacks columns.
     """
-    path = Path(path)
-    if (path / HEADER).is_file():
-        if query is not None or panel is not None:
-            raise QueryError("a panel is exported as it is, without a query", where=str(path),
-                             remedy="give its store first, then the panel")  # fmt: skip
-        if cameras:
+    if (Path(path) / HEADER).is_file():
+        header = Panel.open(path).header
+        if query is not None or panel is not None or header.others or header.store_version < 0:
             raise PanelError(
-                "a panel keeps no frames of cameras", where=str(path), remedy=FROM_THE_STORE
+                "only a panel of one store is exported by itself, and without a query",
+                where=str(path),
+                remedy=f'give a store first: restock export STORE PANEL --query "{OF_PANEL}"',
             )
-        yield _of_panel(Panel.open(path), continuous)
-        return
+        panel, query = path, OF_PANEL
+        path = f"{header.store}@{header.store_version}"
     text = (query or EVERYTHING).strip().rstrip(";")
     beside: Mapping[str, str | Path] = {"panel": panel} if panel is not None else {}
     with (
@@ -106,29 +100,17 @@ def open_selection(
         yield _of_query(store, connection, text, panel, continuous, chosen)
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """What a column of a query must be, by DuckDB's names of types."""
-
-    words: str
-    names: frozenset[str]
-    listed: bool = False
-
-    def fits(self, kind: str) -> bool:
-        """Return whether a DuckDB type, for example DECIMAL(3,1) or FLOAT[97], is of this kind."""
-        return kind.count("[") == self.listed and re.split(r"[(\[]", kind)[0] in self.names
-
-
-_SIZES = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT")
-_INTEGERS = frozenset(sign + size for sign in ("", "U") for size in _SIZES)
-_NUMBERS = _INTEGERS | {"FLOAT", "DOUBLE", "DECIMAL"}
-_EXPECTED = {
-    **dict.fromkeys(("action", "step_index"), _Kind("an integer", _INTEGERS)),
-    **dict.fromkeys(("reward", *COMMAND), _Kind("a number", _NUMBERS)),
-    **dict.fromkeys(("terminated", "truncated"), _Kind("true or false", frozenset({"BOOLEAN"}))),
-    **dict.fromkeys(
-        ("observation", "next_observation"), _Kind("a list of numbers", _NUMBERS, listed=True)
-    ),
+_SIZES = ("tinyint", "smallint", "integer", "bigint", "hugeint")
+_INTEGERS = frozenset(sign + size for sign in ("", "u") for size in _SIZES)
+_NUMBERS = _INTEGERS | {"float", "double", "decimal"}
+_LISTS = ("observation", "next_observation")
+_TYPES: dict[
+    str, tuple[Collection[str], str]
+] = {  # DuckDB's, of a column or of the items of its lists; and what to call them
+    **dict.fromkeys(("action", "step_index"), (_INTEGERS, "an integer")),
+    **dict.fromkeys(("reward", *COMMAND), (_NUMBERS, "a number")),
+    **dict.fromkeys(("terminated", "truncated"), ({"boolean"}, "true or false")),
+    **dict.fromkeys(_LISTS, (_NUMBERS, "a list of numbers")),
 }
 
 
@@ -151,9 +133,12 @@ def _of_query(
             + ", ".join((*REQUIRED, *COMMAND) if continuous else REQUIRED),
         )
     for name, kind in zip(columns, result.types, strict=True):
-        expected = _EXPECTED.get(name)
-        if expected is not None and not expected.fits(str(kind)):
-            raise QueryError(f"its {name} is a {kind}, not {expected.words}", where=where)
+        if name in _TYPES:
+            types, words = _TYPES[name]
+            listed = kind.id in ("list", "array")
+            items: Any = kind.children[0][1] if listed else kind
+            if items.id not in types or listed != (name in _LISTS):
+                raise QueryError(f"its {name} is a {kind}, not {words}", where=where)
     requested, left_out = text, dict[str, int]()
     state = _state(columns, result.types, where)
     if state:
@@ -209,13 +194,16 @@ def _of_query(
         f"SELECT {', '.join(wanted)} FROM ({text}) ORDER BY {', '.join(order)}",
         where=where,
     )
-    seen = ((facts[3], facts[5]), (facts[4], facts[6])) if continuous else None
+    table = np.asarray(task.actions)
+    low, high = table.min(axis=0), table.max(axis=0)
+    if continuous:  # commands may go beyond the actions
+        low, high = np.minimum(low, facts[3::2]), np.maximum(high, facts[4::2])
     return Selection(
         where=where,
         batches=_batches(connection, relation, where),
         task=task,
         continuous=continuous,
-        command_range=_range(task, seen),
+        command_range=(low, high),
         provenance={
             "store": where,
             "store_version": store.version,
@@ -284,7 +272,7 @@ def _state(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str
         return {}
     kind = types[list(columns).index(STATE)]
     inner = dict(kind.children) if kind.id == "struct" else {}
-    if not inner or not all(_Kind("", _NUMBERS).fits(str(one)) for one in inner.values()):
+    if not inner or not all(one.id in _NUMBERS for one in inner.values()):
         raise QueryError(
             f"its {STATE} is a {kind}, not numbers by name",
             where=where,
@@ -317,73 +305,6 @@ def _batches(
             yield batch
     except (duckdb.Error, pa.ArrowException, OSError) as error:
         raise QueryError(str(error).splitlines()[0], where=where) from error
-
-
-def _of_panel(panel: Panel, continuous: bool) -> Selection:
-    if continuous:
-        raise PanelError(
-            "a panel keeps the index of the action, not the command",
-            where=str(panel.path),
-            remedy=FROM_THE_STORE,
-        )
-    task = panel.task
-    return Selection(
-        where=str(panel.path),
-        batches=_panel_batches(panel),
-        task=task,
-        continuous=False,
-        command_range=_range(task, None),
-        provenance={
-            "store": panel.header.store,
-            "store_version": panel.store_version,
-            "other_stores": msgspec.to_builtins(panel.header.others),
-            "panel": panel.id,
-            "labels_version": panel.header.labels_version,
-            **_of_task(task, continuous),
-        },
-    )
-
-
-def _panel_batches(panel: Panel) -> Iterator[pa.RecordBatch]:
-    """Yield a panel's rows in order, as a query would give them."""
-    text = {"recording_id", "episode_id", "condition", "zone", "behaviour_policy"}
-    text |= {"behaviour_version", *LATER}
-    meta = panel.meta.cast(
-        pa.schema([f.with_type(pa.string()) if f.name in text else f for f in panel.meta.schema])
-    )
-    # An episode's place in its recording is the number after the slash.
-    index = [int(name.rpartition("/")[2]) for name in meta["episode_id"].to_pylist()]
-    recording = meta["recording_id"].to_numpy()
-    row = np.lexsort((meta["step_index"].to_numpy(), index, recording))
-    meta = meta.take(pa.array(row))
-    horizon = meta["horizon"].to_numpy()
-    for begin in range(0, len(meta), BATCH_ROWS):
-        part = slice(begin, begin + BATCH_ROWS)
-        packed = panel.rows[row[part]]
-        table = meta.slice(begin, BATCH_ROWS)
-        columns = {
-            name: table[name].combine_chunks()
-            for name in (*REQUIRED, *CARRIED)
-            if name in table.column_names
-        }
-        for name in ("observation", "next_observation"):
-            values = np.ascontiguousarray(packed[:, panel.columns[name]])
-            columns[name] = pa.FixedSizeListArray.from_arrays(
-                pa.array(values.ravel()), panel.observation_size
-            )
-        columns[NEXT_IS_NEXT] = pa.array(horizon[part] == 1)
-        yield pa.RecordBatch.from_pydict(columns)
-
-
-def _range(
-    task: Task, seen: tuple[tuple[float, float], tuple[float, float]] | None
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return what the task's actions span, or more where commands went beyond it."""
-    table = np.asarray(task.actions)
-    low, high = table.min(axis=0), table.max(axis=0)
-    if seen is not None:
-        low, high = np.minimum(low, seen[0]), np.maximum(high, seen[1])
-    return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
 
 def _of_task(task: Task, continuous: bool) -> dict[str, Any]:

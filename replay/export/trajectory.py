@@ -1,7 +1,7 @@
 """Transitions put back together into trajectories: what other libraries' formats hold.
 
 A trajectory is an unbroken run of steps of one episode with the observation after its last step.
-Where rows are missing (a query or a mixture left them out) an episode becomes several, each ended
+Where rows are missing (a query left them out) an episode becomes several, each ended
 by a cut: truncated, for its return continues beyond it.
 """
 
@@ -31,10 +31,6 @@ CARRIED = (  # of a row, where the query has it
     *("action_probability", "action_residual", "robot", "site"),
 )
 STATE = "observation.state"  # of a query: numbers by name, in place of the task's observation
-# A row of an n-step panel: whether `next_observation` is the one a single step later.
-NEXT_IS_NEXT = "next_is_next"
-
-ENDED, CUT, NO_NEXT = "episode ended", "rows are missing", "no observation one step later"
 
 
 @dataclass(frozen=True)
@@ -111,10 +107,10 @@ def trajectories(
         rows = _Rows(table, continuous, where)
         starts = rows.starts()
         for begin, end in pairwise(starts.tolist()):
-            yield from _trajectory(rows, begin, end, counts)
+            yield _trajectory(rows, begin, end, counts)
         left = table.slice(int(starts[-1])) if len(starts) else None
     if left is not None and len(left):
-        yield from _trajectory(_Rows(left, continuous, where), 0, len(left), counts)
+        yield _trajectory(_Rows(left, continuous, where), 0, len(left), counts)
 
 
 class _Rows:
@@ -149,11 +145,6 @@ class _Rows:
             if continuous
             else np.asarray(_whole(table, "action", where), np.int64)
         )
-        self.known: Bools = (
-            np.asarray(_whole(table, NEXT_IS_NEXT, where), np.bool_)
-            if NEXT_IS_NEXT in table.column_names
-            else np.ones(len(table), np.bool_)
-        )
         self.carried = {name: _plain(table, name) for name in CARRIED if name in table.column_names}
         if STATE in table.column_names:
             self.carried[STATE] = observation_matrix(table[STATE], where)
@@ -170,36 +161,28 @@ class _Rows:
             )
         goes_on = same & (self.step[1:] == self.step[:-1] + 1)
         goes_on &= ~(self.terminated[:-1] | self.truncated[:-1])
-        equal = np.all(
+        goes_on &= np.all(
             (self.next_observation[:-1] == self.observation[1:])
             | (np.isnan(self.next_observation[:-1]) & np.isnan(self.observation[1:])),
             axis=1,
         )
-        goes_on &= equal | ~self.known[:-1]
         return np.concatenate([[0], np.flatnonzero(~goes_on) + 1]).astype(np.int64)
 
 
-def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Iterator[Trajectory]:
-    """Yield the rows [begin, end) as one trajectory, or none where nothing is left of them."""
-    last = end - 1
-    ended = bool(rows.terminated[last] or rows.truncated[last])
-    after = rows.next_observation[last]
-    if not rows.known[last]:  # then its own observation is the last one that is known
-        counts.left_out[NO_NEXT] += 1
-        end, after, ended = last, rows.observation[last], False
-    if end == begin:
-        return
-    terminated = ended and bool(rows.terminated[last])
-    inside = slice(begin, end)
+def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Trajectory:
+    """Return the rows [begin, end) as one trajectory."""
+    last, inside = end - 1, slice(begin, end)
+    terminated = bool(rows.terminated[last])
+    ended = terminated or bool(rows.truncated[last])
     counts.transitions += end - begin
     counts.trajectories += 1
     counts.terminated += terminated
     counts.truncated += ended and not terminated
     counts.cut += not ended
-    yield Trajectory(
+    return Trajectory(
         episode_id=str(rows.episode[begin]),
         first_step=int(rows.step[begin]),
-        observations=np.concatenate([rows.observation[inside], after[None]]),
+        observations=np.concatenate([rows.observation[inside], rows.next_observation[last:end]]),
         actions=rows.action[inside],
         rewards=rows.reward[inside],
         terminated=terminated,

@@ -44,7 +44,7 @@ MAY_IMPORT = {
     "replay/review": (
         "store trace ingest ingest/containers ingest/profile ingest/steps ingest/store ingest/task"
     ),
-    "replay/export": ("replay panel plan store ingest/steps ingest/profile ingest/task"),
+    "replay/export": "replay panel store ingest/steps ingest/profile ingest/task",
     "train": (
         "dqn evaluation feed run twin/missions twin/env twin/floors twin/physics"
         " replay/mixture replay/panel replay/sampling ingest/profile ingest/task"

@@ -130,21 +130,10 @@ def test_a_step_is_an_end_if_the_next_begins_elsewhere():
     assert [t.cut for t in found] == [True, False]
 
 
-def test_a_panel_of_n_steps_gives_back_single_steps(store_path, tmp_path):
-    one = n_step_panel(store_path, tmp_path / "one", 1)
-    three = n_step_panel(store_path, tmp_path / "three", 3)
-    single, counts = of(one.path)
-    several, counts_too = of(three.path)
-    assert counts.transitions == counts_too.transitions == len(one)
-    for left, right in zip(single, several, strict=True):
-        np.testing.assert_array_equal(left.observations, right.observations)
-        np.testing.assert_array_equal(left.rewards, right.rewards)
-        assert left.terminated == right.terminated
-
-
-def test_a_panel_with_holes_counts_what_it_leaves_out(store_path, tmp_path):
-    holes = n_step_panel(store_path, tmp_path / "holes", 3, 'where = "step_index % 5 <> 4"\n')
-    found, counts = of(holes.path)
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_a_panels_rows_are_single_steps_of_its_store(store_path, tmp_path, n_step):
+    panel = n_step_panel(store_path, tmp_path / "panel", n_step, 'where = "step_index % 5 <> 4"\n')
+    found, counts = of(panel.path)
     whole, _ = of(store_path)
     by_id = {
         identity: (t, at)
@@ -155,7 +144,8 @@ def test_a_panel_with_holes_counts_what_it_leaves_out(store_path, tmp_path):
         origin, at = by_id[int(t.carried["transition_id"][0])]
         expected = origin.observations[at : at + len(t) + 1]
         np.testing.assert_array_equal(t.observations, expected)
-    assert counts.transitions + sum(counts.left_out.values()) == counts.rows == len(holes)
+        np.testing.assert_array_equal(t.rewards, origin.rewards[at : at + len(t)])
+    assert counts.transitions == counts.rows == len(panel)
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
@@ -420,6 +410,10 @@ def test_hdf5_ends_before_a_full_disk(to, store_path, tmp_path, monkeypatch):
     free = iter([10**10, 10**10, 2**20])  # less, an episode after the other
     monkeypatch.setattr(
         "shutil.disk_usage", lambda path: SimpleNamespace(free=next(free), path=path)
+    for name in ("transition_id", "action", "next_observation"):
+        assert pq.read_table(alone)[name].equals(pq.read_table(beside)[name])
+    with pytest.raises(PanelError, match="only a panel of one store"):
+        export_dataset(panel.path, "parquet", tmp_path / "c.parquet", query=query)
     )
     out = tmp_path / ("out.h5" if to == "d3rlpy" else "out")
     with pytest.raises(StoreError, match=r"nearly full: 1 MiB are free") as refused:
@@ -430,15 +424,11 @@ def test_hdf5_ends_before_a_full_disk(to, store_path, tmp_path, monkeypatch):
 
 def test_a_panel_has_no_commands_but_its_store_has(store_path, tmp_path):
     panel = n_step_panel(store_path, tmp_path / "panel", 1, "where = \"zone = 'cross'\"\n")
-    with pytest.raises(PanelError, match="keeps the index of the action"):
-        export_dataset(panel.path, "parquet", tmp_path / "a.parquet", continuous=True)
+    alone, beside = tmp_path / "a.parquet", tmp_path / "b.parquet"
+    export_dataset(panel.path, "parquet", alone, continuous=True)
+    query = "FROM transitions SEMI JOIN panel.rows USING (transition_id)"
     document = export_dataset(
-        store_path,
-        "parquet",
-        tmp_path / "a.parquet",
-        query="FROM transitions SEMI JOIN panel.rows USING (transition_id)",
-        panel=panel.path,
-        continuous=True,
+        store_path, "parquet", beside, query=query, panel=panel.path, continuous=True
     )
     assert document["transitions"] == len(panel)
     assert document["provenance"]["panel"] == panel.id

@@ -18,7 +18,7 @@ TO = (*FORMATS, "onnx", "run")
 class ExportCommand:
     """Write transitions as another library's data set, or a run's policy as an ONNX file.
 
-    The rows of a panel, or of a query to a store, are put together into episodes: in order, with
+    The rows of a query to a store, or of a panel, are put together into episodes: in order, with
     how each ended and the observation after its last step. If a query leaves out rows, an episode
     is cut where rows are missing and becomes several. The data set records its provenance: store
     version, query or panel, task, counts. See docs/libraries.md. The policy of a run is the best
@@ -27,7 +27,7 @@ class ExportCommand:
     """
 
     source: Annotated[Path, Positional("SOURCE")]
-    """A store or a panel; for onnx, a run; for run, a folder of runs."""
+    """A store, or a panel whose store is there; for onnx, a run; for run, a folder of runs."""
     to: Annotated[str, Option(choices=TO)]
     """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, Option("OUT")]
