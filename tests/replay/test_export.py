@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -18,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from ruamel.yaml import YAML
 from support.neighbours import read_with
 from support.panels import EVERY, NO_SPLIT, panel_of
 from support.stores import TASK, recording_transitions, write_store
@@ -32,7 +30,6 @@ from restock.replay.export.dataset import export_dataset
 from restock.replay.export.selection import open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, trajectories
 from restock.replay.panel.panel import Panel
-from restock.replay.store.store import Store
 
 SLIP = "FROM held_conditions WHERE condition = 'wheel_slip'"
 
@@ -291,7 +288,6 @@ def test_lerobots_state_may_be_chosen_signals(store_path, tmp_path, transitions)
     assert info["features"]["observation.state"]["names"] == ["x.vel", "theta.vel"]
     assert info["features"]["observation.state"]["shape"] == [2]
     assert "next.observation.state" not in info["features"]
-    assert "2 numbers, by name: `x.vel`, `theta.vel`" in (tmp_path / "a/README.md").read_text()
     rows = ordered(transitions)
     with open_recording(tmp_path / "a") as recording:  # its own data set is a recording, too
         state = recording.read({"/observation.state": ["x_vel", "theta_vel"]})["/observation.state"]
@@ -404,25 +400,7 @@ def test_what_cannot_be_exported_is_refused(given, error, named, store_path, tmp
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("to", ["minari", "d3rlpy"])
-def test_hdf5_ends_before_a_full_disk(to, store_path, tmp_path, monkeypatch):
-    pytest.importorskip(FORMATS[to][1])
-    free = iter([10**10, 10**10, 2**20])  # less, an episode after the other
-    monkeypatch.setattr(
-        "shutil.disk_usage", lambda path: SimpleNamespace(free=next(free), path=path)
-    for name in ("transition_id", "action", "next_observation"):
-        assert pq.read_table(alone)[name].equals(pq.read_table(beside)[name])
-    with pytest.raises(PanelError, match="only a panel of one store"):
-        export_dataset(panel.path, "parquet", tmp_path / "c.parquet", query=query)
-    )
-    out = tmp_path / ("out.h5" if to == "d3rlpy" else "out")
-    with pytest.raises(StoreError, match=r"nearly full: 1 MiB are free") as refused:
-        export_dataset(store_path, to, out)
-    assert refused.value.where == str(out)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_panel_has_no_commands_but_its_store_has(store_path, tmp_path):
+def test_a_panel_is_exported_as_by_a_query_beside_it(store_path, tmp_path):
     panel = n_step_panel(store_path, tmp_path / "panel", 1, "where = \"zone = 'cross'\"\n")
     alone, beside = tmp_path / "a.parquet", tmp_path / "b.parquet"
     export_dataset(panel.path, "parquet", alone, continuous=True)
@@ -432,6 +410,10 @@ def test_a_panel_has_no_commands_but_its_store_has(store_path, tmp_path):
     )
     assert document["transitions"] == len(panel)
     assert document["provenance"]["panel"] == panel.id
+    for name in ("transition_id", "action", "next_observation"):
+        assert pq.read_table(alone)[name].equals(pq.read_table(beside)[name])
+    with pytest.raises(PanelError, match="only a panel of one store"):
+        export_dataset(panel.path, "parquet", tmp_path / "c.parquet", query=query)
 
 
 def test_the_verb_says_what_it_wrote(store_path, tmp_path, shell):
@@ -443,30 +425,6 @@ def test_the_verb_says_what_it_wrote(store_path, tmp_path, shell):
     out, err = shell.printed(*arguments, code=ExitCode.USAGE)
     assert "already there" in err
     assert out == ""
-
-
-@pytest.mark.parametrize("to", ["lerobot", "minari"])
-def test_a_directory_has_a_card_with_what_a_hub_reads(store_path, tmp_path, to):
-    if to == "minari":
-        pytest.importorskip("minari", reason="minari is not installed: restock[libraries]")
-    where = "FROM transitions WHERE behaviour_policy = 'operator'"
-    made = export_dataset(store_path, to, tmp_path / "set", query=where)
-    _, front, text = (tmp_path / "set" / "README.md").read_text().split("---\n", 2)
-    said = YAML(typ="safe", pure=True).load(front)
-    assert "No licence was given" in text
-    assert {"robotics", "restock"} <= set(said["tags"])
-    assert said["size_categories"] == ["n<1K" if made["transitions"] < 1000 else "1K<n<10K"]
-    if to == "lerobot":
-        assert "LeRobot" in said["tags"]
-        (files,) = said["configs"]
-        assert list((tmp_path / "set").glob(files["data_files"]))
-    assert f"{made['transitions']:,} transitions" in text
-    assert f"| operator | {made['transitions']:,} | 100.0% |" in text
-    with Store(store_path) as store:
-        nominal = f"SELECT transition_id {where} AND primary_condition = 'nominal'"
-        count = len(store.sql(nominal).to_arrow_table())
-    assert f"| nominal | {count:,} |" in text
-    assert str(store_path) not in text
 
 
 def test_a_missing_library_is_named_with_its_command(store_path, tmp_path, monkeypatch):
