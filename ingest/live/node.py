@@ -218,7 +218,6 @@ class PolicyNode:
         self._parameter("profile", "")
         self._parameter("shadow", not drive)
         self._parameter("limiter", True)
-        self._parameter("takeover_topic", TAKEOVER)
 
     # -- transitions ----------------------------------------------------------------------------
 
@@ -244,7 +243,7 @@ class PolicyNode:
             profile, self._value("cmd_vel_topic"), self._value("cmd_vel_type")
         )
         self.shadow = bool(self._value("shadow"))
-        pilot = Pilot(policy, limits, self._value("takeover_topic"), MAX_AHEAD_S)
+        pilot = Pilot(policy, limits, TAKEOVER, MAX_AHEAD_S)
         reported = profile.inputs.behaviour_policy
         kinds = {
             "proposal": (PROPOSAL, self.form.type),

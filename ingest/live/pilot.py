@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from restock.errors import ConfigError, RecordingError, RestockError
+from restock.errors import RecordingError, RestockError
 from restock.ingest.live.observer import LiveObserver, Observed, value_of
 from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.profile.tables import Input
@@ -50,9 +50,9 @@ class Pilot:
     """Takes messages as they are received, and decides when it is asked.
 
     Args:
-        policy: with its profile. limits: of the limiter; None: no limiter, but an unknown input
-        still stops the robot. takeover_topic: a Bool that is true while a person drives; "": none.
-        The profile's
+        policy: with its profile.
+        limits: of the limiter; None: no limiter, but an unknown input still stops the robot.
+        takeover_topic: a Bool that is true while a person drives; "": none. The profile's
             `command_sources` of OPERATORS count as well: a button that is pressed, or commands of
             the last ACTIVE_S.
         max_ahead_s: as of `LiveObserver`.
@@ -74,12 +74,6 @@ class Pilot:
             source for name, source in self.profile.command_sources.items() if name in OPERATORS
         ]
         if takeover_topic:
-            if takeover_topic in self.observer.topics:
-                raise ConfigError(
-                    f"{takeover_topic} is an input of profile {self.profile.name!r}",
-                    where="takeover_topic",
-                    remedy="name the topic of a std_msgs/Bool, or none",
-                )
             self._people.append(Input(takeover_topic, BOOL, {"pressed": "data"}))
         self._active_ns: dict[str, int | None] = {}  # a person's topic -> when it last said so
         self._now_ns: int | None = None

@@ -268,7 +268,6 @@ def test_an_unfit_policy_leaves_it_unconfigured(policy: Path, tmp_path: Path) ->
         ({"policy": str(tmp_path / "none.onnx")}, "no such file"),
         ({"cmd_vel_type": "std_msgs/msg/Bool"}, "neither the profile's command nor a twist"),
         ({"watchdog_s": 0.0}, "must be within 0 and 60 s"),
-        ({"takeover_topic": "/scan"}, "is an input of profile"),
         ({"limiter_stop_m": 99.0}, "stop_m"),
         ({"limiter_max_speed_mps": 0.0}, "max_speed_mps"),
         ({"limiter_stop_m": 1}, "not <class 'float'>"),
