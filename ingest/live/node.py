@@ -213,11 +213,12 @@ class PolicyNode:
         self._latched: dict[str, Any] = {}  # second ones, while a publisher latches
         self._latching: dict[str, Any] = {}  # topics that a publisher may latch, with their classes
         self._timers: list[Any] = []
-        self._defaults: dict[str, Any] = {}  # of the parameters that a policy's profile declared
         self._parameter("policy", str(policy))
         self._parameter("profile", "")
         self._parameter("shadow", not drive)
         self._parameter("limiter", True)
+        self._parameter("cmd_vel_topic", "")  # these: the profile's
+        self._parameter("cmd_vel_type", "")
 
     # -- transitions ----------------------------------------------------------------------------
 
@@ -229,11 +230,8 @@ class PolicyNode:
         """
         policy = PolicyFile(Path(self._value("policy")), self._value("profile") or None)
         profile, task = policy.profile, policy.profile.task
-        form = CommandForm.of(profile)
-        self._profiles("cmd_vel_topic", form.topic)
-        self._profiles("cmd_vel_type", form.type)
-        self._profiles("watchdog_s", 2.5 * task.control_period_s)
-        self.watchdog_s = float(self._value("watchdog_s"))
+        given_s = self._number("watchdog_s")
+        self.watchdog_s = 2.5 * task.control_period_s if given_s is None else given_s
         if not 0 < self.watchdog_s <= 60:
             raise ConfigError(
                 f"must be within 0 and 60 s, got {self.watchdog_s:g}", where="watchdog_s"
@@ -326,11 +324,6 @@ class PolicyNode:
             self.node.destroy_publisher(self._reports)
         self._timers, self._published, self._reports = [], {}, None
         self._subscriptions, self._latched, self._latching = {}, {}, {}
-        # The next policy has its own; what a person has set stays.
-        for name, default in self._defaults.items():
-            if self._value(name) == default:
-                self.node.undeclare_parameter(name)
-        self._defaults.clear()
 
     # -- messages and ticks ---------------------------------------------------------------------
 
@@ -471,24 +464,22 @@ class PolicyNode:
         if not self.node.has_parameter(name):
             self.node.declare_parameter(name, default)
 
-    def _profiles(self, name: str, default: Any) -> None:
-        """Declare a parameter whose default is the profile's, until `cleanup`."""
-        self._parameter(name, default)
-        self._defaults[name] = default
+    def _number(self, name: str) -> float | None:
+        """Return a number that may be given in place of the profile's; below 0 means not given."""
+        self._parameter(name, -1.0)
+        value = float(self._value(name))
+        return None if value < 0 else value  # 0 and NaN are refused where they are no limit
 
     def _value(self, name: str) -> Any:
         return self.node.get_parameter(name).value
 
     def _limits(self, policy: PolicyFile) -> Limits | None:
-        """Return the limits by profile and parameters `limiter_…`; below 0 means not given."""
+        """Return the limits by parameters `limiter_…`, else by the profile."""
         profile = policy.profile
-        given = {}
+        limits = {} if profile.limiter is None else msgspec.structs.asdict(profile.limiter)
         for name in Limiter.__struct_fields__:
-            value = None if profile.limiter is None else getattr(profile.limiter, name)
-            self._profiles(f"limiter_{name}", -1.0 if value is None else float(value))
-            requested = float(self._value(f"limiter_{name}"))
-            if not requested < 0:  # 0 and NaN are refused where they are no limit
-                given[name] = requested
+            if (value := self._number(f"limiter_{name}")) is not None:
+                limits[name] = value
         if not self._value("limiter"):
             return None
         if not profile.task.lidar:
@@ -496,7 +487,7 @@ class PolicyNode:
                 "no lidar: the limiter limits speed and acceleration, but cannot see obstacles"
             )
         try:
-            return Limits.of(profile.task, profile.robot, msgspec.convert(given, Limiter))
+            return Limits.of(profile.task, profile.robot, msgspec.convert(limits, Limiter))
         except (ValueError, msgspec.ValidationError) as error:
             raise ConfigError(str(error), where="limiter_…") from error
 
