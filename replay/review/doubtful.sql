@@ -1,8 +1,7 @@
 -- Events of labels, and stretches that may be missed ones, the most doubtful first.
 -- `margin`: log odds that the label is right. Where the condition has a probability, those of the
 -- rows, in the mean: below zero they speak against the label. Elsewhere the doublings of one step
--- that it is long: short events are wrong more often, and gaps of a step or two in one are rarely
--- true. What is so little apart counts as one event there.
+-- that it is long: short events are wrong more often.
 WITH rules AS (
     SELECT
         ingest_id,
@@ -41,7 +40,6 @@ WITH rules AS (
         min(logged_ns) AS first_ns,
         max(logged_ns) AS last_ns,
         any_value(recording_start_ns) AS recording_start_ns,
-        bool_or(in_gap) AS in_gap,
         avg(probability) AS probability,
         avg(ln((probability + 1e-4) / (1 + 1e-4 - probability))) * if(labelled, 1, -1) AS log_odds
     FROM (
@@ -50,68 +48,18 @@ WITH rules AS (
             step_index - row_number() OVER (
                 PARTITION BY episode_id, condition, labelled ORDER BY step_index
             ) AS stretch
-        FROM (
-            SELECT
-                *,
-                NOT labelled AND probability IS NULL AND coalesce(
-                    min(step_index) FILTER (WHERE labelled) OVER (
-                        steps ROWS BETWEEN CURRENT ROW AND 2 FOLLOWING
-                    ) - max(step_index) FILTER (WHERE labelled) OVER (
-                        steps ROWS BETWEEN 2 PRECEDING AND CURRENT ROW
-                    ) <= 3,
-                    false
-                ) AS in_gap
-            FROM judged
-            WINDOW steps AS (PARTITION BY episode_id, condition ORDER BY step_index)
-        )
-        WHERE labelled OR probability >= $likely OR in_gap
+        FROM judged
+        WHERE labelled OR probability >= $likely
     )
     GROUP BY episode_id, condition, labelled, stretch
-), events AS (
-    SELECT
-        * EXCLUDE (begins),
-        sum(begins::INTEGER) OVER (PARTITION BY episode_id, condition ORDER BY first_step) AS piece_of
-    FROM (
-        SELECT
-            *,
-            coalesce(
-                first_step - lag(last_step) OVER (
-                    PARTITION BY episode_id, condition ORDER BY first_step
-                ) > 3,
-                true
-            ) AS begins
-        FROM stretches
-        WHERE labelled
-    )
-), doubtful AS (
-    SELECT
-        *,
-        log2(sum(last_step - first_step + 1) OVER (PARTITION BY episode_id, condition, piece_of))
-            AS doublings
-    FROM events
-    UNION ALL BY NAME
-    SELECT *, log2(last_step - first_step + 1) AS doublings
-    FROM stretches
-    -- What is likely beside an event is its edge, and for that event's own verdict.
-    WHERE in_gap OR NOT labelled AND NOT EXISTS (
-        FROM events AS near
-        WHERE near.episode_id = stretches.episode_id
-            AND near.condition = stretches.condition
-            AND near.first_step <= stretches.last_step + $edge
-            AND near.last_step >= stretches.first_step - $edge
-    )
 )
 SELECT
     concat_ws('/', episode_id, concat(first_step, '-', last_step), condition) AS event,
     condition,
     labelled,
     probability,
-    coalesce(log_odds, doublings) AS margin,
-    CASE
-        WHEN in_gap THEN 'gap in an event'
-        WHEN log_odds IS NULL THEN 'length'
-        ELSE 'probability'
-    END AS why,
+    coalesce(log_odds, log2(last_step - first_step + 1)) AS margin,
+    if(log_odds IS NULL, 'length', 'probability') AS why,
     recording_id AS recording,
     source_file,
     make_timestamp(first_ns // 1000) AS start_time,
@@ -122,6 +70,15 @@ SELECT
     first_step,
     last_step,
     transition_id
-FROM doubtful
+FROM stretches
+WHERE labelled OR NOT EXISTS (
+    -- What is likely beside an event is its edge, and for that event's own verdict.
+    FROM stretches AS near
+    WHERE near.labelled
+        AND near.episode_id = stretches.episode_id
+        AND near.condition = stretches.condition
+        AND near.first_step <= stretches.last_step + $edge
+        AND near.last_step >= stretches.first_step - $edge
+)
 ORDER BY margin, source_file, first_ns, condition
 LIMIT $most

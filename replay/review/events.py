@@ -34,7 +34,7 @@ class DoubtfulEvent:
     labelled: bool  # False: it may be missed
     probability: float | None  # mean over its steps; None: the condition has no rule for it
     margin: float  # log odds that the label is right, or what stands for them: doubtful near 0
-    why: str  # what the margin is made of: probability, length, gap in an event
+    why: str  # what the margin is made of: probability or length
     recording: str
     source_file: str
     start_time: datetime
@@ -56,8 +56,7 @@ def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
 
     For a condition with a probability, these are events whose mean log odds support the label
     least, and steps without the label that are likely enough to be a missed event. For other
-    conditions, they are the shortest events, and gaps of a step or two in one. Corrected events are
-    left out.
+    conditions, they are the shortest events. Corrected events are left out.
 
     Raises:
         StoreError: the store holds no labels to review.
