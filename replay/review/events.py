@@ -12,17 +12,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from restock.errors import StoreError, spreadsheet_safe
 from restock.replay.store.definitions import install_named
-from restock.replay.store.novelty import at_hand
-from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
 LIKELY = 0.2  # from this probability on, steps without a label may be a missed event
 EDGE_STEPS = 2  # what is so near to an event is its edge
-VERDICT = "verdict"
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ class DoubtfulEvent:
 
 
 _COLUMNS = [field.name for field in fields(DoubtfulEvent) if field.name != "transition_id"]
-_COLUMNS += ["open", VERDICT]  # of a review file
+_COLUMNS += ["open", "verdict"]  # of a review file
 
 
 def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
@@ -93,7 +88,7 @@ def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]
             row[name] = None if row[name] is None else round(row[name], digits)
         for name in ("start_time", "end_time"):
             row[name] = row[name].isoformat(sep=" ", timespec="milliseconds")
-        rows.append({**row, "open": opened_by(event, store), VERDICT: ""})
+        rows.append({**row, "open": opened_by(event, store), "verdict": ""})
     return rows
 
 
@@ -107,48 +102,19 @@ def review_csv(rows: list[dict[str, Any]]) -> str:
 
 
 MAX_EVENTS = 5_000  # in a page
-_MORE = """
-SELECT event, any_value(r.robot) AS robot, max(novelty) AS novelty
-FROM listed
-LEFT JOIN (SELECT recording_id, tags['robot'] AS robot FROM recordings) AS r
-    ON r.recording_id = listed.recording
-{novelty}
-GROUP BY event
-"""
-_NOVELTY = """
-LEFT JOIN (
-    SELECT episode_id, step_index, novelty FROM transitions JOIN novelty USING (transition_id)
-) AS t ON t.episode_id = listed.episode_id AND t.step_index BETWEEN first_step AND last_step
-"""
+_HALF = MAX_EVENTS // 2
 
 
-def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
-    """Return the events of a page, how many there are in all, and whether their novelty is known.
+def page_events(store: Store) -> tuple[list[dict[str, Any]], int]:
+    """Return the events of a page, and how many there are in all.
 
-    Each has what `DoubtfulEvent` has, its robot, week and novelty, and its place in a random order
-    of the labelled events (None: not labelled). That order is of the events' names alone, so the
-    first of it are a random sample, whatever their labels are. Of more than MAX_EVENTS a page has
-    those that come first in one of the orders.
+    Each has what `DoubtfulEvent` has, its robot and week, and its place in a random order of the
+    labelled events (None: not labelled). That order is of the events' names alone, so the first of
+    it are a random sample, whatever their labels are. Of more than MAX_EVENTS a page has those that
+    come first in one of the orders.
     """
     events = doubtful_events(store)
-    measured = at_hand(store)
-    listed = pa.table(
-        {
-            name: [getattr(event, name) for event in events]
-            for name in ("event", "recording", "episode_id", "first_step", "last_step")
-        }
-    )
-    more: dict[str, tuple[Any, ...]] = {}
-    if events:
-        query = _MORE.format(novelty=_NOVELTY if measured else "")
-        if not measured:
-            query = query.replace("max(novelty)", "NULL::FLOAT")
-        # Both have to be there before the table is passed in.
-        store.sql("FROM recordings LIMIT 0")
-        store.sql(f"FROM {'novelty' if measured else 'transitions'} LIMIT 0").fetchall()
-        with passed_in(store.connection, listed=listed):
-            found = store.connection.sql(query).fetchall()
-        more = {event: tuple(rest) for event, *rest in found}
+    robots = dict(store.sql("SELECT recording_id, tags['robot'] FROM recordings").fetchall())
     shuffled = sorted(
         (event.event for event in events if event.labelled),
         key=lambda name: hashlib.blake2b(name.encode(), digest_size=16).digest(),
@@ -156,7 +122,9 @@ def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
     place = {name: number for number, name in enumerate(shuffled)}
     rows = []
     for doubt, event in enumerate(events):
-        robot, novelty = more[event.event]
+        at = place.get(event.event)
+        if len(events) > MAX_EVENTS and min(doubt, len(events) if at is None else at) >= _HALF:
+            continue
         year, week, _ = event.start_time.isocalendar()
         rows.append(
             {
@@ -165,20 +133,9 @@ def page_events(store: Store) -> tuple[list[dict[str, Any]], int, bool]:
                 "start_time": event.start_time.isoformat(sep=" ", timespec="seconds"),
                 "end_time": event.end_time.isoformat(sep=" ", timespec="seconds"),
                 "doubt": doubt,
-                "random": place.get(event.event),
-                "novelty": novelty,
-                "robot": robot or "",
+                "random": at,
+                "robot": robots.get(event.recording) or "",
                 "week": f"{year}-W{week:02}",
             }
         )
-    share = MAX_EVENTS // 3
-    kept = {
-        row["event"]
-        for order in (
-            rows,
-            sorted((r for r in rows if r["random"] is not None), key=lambda r: r["random"]),
-            sorted(rows, key=lambda row: -(row["novelty"] or 0.0)),
-        )
-        for row in (rows if len(rows) <= MAX_EVENTS else order[:share])
-    }
-    return [row for row in rows if row["event"] in kept], len(rows), measured
+    return rows, len(events)

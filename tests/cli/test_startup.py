@@ -52,8 +52,8 @@ def test_an_audit_imports_no_learning_and_no_readers(store: Path) -> None:
     assert loaded("audit", str(store)) & (SLOW | unused) == set()
 
 
-def test_a_review_page_imports_no_learning_and_no_charts(store: Path, tmp_path: Path) -> None:
-    modules = loaded("review", str(store), "--out", str(tmp_path / "page.html"))
+def test_a_review_imports_no_learning_and_no_charts(store: Path, tmp_path: Path) -> None:
+    modules = loaded("review", str(store), "--out", str(tmp_path / "review.csv"))
     assert modules & (OF_LEARNING | {"vl_convert"}) == set()
 
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from restock.replay.review.journal import Written
 
 NONE = "none"  # in place of a file: takes all corrections out
-SPREADSHEET = ".csv"
 
 
 @dataclass
@@ -29,23 +28,21 @@ class ReviewCommand:
     (STORE/review.jsonl) as soon as its key is pressed. Ctrl-C, or the page's button, writes them
     into the store, where the labels get a version of their own.
 
-    With --out, it writes one file instead: page.html opens without a server and saves verdicts as a
-    file; review.csv is a spreadsheet with a column for them. FILE takes either back. See
-    docs/ingest.md.
+    With --out, it writes a spreadsheet instead, with a column for verdicts, which FILE takes back.
+    See docs/ingest.md.
     """
 
     store: Annotated[Path, Positional()]
     """The store's folder."""
     file: Annotated[str | None, Positional("[FILE|none]", name="FILE|none")] = None
-    """Write the verdicts of this file into the store: verdicts.json of a page, or a .csv file;
-    `none` removes all corrections."""
+    """Write the verdicts of this CSV file into the store; `none` removes all corrections."""
     out: Path | None = None
-    """Write the events to this new file, page.html or review.csv, instead of serving a page."""
+    """Write the events to this new file, review.csv, instead of serving a page."""
     dry_run: bool = False
     """With FILE: do everything except writing, and print what would change."""
     json: bool = False
     """Print one JSON document: {"version", "verdicts", "recordings": [{"recording_id", …}]}; of a
-    page, its {"address"} or {"page"}."""
+    page its {"address"}, of a new file {"file"}."""
 
     def run(self) -> int:
         """Serve, write a file, or take one."""
@@ -63,15 +60,13 @@ class ReviewCommand:
         return self._serve(place)
 
     def _write(self, place: Location, out: Path) -> int:
-        from restock.files import expect_file_place
+        from restock.files import expect_file_place, write_text
         from restock.replay.review.events import doubtful_events, review_csv, review_rows
         from restock.replay.store.store import Store
 
         expect_file_place(out, "--out")
-        if out.suffix not in (SPREADSHEET, ".html"):
-            raise ConfigError(
-                f"{out.name!r} must end in .html or .csv", where="--out", remedy="rename it"
-            )
+        if out.suffix != ".csv":
+            raise ConfigError(f"{out.name!r} must end in .csv", where="--out", remedy="rename it")
         if out.exists():
             raise LabelError(
                 "already exists, and may contain verdicts",
@@ -79,36 +74,20 @@ class ReviewCommand:
                 remedy="choose another --out",
             )
         with Store(place) as store:
-            if out.suffix == SPREADSHEET:
-                from restock.files import write_text
-
-                rows = review_rows(doubtful_events(store), str(self.store))
-                write_text(out, review_csv(rows), exclusive=True)
-                done: dict[str, Any] = {"page": str(out), "events": len(rows), "notes": []}
-                then = "fill in its last column with yes, no or FIRST..LAST (steps), then run:"
-                file = out
-            else:
-                from restock.report.fleet.review import write_review_page
-
-                with output.progress("reading what the page shows", None):
-                    done = write_review_page(store, out)
-                then = "open it in a browser, give verdicts and save them, then run:"
-                file = Path("verdicts.json")
+            rows = review_rows(doubtful_events(store), str(self.store))
+        write_text(out, review_csv(rows), exclusive=True)
         if self.json:
-            output.print_json(done)
+            output.print_json({"file": str(out), "events": len(rows)})
             return ExitCode.OK
-        of = done.get("of", done["events"])
-        count = f"{done['events']} events" if of == done["events"] else f"{done['events']} of {of}"
-        output.print_text(f"{out}: {count}" if done["events"] else f"{out}: {NOTHING}")
-        for note in done["notes"]:
-            output.print_text(f"note: {note}")
-        if done["events"]:
-            output.say(f"{then} restock review {quoted(self.store)} {quoted(file)}")
+        output.print_text(f"{out}: {len(rows)} events" if rows else f"{out}: {NOTHING}")
+        if rows:
+            then = "fill in its last column with yes, no or FIRST..LAST (steps), then run:"
+            output.say(f"{then} restock review {quoted(self.store)} {quoted(out)}")
         return ExitCode.OK
 
     def _take(self, place: Location, file: str) -> int:
         from restock.ingest.relabel import correct_store, open_for_relabel, remove_corrections
-        from restock.replay.review.journal import Written, take_file
+        from restock.replay.review.journal import Written
         from restock.replay.review.verdicts import read_verdicts
         from restock.replay.store.store import Store
 
@@ -116,14 +95,12 @@ class ReviewCommand:
         left_open = 0
         if file == NONE:
             written = Written(*remove_corrections(store, dry_run=self.dry_run))
-        elif Path(file).suffix == SPREADSHEET:
+        else:
             with Store(place) as opened:
                 verdicts = read_verdicts(file, opened)
             left_open = verdicts.left_open
             outcomes, version = correct_store(store, verdicts.given, dry_run=self.dry_run)
             written = Written(outcomes, version, verdicts.taken)
-        else:
-            written = take_file(Path(file), place, dry_run=self.dry_run)
         if self.json:
             more = {"dry_run": self.dry_run, "without_verdict": left_open}
             output.print_json(written.document | more)
@@ -136,12 +113,6 @@ class ReviewCommand:
         from restock.report.fleet.review import Review, Server
 
         place.expect_newest()
-        if place.folder is None:
-            raise LabelError(
-                "verdicts are kept in the store's folder, and this store has none",
-                where=str(place),
-                remedy=f"review it in a file: `restock review {place} --out page.html`",
-            )
         review = Review(place)
         try:
             if not review.data["events"]:

@@ -1,4 +1,4 @@
-"""The review page: served on this machine, or as one file that holds all it shows.
+"""The review page, served on this machine.
 
 The server listens on loopback alone. Every request names the token of the address, and this machine
 as the host; what changes something comes from the page itself. Several browsers and several servers
@@ -14,10 +14,9 @@ import json
 import secrets
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -26,35 +25,26 @@ import msgspec
 from markupsafe import Markup
 
 from restock.errors import LabelError, RestockError
-from restock.files import write_text
-from restock.ingest.store.location import TRANSITIONS, Location
+from restock.ingest.store.location import Location
 from restock.replay.review.events import page_events
-from restock.replay.review.journal import Entry, Journal, Written, checked, write_verdicts
+from restock.replay.review.journal import Entry, Journal, Written, write_verdicts
 from restock.replay.review.moments import Moments
-from restock.replay.review.verdicts import CONDITIONS
+from restock.replay.review.verdicts import CONDITIONS, check
 from restock.replay.store.store import Store
 from restock.report.look.blocks import dark_rules, palette
-
-IN_A_FILE = 300  # events of a page without a server: the first of each order, half and half
 
 
 def page_data(store: Store) -> dict[str, Any]:
     """Return what a page knows of the events of a store, the most doubtful first."""
-    events, total, novelty = page_events(store)
+    events, total = page_events(store)
     rows = store.connection.sql(CONDITIONS).fetchall()
     names = sorted({name for *_, own in rows for name in own})
     return {
         "store": str(store.path),
         "events": events,
         "total": total,
-        "novelty": novelty,
         "conditions": {recording: sorted(own) for _, recording, own in rows},
         "colours": palette(names),
-        "online": True,
-        "id": hashlib.blake2b(
-            json.dumps([str(store.path), [event["event"] for event in events]]).encode(),
-            digest_size=6,
-        ).hexdigest(),
     }
 
 
@@ -66,10 +56,9 @@ def review_html(data: dict[str, Any]) -> tuple[str, str]:
         for name in ("review.js", "style.css", "review.css", "review.html.jinja")
     )
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    own_server = "'self'" if data["online"] else "'none'"
     policy = (
         "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
-        f" form-action 'none'; connect-src {own_server}; script-src 'sha256-{digest}'"
+        f" form-action 'none'; connect-src 'self'; script-src 'sha256-{digest}'"
     )
     document = json.dumps(data, separators=(",", ":"), allow_nan=False)
     # No name in it ends the element, or begins another.
@@ -84,33 +73,6 @@ def review_html(data: dict[str, Any]) -> tuple[str, str]:
     return html, policy
 
 
-def write_review_page(store: Store, out: Path) -> dict[str, Any]:
-    """Write a page that opens without a server; return how many events it has, and notes."""
-    data = page_data(store)
-    chosen = first_of_orders(data["events"], IN_A_FILE)
-    moments, notes = {}, []
-    show = Moments(store)
-    for event in sorted(chosen, key=lambda one: (one["recording"], one["doubt"])):
-        try:
-            moments[event["event"]] = show.show(event) | {"frames": show.frames(event)}
-        except RestockError as error:
-            notes.append(f"{event['event']} is left out: {error}")
-    kept = [event for event in chosen if event["event"] in moments]
-    html, _ = review_html(data | {"events": kept, "moments": moments, "online": False})
-    write_text(out, html)
-    notes += sorted({note for one in moments.values() for note in one["notes"]})
-    return {"page": str(out), "events": len(kept), "of": data["total"], "notes": notes}
-
-
-def first_of_orders(events: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
-    """Return the most doubtful events, and as many of the random order, by doubt."""
-    labelled = sorted(
-        (event for event in events if event["random"] is not None), key=lambda e: e["random"]
-    )
-    half = {event["event"] for event in (*events[: count // 2], *labelled[: count // 2])}
-    return [event for event in events if event["event"] in half or len(events) <= count]
-
-
 PORT = 7474  # taken if it is free, so that an SSH tunnel can be prepared
 HOSTS = ("127.0.0.1", "localhost")
 NOTHING = "default-src 'none'"  # a policy of what is not a page
@@ -122,21 +84,15 @@ class Review:
 
     def __init__(self, place: Location) -> None:
         self.place = place
-        self.journal = Journal.of(place)
+        self.journal = Journal(place)
         self.store = Store(place)
         self.data = page_data(self.store)
         self.moments = Moments(self.store)
-        self._now = self.store  # of the newest version, against which verdicts are checked
         self._lock = threading.RLock()  # neither store nor journal is for several threads
 
     def close(self) -> None:
-        """Close the stores."""
-        for store in {self.store, self._now}:
-            store.close()
-
-    def page(self) -> tuple[str, str]:
-        """Return the page and its policy."""
-        return review_html(self.data)
+        """Close the store."""
+        self.store.close()
 
     def moment(self, place: int) -> dict[str, Any]:
         with self._lock:
@@ -153,18 +109,11 @@ class Review:
         event: dict[str, Any] = events[place]
         return event
 
-    def state(self, after: int) -> dict[str, Any]:
-        """Return the journal's lines from one on, and the conflicts among its verdicts."""
+    def state(self) -> dict[str, Any]:
+        """Return the journal's lines."""
         with self._lock:
             self.journal.refresh()
-            lines = self.journal.lines
-            whole = not 0 < after <= len(lines)
-            return {
-                "lines": msgspec.to_builtins(lines if whole else lines[after:]),
-                "all": whole,
-                "next": len(lines),
-                "conflicts": msgspec.to_builtins(self.journal.conflicts()),
-            }
+            return {"lines": msgspec.to_builtins(self.journal.lines)}
 
     def give(self, entries: list[Entry]) -> None:
         """Take verdicts: they are on the disk when this returns.
@@ -174,7 +123,8 @@ class Review:
         """
         with self._lock:
             given = [one for one in entries if one.verdict]
-            _, problems = checked(given, self._newest())
+            with Store(self.place) as newest:
+                problems = check(enumerate(given), newest).problems
             if problems:
                 raise LabelError("; ".join(problems[place] for place in sorted(problems)))
             self.journal.append([msgspec.structs.replace(one, at="") for one in entries])
@@ -184,19 +134,11 @@ class Review:
         with self._lock:
             return write_verdicts(self.journal, self.place)
 
-    def _newest(self) -> Store:
-        if self.place.open_table(TRANSITIONS).version() != self._now.version:
-            if self._now is not self.store:
-                self._now.close()
-            self._now = Store(self.place)
-        return self._now
-
 
 class _Asked(msgspec.Struct):
     """What the page sends."""
 
     entries: list[Entry] = []  # verdicts that it gives
-    after: int = 0  # lines of the journal that it has
 
 
 class Server(ThreadingHTTPServer):
@@ -269,7 +211,7 @@ class Handler(BaseHTTPRequestHandler):
         review = self.server.review
         kind, _, place = path.partition("/")
         if path == "":
-            html, policy = review.page()
+            html, policy = review_html(review.data)
             self._send(200, html, "text/html", policy)
         elif kind in ("moment", "frames") and place.isdecimal() and len(place) < 9:
             shown = review.moment if kind == "moment" else review.frames
@@ -293,13 +235,12 @@ class Handler(BaseHTTPRequestHandler):
             review.give(posted.entries)
         elif path == "write":
             written = review.write()
-            state = review.state(posted.after)
-            self._send(200, json.dumps(written.document | {"state": state}, default=str))
+            self._send(200, json.dumps(written.document | review.state(), default=str))
             return
         elif path != "state":
             self._send(404, json.dumps({"error": "there is nothing here"}))
             return
-        self._send(200, json.dumps(review.state(posted.after)))
+        self._send(200, json.dumps(review.state()))
 
     def _send(
         self, status: int, text: str, kind: str = "application/json", policy: str | None = None

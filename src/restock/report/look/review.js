@@ -1,7 +1,7 @@
 "use strict";
 // The review page: one event at a time, its moment with a slider, and a person's verdict. Names of
-// robots, files and conditions only ever become text. With a server, a verdict counts once the
-// server has answered that it is on the disk; without one, it is kept here until it is saved.
+// robots, files and conditions only ever become text. A verdict counts once the server has answered
+// that it is on the disk.
 (() => {
   const page = JSON.parse(document.getElementById("page").textContent);
   const at = (id) => document.getElementById(id);
@@ -29,7 +29,7 @@
       return own;
     }
   })();
-  let lines = [], read = 0, disputes = [];
+  let lines = [];
   const given = [];  // ids of what was given here, an action each: for undo
 
   function counting() {
@@ -43,18 +43,16 @@
     latest = new Map(counting().map((entry) => [entry.event, entry]));
   }
   function entry(event, verdict, more = {}) {
-    const rivals = disputes.filter((pair) => pair.some((one) => one.event === event.event)).flat();
     const before = counting().filter((one) => one.event === event.event);
     return {
       kind: "verdict", id: crypto.randomUUID(), by: me, event: event.event,
       episode_id: event.episode_id, condition: event.condition,
       first_step: event.first_step, last_step: event.last_step, start_s: event.start_s, verdict,
       note: at("note").value.trim().slice(0, 2000), at: new Date().toISOString(),
-      instead_of: [...new Set([...before, ...rivals].map((one) => one.id))], ...more,
+      instead_of: before.map((one) => one.id), ...more,
     };
   }
 
-  const KEPT = `restock review ${page.id}`;
   async function ask(path, body) {
     const answer = await fetch(path, body === undefined ? {} : {
       method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body),
@@ -66,21 +64,11 @@
     return document_;
   }
   function take(state) {
-    lines = state.all ? state.lines : [...lines, ...state.lines];
-    read = state.next;
-    disputes = state.conflicts;
+    lines = state.lines;
     settle();
   }
   async function give(entries) {
-    if (page.online) {
-      take(await ask("verdicts", { entries, after: read }));
-    } else {
-      lines.push(...entries);
-      try {
-        localStorage[KEPT] = JSON.stringify(lines);
-      } catch { /* a browser that keeps nothing for files: saving is up to the reader */ }
-      settle();
-    }
+    take(await ask("verdicts", { entries }));
     given.push(entries.map((one) => one.id));
   }
 
@@ -90,7 +78,6 @@
   let queue = [], here = null, ends = [0, 0], moment = null, now = 0;
   const ORDERS = {
     doubt: ["most doubtful first", (e) => e.doubt],
-    novelty: ["most novel first", (e) => -(e.novelty ?? -1)],
     random: ["random: estimates precision", (e) => e.random ?? Infinity],
     time: ["by time", (e) => `${e.source_file} ${e.start_time} ${e.event}`],
   };
@@ -138,11 +125,6 @@
   const moments = new Map();
   function fetched(event, kind = "moment") {
     const key = `${kind} ${event.event}`;
-    if (!page.online) {
-      const known = page.moments[event.of ?? event.event];
-      return known ? Promise.resolve(kind === "moment" ? known : known.frames ?? { cameras: {}, notes: [] })
-        : Promise.reject(new Error("This file holds no picture of this event: judge it in `restock review STORE`."));
-    }
     if (!moments.has(key)) {
       const found = ask(`${kind}/${events.includes(event) ? event.place : event.from}`);
       found.catch(() => moments.delete(key));
@@ -185,7 +167,7 @@
       if (here === event) at("look").classList.remove("waiting");
     }
     const following = nextOpen();
-    if (page.online && following) fetched(following).catch(() => {});
+    if (following) fetched(following).catch(() => {});
     at("cameras").replaceChildren();
     frames = {};
     if (!moment) return;
@@ -209,12 +191,9 @@
       `${place < 0 ? "–" : place + 1} of ${queue.length}, ${done} judged`;
     at("estimate").textContent = at("order").value === "random" ? estimate() : "";
     const kept = inStore(), count = counting().filter((one) => !kept.has(one.id)).length;
-    at("write").textContent = page.online
-      ? `Write ${count} into the store` : `Save ${count} to a file`;
+    at("write").textContent = `Write ${count} into the store`;
     at("write").disabled = count === 0;
     at("undo").disabled = given.length === 0;
-    at("conflicts").hidden = disputes.length === 0;
-    at("conflicts").textContent = `${disputes.length} in conflict`;
     if (here === null) return;
     at("name").textContent = words(here.condition);
     at("kind").textContent = here.marked ? "marked by you"
@@ -222,8 +201,6 @@
     const facts = [
       here.probability === null || here.probability === undefined ? null
         : `probability ${here.probability.toFixed(2)}`,
-      here.novelty === null || here.novelty === undefined ? null
-        : `novelty ${here.novelty.toFixed(2)}`,
       here.why && here.why !== "probability" ? `doubt: ${here.why}` : null,
       here.robot || null, here.source_file.split("/").pop(),
       `${here.start_time} UTC`, `steps ${here.first_step} to ${here.last_step}`,
@@ -234,13 +211,6 @@
     at("verdict").textContent = verdict
       ? `${mine ? "You" : "Somebody"} said ${verdict.verdict} at ${verdict.at.slice(11, 19)} UTC`
         + (kept.has(verdict.id) ? ", and it is in the store." : ".") : "";
-    const rival = disputes.find((pair) => pair.some((one) => one.event === here.event));
-    if (rival) {
-      at("verdict").textContent = "Conflict: " + rival.map((one) =>
-        `${one.by === me ? "you" : "somebody"} said ${one.verdict} for steps ${one.first_step} to`
-        + ` ${one.last_step} at ${one.at.slice(11, 19)}`).join(", ") + ". Your next verdict decides.";
-    }
-    at("verdict").className = rival ? "bad" : "note";
     const edited = ends[0] !== here.first_step || ends[1] !== here.last_step;
     at("yes").querySelector("span").textContent = edited || here.marked
       ? `Yes, ${ends[0]}..${ends[1]}` : "Yes";
@@ -311,7 +281,7 @@
       const event = {
         ...from, marked: true, of: from.of ?? from.event, from: from.from ?? from.place, condition: name,
         event: `mark ${crypto.randomUUID()}`, first_step: first, last_step: last,
-        labelled: false, probability: null, novelty: null, why: "",
+        labelled: false, probability: null, why: "",
       };
       marked.push(event);
       here = event;
@@ -617,11 +587,11 @@
     other: () => here && !here.marked && pick("Which condition is it?", (name) => judge("no", name)),
     undo, mark, play: () => play(), first: () => moment && setEnd(0, moment.steps[now]),
     last: () => moment && setEnd(1, moment.steps[now]), back: () => go(now - 1), on: () => go(now + 1),
-    write, conflicts: () => disputes.length && show(events.find((e) => disputes[0].some((one) => one.event === e.event)) ?? here),
+    write,
   };
   const KEYS = { y: "yes", n: "no", ArrowRight: "next", ArrowLeft: "previous", c: "other", u: "undo",
     m: "mark", " ": "play", "[": "first", "]": "last", ",": "back", ".": "on" };
-  for (const name of ["yes", "no", "next", "previous", "other", "undo", "mark", "play", "first", "last", "write", "conflicts"]) {
+  for (const name of ["yes", "no", "next", "previous", "other", "undo", "mark", "play", "first", "last", "write"]) {
     at(name).addEventListener("click", () => does[name]());
   }
   let queued = Promise.resolve();  // keys are taken one after the other, however fast they come
@@ -653,25 +623,18 @@
     } catch (error) { say(error.message, "bad"); }
   });
   async function write() {
-    if (page.online) {
-      try {
-        const done = await ask("write", { after: read });
-        take(done.state);
-        const held = done.held_back.length ? ` Held back: ${done.held_back.join("; ")}.` : "";
-        say(`${done.verdicts} verdicts are in the store${done.version === null ? "" : `, version ${done.version}`}.${held}`, held ? "bad" : "good");
-        refresh();
-      } catch (error) { say(error.message, "bad"); }
-      return;
-    }
-    const saved = lines.map((line) => JSON.stringify(line)).join(",\n");
-    const link = make("a", { download: "verdicts.json", href: URL.createObjectURL(new Blob([`[\n${saved}\n]\n`], { type: "application/json" })) });
-    link.click();
-    say("Saved as verdicts.json: `restock review STORE verdicts.json` takes it.", "good");
+    try {
+      const done = await ask("write", {});
+      take(done);
+      const held = done.held_back.length ? ` Held back: ${done.held_back.join("; ")}.` : "";
+      say(`${done.verdicts} verdicts are in the store${done.version === null ? "" : `, version ${done.version}`}.${held}`, held ? "bad" : "good");
+      refresh();
+    } catch (error) { say(error.message, "bad"); }
   }
 
   events.forEach((event, place) => { event.place ??= place; });
   const options = (name, values) => at(name).append(...values.map(([value, said]) => make("option", { value }, said)));
-  options("order", Object.entries(ORDERS).filter(([name]) => name !== "novelty" || page.novelty).map(([name, [said]]) => [name, said]));
+  options("order", Object.entries(ORDERS).map(([name, [said]]) => [name, said]));
   for (const name of ["condition", "robot", "week"]) {
     const values = [...new Set(events.map((event) => event[name]))].filter(Boolean).sort();
     options(name, [["", `every ${name}`], ...values.map((value) => [value, name === "condition" ? words(value) : value])]);
@@ -680,25 +643,17 @@
   for (const name of ["order", "condition", "robot", "week"]) {
     at(name).addEventListener("change", () => { choose(); show(queue.find(open) ?? queue[0] ?? null); });
   }
-  at("about").textContent = `${events.length < page.total ? `${events.length} of ${page.total}` : events.length} events of ${page.store}.`
-    + (page.novelty ? "" : " Novelty is not measured: `restock sql STORE \"FROM novelty LIMIT 1\"` does it.");
+  at("about").textContent = `${events.length < page.total ? `${events.length} of ${page.total}` : events.length} events of ${page.store}.`;
   addEventListener("resize", () => { if (moment && here) draw(); });
 
   async function begin() {
-    if (page.online) {
-      take(await ask("state", { after: 0 }));
-      setInterval(async () => {
-        try {
-          take(await ask("state", { after: read }));
-          refresh();
-        } catch (error) { say(error.message, "bad"); }
-      }, 3000);
-    } else {
+    take(await ask("state", {}));
+    setInterval(async () => {
       try {
-        lines = JSON.parse(localStorage[KEPT] ?? "[]");
-      } catch { lines = []; }
-      settle();
-    }
+        take(await ask("state", {}));
+        refresh();
+      } catch (error) { say(error.message, "bad"); }
+    }, 3000);
     choose();
     await show(queue.find(open) ?? null);
   }
