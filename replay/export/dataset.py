@@ -8,6 +8,7 @@ be installed.
 from __future__ import annotations
 
 import importlib
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -27,6 +28,9 @@ from restock.replay.export.trajectory import (
 )
 
 WITH_IMAGES = "lerobot"
+# The HDF5 library crashes where it cannot write what it holds back when a file is closed. That is
+# less than this: its caches of metadata, and of chunks.
+ROOM_BYTES = 64 << 20
 
 
 @interrupts_raised
@@ -53,7 +57,7 @@ def export_dataset(
     set carries.
 
     Raises:
-        StoreError: an unknown format, something at `out`, no rows.
+        StoreError: an unknown format, something at `out`, no rows, a disk too full for HDF5.
         ConfigError: a library that is not installed.
         PanelError, QueryError: see `open_selection`.
     """
@@ -104,9 +108,12 @@ def export_dataset(
                 where=selection.where,
                 remedy="export the observations as they are stored",
             )
+        several: Iterator[Trajectory] = chain([first], episodes)
+        if needs and to != WITH_IMAGES:
+            several = _while_there_is_room(several, out)
         with building(out) as folder:
             partial = folder / out.name
-            notes = write(selection, chain([first], episodes), partial, counts)
+            notes = write(selection, several, partial, counts)
             partial.rename(out)
     return {
         "format": to,
@@ -123,3 +130,17 @@ def _advancing(
     for trajectory in episodes:
         yield trajectory
         advance(len(trajectory))
+
+
+def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
+    """Raise StoreError before the disk is full."""
+    for trajectory in episodes:
+        free = shutil.disk_usage(out.parent).free
+        if free < ROOM_BYTES + 2 * trajectory.observations.nbytes:
+            raise StoreError(
+                f"its disk is nearly full: {free / 2**20:,.0f} MiB are free, and HDF5 needs"
+                f" {ROOM_BYTES >> 20} MiB to spare",
+                where=str(out),
+                remedy="free some space, choose another place, or export to parquet",
+            )
+        yield trajectory

@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -397,6 +398,20 @@ def test_what_cannot_be_exported_is_refused(given, error, named, store_path, tmp
     given = {"to": "parquet", "out": "a.parquet"} | given
     with pytest.raises(error, match=re.escape(named)):
         export_dataset(store_path, given.pop("to"), tmp_path / given.pop("out"), **given)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("to", ["minari", "d3rlpy"])
+def test_hdf5_ends_before_a_full_disk(to, store_path, tmp_path, monkeypatch):
+    pytest.importorskip(FORMATS[to][1])
+    free = iter([10**10, 10**10, 2**20])  # less, an episode after the other
+    monkeypatch.setattr(
+        "shutil.disk_usage", lambda path: SimpleNamespace(free=next(free), path=path)
+    )
+    out = tmp_path / ("out.h5" if to == "d3rlpy" else "out")
+    with pytest.raises(StoreError, match=r"nearly full: 1 MiB are free") as refused:
+        export_dataset(store_path, to, out)
+    assert refused.value.where == str(out)
     assert not list(tmp_path.iterdir())
 
 
