@@ -150,9 +150,6 @@ class LifecycleNode:
             raise TypeError(f"parameter {name} is {type(given)}, not {type(value)}")
         self._values[name] = given
 
-    def undeclare_parameter(self, name: str) -> None:
-        del self._values[name]
-
     def get_parameter(self, name: str) -> Any:
         return SimpleNamespace(value=self._values[name])
 
