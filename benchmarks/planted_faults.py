@@ -4,9 +4,7 @@
 
 Three faults of the buffer, all in the blocked aisles, which the twin's training episodes then lack:
 their logged rows are removed; stale (next observations and rewards of other rows of the stratum);
-or mislabelled (the label stands on nominal rows). Two of the logs' actions: one (backing up) that
-they lack, or that is rare (a fiftieth is left) in the blocked aisles: the twin supplies it, so the
-run is not at fault, but the evidence must name it. Four of the target and the optimizer: frozen,
+or mislabelled (the label stands on nominal rows). Four of the target and the optimizer: frozen,
 too slow, no target at all (tau 1), learning rate a thousand times too high. Runs are kept in --out
 and taken up where they are, so that a table can be made again without training again.
 """
@@ -23,32 +21,27 @@ import pyarrow as pa
 from harness import finish, markdown, option_parser, run_restock
 from twin_runs import trained
 
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
-from restock.train.judge.diagnose import Diagnosis, diagnose
+from restock.train.judge.diagnose import diagnose
 from restock.train.run.run import Run
 
 STRATUM = "blocked_aisle"
 # Of the training episodes: none in the stratum, the rest as a run has them by default.
 LACKING = "env.conditions={nominal=0.4, wheel_slip=0.2, near_collision=0.2, blocked_aisle=0}"
-ACTION, LEFT_SHARE = "back 0.4", 0.02  # of the logs' rows with it, where it is made rare
 BUFFER, TARGET = {"BUFFER", "BOTH"}, {"TARGET", "BOTH", "DIVERGENCE"}
-ACTIONS = {"ACTION_COVERAGE", "HEALTHY"}  # the latter, where the evidence names the action
-CAUSES = ["HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+CAUSES = ["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
 # fault -> the causes that are right, and the settings that plant it
 FAULTS: dict[str, tuple[set[str], list[str]]] = {
     "healthy": ({"HEALTHY"}, []),
     "stratum removed": (BUFFER, [LACKING]),
     "stratum stale": (BUFFER, [LACKING]),
     "stratum mislabelled": (BUFFER, [LACKING]),
-    "action missing": (ACTIONS, []),
-    "action rare": (ACTIONS, []),
     "target frozen": (TARGET, ["target={rule='hard', every=1000000}"]),
     "target too slow": (TARGET, ["target={rule='polyak', tau=0.00003}"]),
     "target too fast": (TARGET, ["target={rule='polyak', tau=1.0}"]),
     "learning rate too high": (TARGET, ["optimizer.learning_rate=0.3"]),
 }
-LOGGED = ("stratum", "action")  # faults of the logs, by their first word
+LOGGED = "stratum"  # the first word of faults of the logs
 SETTINGS = {
     "schedule.env_steps": 32_000,
     "schedule.offline_updates": 1_000,
@@ -66,20 +59,14 @@ SETTINGS = {
 def plant(clean: Path, faulty: Path, fault: str) -> None:
     """Write a store with the fault in its rows."""
     rng = np.random.default_rng(0)
-    action = load_profile("warehouse_amr").task.action_names.index(ACTION)
     source, writer = StoreWriter(clean), StoreWriter(faulty)
     for row in source.live().to_pylist():
         rows = source.rows(row["recording_id"], row["ingest_id"])
         labels = rows["conditions"].to_pylist()
         names = np.array(rows["condition"].to_pylist(), object)
         inside = np.array([STRATUM in some for some in labels]) | (names == STRATUM)
-        taken = np.array(rows["action"]) == action
         if fault == "stratum removed":
             rows = rows.filter(pa.array(~inside))
-        elif fault == "action missing":
-            rows = rows.filter(pa.array(~taken))
-        elif fault == "action rare":
-            rows = rows.filter(pa.array(~(taken & inside) | (rng.random(len(rows)) < LEFT_SHARE)))
         elif fault == "stratum stale":
             order = np.arange(len(rows))
             order[inside] = rng.permutation(order[inside])
@@ -118,11 +105,6 @@ def panel_for(fault: str, out: Path) -> Path:
     return panel
 
 
-def names_action(found: Diagnosis) -> bool:
-    """Return whether the evidence says that the logs lack the planted action."""
-    return any(f"takes {ACTION!r}" in line for line in found.evidence)
-
-
 def run_for(fault: str, seed: int, out: Path) -> Run:
     """Return a run with the fault; train it if it is missing."""
     panel = panel_for(fault if fault.startswith(LOGGED) else "healthy", out)
@@ -144,18 +126,12 @@ def main() -> int:
     right = opposite = total = 0
     for fault in options.faults.split(","):
         expected = FAULTS[fault][0]
-        found = [diagnose([run_for(fault, seed, options.out)]) for seed in seeds]
-        causes = [one.cause for one in found]
+        causes = [diagnose([run_for(fault, seed, options.out)]).cause for seed in seeds]
         table[fault] = dict(Counter(causes))
         total += len(causes)
-        right += sum(
-            one.cause == "UNDETERMINED"
-            or (one.cause in expected and (expected is not ACTIONS or names_action(one)))
-            for one in found
-        )
-        of_rows = BUFFER | ACTIONS - {"HEALTHY"}
+        right += sum(cause == "UNDETERMINED" or cause in expected for cause in causes)
         of_target = expected <= TARGET or fault == "healthy"
-        wrong = of_rows - TARGET if of_target else TARGET - BUFFER
+        wrong = BUFFER - TARGET if of_target else TARGET - BUFFER
         opposite += sum(cause in wrong for cause in causes)
     rows = [[fault, *(counts.get(c, "") for c in CAUSES)] for fault, counts in table.items()]
     verdict = f"{right} of {total} named right or UNDETERMINED; {opposite} named the opposite"

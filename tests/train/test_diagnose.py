@@ -29,9 +29,6 @@ def make_run(
     explained: float | Mapping[str, float] | None = 0.8,
     strata: bool = True,  # named as the conditions are; else there is one of all rows
     until: int | None = None,  # the window in which the symptoms end
-    actions: Mapping[str, tuple[float, float]] | None = None,  # of `turn`: wanted, of the logs
-    logged: int = 400,  # different rows of each condition in the logs
-    supplied: float = 0.0,  # of the fresh rows of these conditions, those with `turn`
     held_out: Mapping[str, int] | None = None,  # rows of a condition in each evaluation
     lags: Sequence[float] | None = None,  # L of each window, in place of `lag`
     every: int = 500,  # updates of a window
@@ -59,8 +56,6 @@ def make_run(
                 logs_agreement=(agreement or {}).get(name, 0.8),
                 logs_unexplained=(unexplained or {}).get(name, 0.45),
             )  # fmt: skip
-            turn = (actions or {}).get(name)
-            run.append("actions", action_rows(clocks, name, turn, logged, supplied))
             if share:
                 fed = {"drawn_rows": round(share * 10_000), "td_abs_mean": replay_td}
                 append(run, "conditions", clocks, source="logs", condition=name, **fed)
@@ -77,27 +72,6 @@ def make_run(
 def append(run: Run, table: str, clocks: Mapping[str, int], **values: Any) -> None:
     """Append a row of which all that is not given is null."""
     run.append(table, [{**dict.fromkeys(run.table(table).schema.names), **clocks, **values}])
-
-
-def action_rows(
-    clocks: Mapping[str, int], condition: str, turn: tuple[float, float] | None, logged: int,
-    supplied: float,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Return rows of two actions; `turn` is (wanted in fresh rows, share of it in the logs)."""
-    wanted, share = turn or (0.4, 0.4)
-    fresh = 0.4 if turn is None else supplied
-    rows = []
-    for source, drawn, greedy in (("logs", 5 * logged, 60), ("fresh", 2000, 100)):
-        there = share if source == "logs" else fresh
-        for action, (has, wants) in enumerate(((1 - there, 1 - wanted), (there, wanted))):
-            row = {"phase": "online", "source": source, "stratum": "all", "condition": condition}
-            row |= {"action": action, "name": ("stop", "turn")[action], "drawn_share": None}
-            row |= {"drawn_rows": round(drawn * has), "unique_rows": round(logged * has)}
-            # What it would do in logged rows says less: half of them, whatever the case.
-            wanted_rows = round(greedy * (wants if source == "fresh" else 0.5))
-            row |= {"audited_rows": greedy, "greedy_rows": wanted_rows, "greedy_share": None}
-            rows.append({**clocks, **row})
-    return rows
 
 
 @pytest.mark.parametrize(
@@ -136,28 +110,10 @@ def action_rows(
         # No run is old enough for a target that hardly moves, and L does not fall.
         ({"every": 450, "lag": 1.1, "target": Hard(1_000_000)}, "TARGET"),
         ({"every": 450, "lags": (1.2, 1.15, 1.1, 1.0), "target": Polyak(tau=3e-5)}, "TARGET"),
-        ({"actions": {"recovery": (0.3, 0.0)}}, "ACTION_COVERAGE"),
-        ({"actions": {"recovery": (0.3, 0.05)}}, "HEALTHY"),  # rare, and there
-        ({"actions": {"recovery": (0.1, 0.0)}}, "HEALTHY"),  # not there, and hardly wanted
-        # The critic sees in fresh rows what it leads to.
-        ({"actions": {"recovery": (0.3, 0.0)}, "supplied": 0.1}, "HEALTHY"),
-        # Nobody knows of so few rows what they lack.
-        ({"actions": {"recovery": (0.3, 0.0)}, "logged": 40}, "HEALTHY"),
-        ({"actions": {"recovery": (0.3, 0.0)}, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
-        ({"actions": {"recovery": (0.3, 0.0)}, "lag": 0.9}, "TARGET"),
     ],
 )
 def test_symptoms_are_named(tmp_path: Path, symptoms: dict[str, Any], cause: str) -> None:
     assert diagnose([make_run(tmp_path / "r", **symptoms)]).cause == cause
-
-
-def test_the_evidence_names_the_action(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "r", actions={"recovery": (0.3, 0.01)})
-    found = diagnose([run])
-    (line,) = [line for line in found.evidence if "turn" in line]
-    assert line.startswith("recovery: the policy takes 'turn' in 30% of the rows looked at")
-    assert "in 1.0%: 4 of 400 different rows, fresh rows in 0%" in line
-    assert "'turn' in recovery" in found.experiment
 
 
 def test_most_seeds_must_agree(tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ from restock.train.judge.windows import (
     LIMITS,
     Cause,
     Window,
-    action_symptoms,
     median_window,
     windows_of,
 )
@@ -43,7 +42,6 @@ _SETTLED_LAGS = 10  # updates, in mean ages of the target: then even a young cri
 _MIN_UPDATES = 1500  # of a slower rule: no excuse, unless L is falling
 _FALLING = 0.75  # the last L over the first of the last windows
 _WORKING_LAGS = 50, 800  # updates: the mean age of a target that most critics can learn from
-ALONE = "a policy from these logs alone never learns what it leads to"
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ def diagnose(runs: Sequence[Run]) -> Diagnosis:
     """
     refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]
-    figures = [_figures(*pair) for pair in zip(runs, windows, strict=True)]
+    figures = [median_window(its[-WINDOWS:]) for its in windows]
     verdicts = [_verdict(*its) for its in zip(runs, windows, figures, strict=True)]
     causes = [cause for cause, _ in verdicts]
     ((cause, votes), *_) = Counter(causes).most_common()
@@ -107,13 +105,6 @@ def other_target(rule: TargetRule) -> Polyak:
     least, below = _WORKING_LAGS
     lag = rule.effective_lag
     return Polyak(tau=4 / lag) if least <= lag < below else Polyak()
-
-
-def _figures(run: Run, windows: Sequence[Window]) -> Window:
-    """Return the median figures of a run's last windows."""
-    before = windows[-WINDOWS - 1].gradient_steps if len(windows) > WINDOWS else 0
-    actions = action_symptoms(run, before)
-    return replace(median_window(windows[-WINDOWS:]), actions=actions)
 
 
 def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Cause, str]:
@@ -179,10 +170,6 @@ def _evidence(window: Window) -> list[str]:
     lines += [f"target: {reason}" for reason in window.target()]
     for condition, reasons in window.bad().items():
         lines += [f"{condition}: {reason}" for reason in reasons]
-    lacking = window.lacking()
-    for symptom in window.unlogged():
-        alone = "" if symptom in lacking else f"; {ALONE}"
-        lines.append(f"{symptom.condition}: {symptom.reason}{alone}")
     return lines
 
 
@@ -194,19 +181,10 @@ def _experiment(
 ) -> str:
     named = dict.fromkeys(name for window in windows for name in window.bad())
     which = ", ".join(named) or "the condition with the largest gap"
-    lacking = {
-        f"{lack.action!r} in {lack.condition}": None
-        for window in windows
-        for lack in window.lacking()
-    }
     return {
         "HEALTHY": "none needed: no figure is past its limit",
         "BUFFER": f"train again with more or corrected rows of {which} and the same target rule: "
         "these symptoms must be gone, and nothing else change",
-        "ACTION_COVERAGE": "train again with logged rows of "
-        + ", ".join(lacking)
-        + " (record some; `restock twin record` drives the twin): this symptom must disappear, and "
-        "the offline policy must not get worse there",
         "TARGET": f"train again with the target rule {other_target(rule)} in place of {rule} on "
         "the same panel: the figures of the target must be back within their limits",
         "BOTH": f"first change the target rule alone, from {rule} to {other_target(rule)}, then "
@@ -219,7 +197,6 @@ def _experiment(
 
 _TOGETHER: dict[Cause, Cause] = {  # of a run, where its rows are at fault too
     "HEALTHY": "BUFFER",
-    "ACTION_COVERAGE": "BUFFER",
     "UNDETERMINED": "BUFFER",
     "TARGET": "BOTH",
 }

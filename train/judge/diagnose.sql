@@ -4,15 +4,10 @@ WITH windows AS (
     SELECT gradient_steps AS until,
            coalesce(lag(gradient_steps) OVER (ORDER BY gradient_steps), 0) AS since
     FROM (SELECT DISTINCT gradient_steps FROM run_evaluation_buffer)
-), fed AS (  -- of the same condition, logged and fresh together, in the window before
-    SELECT gradient_steps, condition, drawn_rows, td_abs_mean FROM run_conditions
-    UNION ALL  -- a run from before that table was kept has its strata, which may be conditions
-    SELECT gradient_steps, stratum, drawn_rows, td_abs_mean FROM run_strata
-    WHERE NOT EXISTS (FROM run_conditions)
-), replay AS (
+), replay AS (  -- of the same condition, logged and fresh together, in the window before
     SELECT until, condition, sum(drawn_rows) AS replay_rows,
            sum(td_abs_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS replay_td
-    FROM fed
+    FROM run_conditions
     JOIN windows ON gradient_steps > since AND gradient_steps <= until
     GROUP BY ALL
 ), quota AS (  -- what a stratum of that name was to get of its source, and got
@@ -33,12 +28,6 @@ WITH windows AS (
     GROUP BY ALL
 ), drawn AS (
     SELECT until, sum(replay_rows) AS all_rows FROM replay GROUP BY until
-), evaluation_buffer AS (  -- runs from before these were kept have none of them
-    SELECT * FROM run_evaluation_buffer
-    UNION ALL BY NAME
-    SELECT NULL::BIGINT AS rows_met, NULL::DOUBLE AS explained,
-           NULL::DOUBLE AS logs_agreement, NULL::DOUBLE AS logs_unexplained
-    WHERE false
 )
 SELECT h.gradient_steps AS gradient_steps,
        h.condition AS condition,
@@ -56,7 +45,7 @@ SELECT h.gradient_steps AS gradient_steps,
        quota.quota_met AS quota_met,
        clock.lag AS lag,
        clock.q_abs_max AS q_abs_max
-FROM evaluation_buffer h
+FROM run_evaluation_buffer h
 JOIN clock ON clock.until = h.gradient_steps
 LEFT JOIN drawn ON drawn.until = h.gradient_steps
 LEFT JOIN quota ON quota.until = h.gradient_steps AND quota.condition = h.condition

@@ -11,8 +11,6 @@ A network that generalises, or memorises few rows, hides what is wrong with its 
 all of these. So three figures look at the rows, not at the critic
 (`restock.train.feed.logs`): how much of replay a condition is, beside how often it is met;
 how many of its logged rows look like it; and whether their next observations follow from them.
-And a condition may be well supplied, and an action of it not (`action_coverage`): neither logs nor
-fresh rows say what it leads to, and the policy wants it.
 
 The limits are from faults planted in the twin (benchmarks/planted_faults.py; the table is in
 docs/run.md).
@@ -21,7 +19,7 @@ docs/run.md).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from statistics import median
 from typing import Any, Literal
@@ -30,64 +28,11 @@ import duckdb
 import numpy as np
 
 from restock.errors import RunError
-from restock.stats import wilson
 from restock.train.run.run import Run
 
-
-@dataclass(frozen=True)
-class ActionSymptom:
-    """One action in one condition, over the last windows."""
-
-    condition: str
-    action: str  # its name
-    wanted_share: float  # of the condition's fresh rows looked at, where the policy would take it
-    wanted_low: float  # lower end of its 95 % interval
-    audited_rows: int  # that were looked at
-    logs_share: float  # of the condition's logged rows drawn
-    logged_rows: int  # different ones with the action
-    condition_rows: int  # different ones of the condition
-    fresh_share: float | None  # of the condition's fresh rows drawn
-
-    @property
-    def reason(self) -> str:
-        """Describe the symptom in words."""
-        supplied = "" if self.fresh_share is None else f", fresh rows in {self.fresh_share:.0%}"
-        return (
-            f"the policy takes {self.action!r} in {self.wanted_share:.0%} of the rows looked at (at"
-            f" least {self.wanted_low:.0%}), logged batches have it in {self.logs_share:.1%}:"
-            f" {self.logged_rows} of {self.condition_rows} different rows{supplied}"
-        )
-
-
-def action_symptoms(run: Run, since: int) -> list[ActionSymptom]:
-    """Return every action in every condition of the logs, in batches after gradient step `since`.
-
-    Empty for a run without logs, of another library, or of a Restock that kept no such table.
-    """
-    query = files("restock.train.judge").joinpath("action_coverage.sql").read_text("utf-8")
-    with duckdb.connect() as connection:
-        connection.register("run_actions", run.table("actions"))
-        rows = connection.sql(query, params={"since": since}).to_arrow_table().to_pylist()
-    symptoms = []
-    for row in rows:
-        wanted, audited = row.pop("wanted"), row.pop("audited")
-        if not audited:
-            continue
-        low, _ = wilson(wanted, audited)
-        symptoms.append(
-            ActionSymptom(
-                wanted_share=wanted / audited, wanted_low=low, audited_rows=audited, **row
-            )
-        )
-    return symptoms
-
-
-Cause = Literal[
-    "HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"
-]
+Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
 _MIN_ROWS = 20  # held out, for a condition to be diagnosed
 _MIN_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
-_MIN_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
 
 
 @dataclass(frozen=True)
@@ -107,9 +52,6 @@ class DiagnosisLimits:
     unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
     unexplained_relative: float = 1.6  # and over that of the condition with the least
     quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
-    wanted: float = 0.18  # of a condition's fresh rows, those where the policy takes an action …
-    logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it …
-    fresh: float = 0.02  # … and of its fresh rows drawn: nor does driving supply it
 
 
 LIMITS = DiagnosisLimits()
@@ -146,7 +88,6 @@ class Window:
     explained: float | None  # of the targets' variance, the median condition's
     q_abs_max: float
     q_bound: float  # the largest value that rewards seen could add up to
-    actions: list[ActionSymptom] = field(default_factory=list)  # over several windows only
 
     def relative(self, symptom: Symptom) -> float | None:
         """Return G_k divided by the median G: how much worse than the others the condition is."""
@@ -178,7 +119,7 @@ class Window:
         return doubts
 
     def _supply(self, symptom: Symptom) -> list[str]:
-        if symptom.supply is None:  # a run from before it was kept
+        if symptom.supply is None:
             return [] if symptom.replay_share else ["is not in replay"]
         if symptom.supply >= LIMITS.supply:
             return []
@@ -203,21 +144,6 @@ class Window:
                 "and next observations match"
             )
         return reasons
-
-    def unlogged(self) -> list[ActionSymptom]:
-        """Return actions that the policy wants in conditions whose logged rows hardly have them."""
-        return [
-            symptom
-            for symptom in self.actions
-            if symptom.condition_rows >= _MIN_LOGGED
-            and symptom.wanted_low >= LIMITS.wanted
-            and symptom.logs_share <= LIMITS.logged
-        ]
-
-    def lacking(self) -> list[ActionSymptom]:
-        """Return those of `unlogged` that fresh rows do not supply either."""
-        unlogged = self.unlogged()
-        return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= LIMITS.fresh]
 
     def target(self) -> list[str]:
         """Return in words which figures put the target in doubt; empty if none does.
@@ -260,9 +186,7 @@ class Window:
             return "BOTH" if buffer else "TARGET"
         if buffer:
             return "BUFFER"
-        if bad:
-            return "UNDETERMINED"
-        return "ACTION_COVERAGE" if self.lacking() else "HEALTHY"
+        return "UNDETERMINED" if bad else "HEALTHY"
 
 
 def median_window(windows: Sequence[Window]) -> Window:
@@ -295,8 +219,7 @@ def windows_of(run: Run) -> list[Window]:
     """Return the windows of a run, one an evaluation that had updates before it."""
     query = files("restock.train.judge").joinpath("diagnose.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
-        names = ("evaluation_buffer", "conditions", "strata", "progress")
-        for name in names:  # one that an older run has not is empty
+        for name in ("evaluation_buffer", "conditions", "strata", "progress"):
             connection.register(f"run_{name}", run.table(name))
         rows = connection.sql(query).to_arrow_table().to_pylist()
     rows = [row for row in rows if row["q_abs_max"] is not None]  # None: no batch was audited yet

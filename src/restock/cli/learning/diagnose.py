@@ -21,9 +21,8 @@ class DiagnoseCommand:
 
     For each condition, it compares replay with the steps of the periodic evaluations, which are
     never replayed: TD error, frequency and rows. It also compares the online network with the
-    target network, and the actions that the policy prefers with the actions in the logs. The
-    verdict is HEALTHY, BUFFER, ACTION_COVERAGE, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with the
-    evidence and an experiment that would confirm it. The figures are from the last three
+    target network. The verdict is HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with
+    the evidence and an experiment that would confirm it. The figures are from the last three
     evaluations; most of the runs must agree. Faulty rows in the panel change HEALTHY to BUFFER.
 
     Of a panel or a store, before training, the rows of each robot and recording are compared with
