@@ -33,9 +33,15 @@ from restock.stats import (
     difference_of_arms,
     improvement_of_arms,
     iqm,
-    mean_over_strata,
 )
-from restock.train.evaluation.regression import MIN_EPISODES, agent_episodes
+from restock.train.evaluation.paired import (
+    MIN_EPISODES,
+    Cell,
+    Key,
+    agent_episodes,
+    by_cell,
+    paired,
+)
 from restock.train.judge.comparability import (
     ALLOWED,
     Arm,
@@ -49,11 +55,8 @@ from restock.train.judge.comparability import (
     same_run,
     worst,
 )
-from restock.train.run.kept_evaluations import cell_name
 from restock.train.run.run import Run
 
-Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
-_Key = tuple[int, str]  # of an episode: seed, and the values of the perturbation in force
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
 MIN_RUNS = 3  # seeds of each arm: with fewer there is no interval
 
@@ -268,9 +271,9 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
     return None
 
 
-def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[_Key, F64]]:
+def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[Key, F64]]:
     """Return success and return (runs, 2) by cell, of the episodes that every run drove."""
-    first, *others = runs = [_cells(table) for table in tables]
+    first, *others = runs = [by_cell(table) for table in tables]
     return {
         cell: {
             key: np.array([run[cell][key] for run in runs], np.float64)
@@ -309,7 +312,7 @@ def last_evaluation(run: Run) -> pa.Table:
 Rows = list[dict[str, Any]]
 
 
-def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[str, Any]:
+def diff_runs(first: Path | str, second: Path | str) -> dict[str, Any]:
     """Return what is different in `second`, as `restock coverage diff --json` prints it.
 
     Raises:
@@ -325,8 +328,7 @@ def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[s
             remedy="compare runs of one profile (`profile` in their configs)",
         )
     settings = [asdict(difference) for difference in differences(a, b)]
-    source, evaluation, note = _evaluations(a, b, np.random.default_rng(seed))
-    verdict = _verdict(a.path, b.path)
+    source, evaluation, note = _evaluations(a, b)
     return {
         "kind": "run",
         "different": bool(settings) or any(row["difference"] for row in evaluation),
@@ -339,7 +341,6 @@ def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[s
         "evaluated_by": source,
         "evaluation": evaluation,
         "evaluation_note": note,
-        "comparable": verdict,
     }
 
 
@@ -393,68 +394,12 @@ def _ages(a: Run, b: Run) -> Rows:
     return [{**empty, **line} for line in lines.values()]
 
 
-def _evaluations(a: Run, b: Run, rng: np.random.Generator) -> tuple[str | None, Rows, str | None]:
+def _evaluations(a: Run, b: Run) -> tuple[str | None, Rows, str | None]:
     """Return the episodes' origin and a line per perturbation and condition, or why none."""
     try:
         source, tables = _episodes([a, b])
     except RunError as error:
         return None, [], str(error)
-    cells = [_cells(table) for table in tables]
-    rows = []
-    for cell, of_a in cells[0].items():
-        of_b = cells[1].get(cell, {})
-        if shared := sorted(of_a.keys() & of_b.keys()):
-            pairs = np.array([[of_a[key], of_b[key]] for key in shared])  # (n, 2, 2)
-            rows.append(_evaluation(cell, pairs, rng))
-    return (
-        source,
-        rows,
-        None if rows else ("they have no episode in common: evaluate both with the same --seed"),
-    )
-
-
-def _evaluation(
-    cell: tuple[str, str], pairs: np.ndarray[Any, Any], rng: np.random.Generator
-) -> dict[str, Any]:
-    """Return success and return of both, and the paired differences over episodes."""
-    line: dict[str, Any] = {
-        "perturbation": cell[0],
-        "condition": cell[1],
-        "episodes": len(pairs),
-    }
-    for place, name in enumerate(("success", "return")):
-        of_both = pairs[:, :, place]
-        known = not np.isnan(of_both).any()
-        prefix = "" if name == "success" else "return_"
-        keys = (f"{prefix}difference", f"{prefix}difference_low", f"{prefix}difference_high")
-        line |= {f"{name}_a": None, f"{name}_b": None, **dict.fromkeys(keys)}
-        if not known:  # the task has no goal
-            continue
-        line |= {f"{name}_a": float(of_both[:, 0].mean()), f"{name}_b": float(of_both[:, 1].mean())}
-        found = mean_over_strata([of_both[:, 1] - of_both[:, 0]], rng=rng)
-        line[keys[0]] = found.value
-        if len(pairs) >= MIN_EPISODES and found.low < found.high:
-            line |= {keys[1]: found.low, keys[2]: found.high}
-    return line
-
-
-def _cells(table: pa.Table) -> dict[Cell, dict[_Key, tuple[float, float]]]:
-    """Return success and return by cell and episode."""
-    cells: dict[Cell, dict[_Key, tuple[float, float]]] = {}
-    for row in table.to_pylist():
-        cell = str(row.get("perturbation", "none")), cell_name(row["condition"], row["block"])
-        success = float("nan") if row["success"] is None else float(row["success"])
-        key = int(row["episode_seed"]), str(sorted(row.get("perturbation_values") or ()))
-        cells.setdefault(cell, {})[key] = success, float(row["return"])
-    return cells
-
-
-def _verdict(first: Path, second: Path) -> dict[str, Any]:
-    """Return the verdict of `restock compare`, given the difference that is allowed."""
-    verdict: dict[str, Any] = {}
-    for treatment in ("algorithm", "mixture"):
-        try:
-            verdict[treatment] = compare([first], [second], treatment=treatment).verdict
-        except RunError as error:
-            verdict[treatment] = f"not compared: {error}"
-    return verdict
+    rows = paired(*(by_cell(table) for table in tables))
+    none = "they have no episode in common: evaluate both with the same --seed"
+    return source, rows, None if rows else none

@@ -1,37 +1,30 @@
 -- What the critics of two runs were fed, by source and condition: shares of all rows drawn, plain and
 -- after importance weights. `fed_a` and `fed_b` are the runs' sampled_episodes.
-WITH of_a AS (
+WITH fed AS (
+    SELECT 'a' AS side, * FROM fed_a UNION ALL SELECT 'b', * FROM fed_b
+), shares AS (
     SELECT
+        side,
         source,
         condition,
         sum(drawn_rows) AS drawn,
         count(DISTINCT episode) AS episodes,
-        sum(drawn_rows) / sum(sum(drawn_rows)) OVER () AS share,
-        sum(weight) / sum(sum(weight)) OVER () AS effective_share
-    FROM fed_a
-    GROUP BY source, condition
-), of_b AS (
-    SELECT
-        source,
-        condition,
-        sum(drawn_rows) AS drawn,
-        count(DISTINCT episode) AS episodes,
-        sum(drawn_rows) / sum(sum(drawn_rows)) OVER () AS share,
-        sum(weight) / sum(sum(weight)) OVER () AS effective_share
-    FROM fed_b
-    GROUP BY source, condition
+        sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY side) AS share,
+        sum(weight) / sum(sum(weight)) OVER (PARTITION BY side) AS effective_share
+    FROM fed
+    GROUP BY ALL
 )
 SELECT
     source,
     condition,
-    coalesce(of_a.drawn, 0)::BIGINT AS drawn_a,
-    coalesce(of_b.drawn, 0)::BIGINT AS drawn_b,
-    coalesce(of_a.share, 0) AS share_a,
-    coalesce(of_b.share, 0) AS share_b,
-    coalesce(of_a.effective_share, 0) AS effective_share_a,
-    coalesce(of_b.effective_share, 0) AS effective_share_b,
-    coalesce(of_a.episodes, 0) AS episodes_a,
-    coalesce(of_b.episodes, 0) AS episodes_b
-FROM of_a
-FULL JOIN of_b USING (source, condition)
+    coalesce(sum(drawn) FILTER (side = 'a'), 0)::BIGINT AS drawn_a,
+    coalesce(sum(drawn) FILTER (side = 'b'), 0)::BIGINT AS drawn_b,
+    coalesce(sum(share) FILTER (side = 'a'), 0) AS share_a,
+    coalesce(sum(share) FILTER (side = 'b'), 0) AS share_b,
+    coalesce(sum(effective_share) FILTER (side = 'a'), 0) AS effective_share_a,
+    coalesce(sum(effective_share) FILTER (side = 'b'), 0) AS effective_share_b,
+    coalesce(sum(episodes) FILTER (side = 'a'), 0)::BIGINT AS episodes_a,
+    coalesce(sum(episodes) FILTER (side = 'b'), 0)::BIGINT AS episodes_b
+FROM shares
+GROUP BY source, condition
 ORDER BY source, condition

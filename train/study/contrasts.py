@@ -21,7 +21,7 @@ import pyarrow as pa
 from restock.arrays import F64
 from restock.errors import RunError, counted
 from restock.stats import MIN_PAIRS, holm, nothing_varies, paired_t
-from restock.train.evaluation.regression import agent_episodes
+from restock.train.evaluation.paired import agent_episodes
 from restock.train.run.run import Run
 from restock.train.twin.missions import MISSIONS
 

@@ -18,7 +18,7 @@ from restock.replay.store.store import Store, is_store
 from restock.report.fleet.coverage import coverage_weeks
 from restock.report.look.blocks import Rows, Section, Table, better_and_worse, count, words
 from restock.stats import interval_text
-from restock.train.evaluation.regression import agent_episodes
+from restock.train.evaluation.paired import agent_episodes
 from restock.train.judge.compare import diff_runs, last_evaluation
 from restock.train.run.kept_evaluations import summary_rows
 from restock.train.run.replay_audit import fed_shares

@@ -176,11 +176,6 @@ def _print_runs(document: dict[str, Any]) -> None:
         f"evaluation ({document['evaluated_by']}): paired differences b - a, 95 % over episodes",
         _lines(document["evaluation"], _EVALUATION),
     )
-    verdict = document["comparable"]
-    output.print_text(
-        f"\n`restock compare` says: {verdict['algorithm']} as methods, {verdict['mixture']} as"
-        " mixtures (--treatment mixture)"
-    )
 
 
 def _sides(document: dict[str, Any], names: tuple[str, ...]) -> None:

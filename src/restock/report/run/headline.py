@@ -6,7 +6,7 @@ A run without a twin is judged by logs that it did not learn from.
 
 from __future__ import annotations
 
-from restock.errors import RunError, quoted
+from restock.errors import quoted
 from restock.report.look.blocks import (
     Rows,
     Section,
@@ -19,7 +19,8 @@ from restock.report.look.blocks import (
     words,
 )
 from restock.report.run.facts import Facts, mean_success
-from restock.train.evaluation.regression import read_run_evaluation, regression
+from restock.train.evaluation.paired import AGENT, agent_episodes, by_cell, paired
+from restock.train.run.run import Run
 from restock.train.twin.calibration.twin_gap import TRUSTED
 
 BASELINES = {
@@ -78,16 +79,15 @@ def baseline(facts: Facts) -> str | None:
 
 
 def compared(facts: Facts, name: str | None) -> Rows:
-    """Return `regression`'s rows against another policy, by perturbation and condition.
+    """Return the rows of `paired` against another policy, by perturbation and condition.
 
     There are none if it did not drive the same episodes, or if these have no success to compare.
     """
     if name is None or facts.no_goal:
         return []
-    try:
-        return regression(read_run_evaluation(facts.run, name), read_run_evaluation(facts.run))
-    except RunError:
-        return []
+    driven = [agent_episodes(Run.open(facts.run), policy) for policy in (name, AGENT)]
+    tables = [table for table in driven if table is not None]
+    return paired(*map(by_cell, tables)) if len(tables) == len(driven) else []
 
 
 def losses(facts: Facts) -> list[str]:
@@ -95,7 +95,7 @@ def losses(facts: Facts) -> list[str]:
     return [
         f"Worse than {BASELINES[name]} in {words(row['condition'])}"
         + ("" if row["perturbation"] == "none" else f" under {row['perturbation']}")
-        + f": {row['candidate']:.0%} against {row['baseline']:.0%}"
+        + f": {row['success_b']:.0%} against {row['success_a']:.0%}"
         for name in ("planner", "cloned")
         if facts.clean_cells(name)
         for row in compared(facts, name)

@@ -1,13 +1,14 @@
-"""A policy against another on the same episodes: paired, refused where the episodes differ."""
+"""A policy against another on the same episodes: paired, by those that both drove."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
 from restock.files import write_table
-from restock.train.evaluation.regression import read_run_evaluation, regression
+from restock.train.evaluation.paired import agent_episodes, by_cell, paired
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
@@ -66,11 +67,18 @@ def verdicts(rows: list[dict[str, object]], perturbation: str = "none") -> dict[
     return {r["condition"]: r["verdict"] for r in rows if r["perturbation"] == perturbation}
 
 
-def test_regression_is_worse_better_or_left_open(baseline: Path, tmp_path: Path) -> None:
+def compared(first: Path, second: Path) -> list[dict[str, Any]]:
+    """Compare the runs' own policies on the episodes of both."""
+    driven = [agent_episodes(Run.open(path)) for path in (first, second)]
+    tables = [table for table in driven if table is not None]
+    return paired(*map(by_cell, tables))
+
+
+def test_a_policy_is_worse_better_or_left_open(baseline: Path, tmp_path: Path) -> None:
     other = evaluated(
         tmp_path / "b", {"nominal": 1.0, "wheel_slip": 0.2, "blocked_aisle": 0.9}, shuffle=3
     )
-    rows = regression(read_run_evaluation(baseline), read_run_evaluation(other))
+    rows = compared(baseline, other)
     assert verdicts(rows) == {
         "blocked_aisle (full)": "better",
         "blocked_aisle (partial)": "better",
@@ -78,7 +86,7 @@ def test_regression_is_worse_better_or_left_open(baseline: Path, tmp_path: Path)
         "wheel_slip": "worse",
     }
     slip = next(row for row in rows if row["condition"] == "wheel_slip")
-    assert (slip["baseline"], slip["candidate"]) == pytest.approx((0.6, 0.2))
+    assert (slip["success_a"], slip["success_b"]) == pytest.approx((0.6, 0.2))
     assert slip["difference"] == pytest.approx(-0.4)
     assert slip["difference_low"] < -0.4 < slip["difference_high"] < 0
 
@@ -87,31 +95,30 @@ def test_pairing_tells_what_unpaired_shares_would_not(tmp_path: Path) -> None:
     """Six of sixty fell and none rose: paired that is sure, for two shares it is not."""
     first = evaluated(tmp_path / "a", GOOD)
     second = evaluated(tmp_path / "b", {**GOOD, "wheel_slip": 0.5})
-    slip = verdicts(regression(read_run_evaluation(first), read_run_evaluation(second)))[
-        "wheel_slip"
-    ]
-    assert slip == "worse"
+    assert verdicts(compared(first, second))["wheel_slip"] == "worse"
 
 
 def test_few_episodes_say_nothing_of_better_or_worse(tmp_path: Path) -> None:
     """One episode that fell is no regression: values, without interval and verdict."""
     good = evaluated(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
     bad = evaluated(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
-    rows = regression(read_run_evaluation(good), read_run_evaluation(bad))
+    rows = compared(good, bad)
     few = {row["condition"]: row for row in rows if row["perturbation"] == "none"}
     assert {few[name]["verdict"] for name in ("nominal", "wheel_slip")} == {"inconclusive"}
     assert (few["nominal"]["difference"], few["nominal"]["difference_low"]) == (-1.0, None)
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"first_seed": 10_001}, {"episodes": 40}, {"perturbations": ("none",)}, {"friction": 0.7}],
+    ("changes", "episodes"),
+    [
+        ({"first_seed": 10_001}, {"none": 59, "friction": 59}),
+        ({"episodes": 40}, {"none": 40, "friction": 40}),
+        ({"perturbations": ("none",)}, {"none": 60}),
+        ({"friction": 0.7}, {"none": 60}),
+    ],
     ids=str,
 )
-def test_other_episodes_are_refused(baseline: Path, tmp_path: Path, changes: dict) -> None:
-    other = evaluated(tmp_path / "b", GOOD, **changes)
-    rows = regression(read_run_evaluation(baseline), read_run_evaluation(other))
-    refused = [row for row in rows if row["verdict"] == "refused"]
-    assert refused
-    assert all(row["difference"] is None for row in refused)
-    assert {row["perturbation"] for row in rows} == {"none", "friction"}
+def test_only_episodes_of_both_are_compared(baseline, tmp_path, changes, episodes) -> None:
+    rows = compared(baseline, evaluated(tmp_path / "b", GOOD, **changes))
+    nominal = [row for row in rows if row["condition"] == "nominal"]
+    assert {row["perturbation"]: row["episodes"] for row in nominal} == episodes
