@@ -32,7 +32,6 @@ from restock.train.judge.before_training import (
     OpenedRows,
     RowDiagnosis,
     diagnose_rows,
-    gap_evidence,
     open_rows,
 )
 from restock.train.judge.beside import PROPOSED, tallies
@@ -40,13 +39,6 @@ from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
 from restock.train.judge.fed_rows import FedRows, drive_twin, judged, over_parts
 from restock.train.judge.row_checks import values
-from restock.train.twin.calibration.twin_gap import (
-    TrustLimits,
-    TwinGap,
-    Verdict,
-    trust_verdict,
-    write_gap,
-)
 from restock.train.twin.env.drivers import RandomPolicy
 from restock.train.twin.floors.floors import open_floors
 
@@ -550,37 +542,6 @@ def test_one_episode_without_spread_is_not_a_broken_sensor(logs: FedRows, twin: 
     assert spread["still"]["spread: lateral_speed"] == "ok"
     assert spread["calm"]["spread: accel_x"] == "off"
     assert spread["calm in one"]["spread: accel_x"] == "undecided"
-
-
-@pytest.fixture
-def gap() -> TwinGap:
-    def verdict(condition: str, metres: float) -> Verdict:
-        ends = ConfidenceInterval(metres, metres * 0.9, metres * 1.1)
-        limits = TrustLimits()
-        return trust_verdict(
-            condition, limits=limits, segments=60, episodes=12 if metres else 2,
-            position_p90=ends, reward_ratio=ConfidenceInterval(0.1, 0.1, 0.1),
-        )  # fmt: skip
-
-    reported = (verdict("nominal", 0.1), verdict("wheel_slip", 0.4), verdict("recovery", 0.0))
-    return TwinGap({}, [], [], [], reported, ())
-
-
-def test_a_measured_gap_is_evidence_and_no_verdict(tmp_path: Path, gap: TwinGap) -> None:
-    (missing,) = gap_evidence([tmp_path])
-    assert (missing.status, missing.note) == (
-        "not run", f"`restock twin gap STORE --out {tmp_path / 'gap'}` measures it",
-    )  # fmt: skip
-    write_gap(gap, tmp_path / "gap")
-    rows = {row.check: row for row in gap_evidence([tmp_path / "run", tmp_path])}
-    assert {name: row.status for name, row in rows.items()} == {
-        "twin gap: nominal": "ok", "twin gap: wheel_slip": "off", "twin gap: recovery": "not run",
-    }  # fmt: skip
-    assert "0.40 m" in rows["twin gap: wheel_slip"].note
-    assert RowDiagnosis("HEALTHY", [], list(rows.values()), {}).untrusted == ["wheel_slip"]
-    (tmp_path / "gap/gap.json").write_text("{")
-    (damaged,) = gap_evidence([tmp_path])
-    assert (damaged.status, "contains no readable gap" in damaged.note) == ("not run", True)
 
 
 def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

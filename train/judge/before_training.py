@@ -9,7 +9,7 @@ that need none still run, and the others say why they did not.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -32,7 +32,6 @@ from restock.train.judge.fed_rows import (
     Comparison,
     FedRows,
     Flags,
-    Status,
     drive_twin,
     not_run,
     of_panel,
@@ -42,47 +41,9 @@ from restock.train.judge.fed_rows import (
 from restock.train.judge.mission_checks import mission_checks, with_missions
 from restock.train.judge.row_checks import fed_labels, outcomes, row_order, stored, values
 from restock.train.run.run_profile import carried_profile, profile_of_panel
-from restock.train.twin.calibration.twin_gap import (
-    FOLDER,
-    TRUSTED,
-    UNDECIDED,
-    UNTRUSTED,
-    gap_folder,
-    read_gap,
-)
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.perturbation import Perturbation
-
-GAP_CHECK = "twin gap"
-_STATUS: dict[str, Status] = {TRUSTED: "ok", UNDECIDED: "undecided", UNTRUSTED: "off"}
-
-
-def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
-    """Yield a row for each condition of the first of `places` (a run, a store) that has a gap."""
-    what = "where the twin ends when it drives the logged commands"
-    folder = gap_folder(places)
-    if folder is None:
-        shown = places[0] / FOLDER if places else f"STORE/{FOLDER}"
-        yield not_run(GAP_CHECK, what, f"`restock twin gap STORE --out {shown}` measures it")
-        return
-    try:
-        gap = read_gap(folder)
-    except RunError as error:
-        yield not_run(GAP_CHECK, what, f"{error.where}: {error.what}")
-        return
-    for verdict in gap.verdicts:
-        name, reasons = f"{GAP_CHECK}: {verdict.condition}", "; ".join(verdict.reasons)
-        if verdict.verdict not in _STATUS:
-            yield not_run(name, what, reasons)
-            continue
-        ends = verdict.position_p90
-        yield Comparison(
-            name, what, "m", _STATUS[verdict.verdict],
-            effect=ends.value, low=ends.low, high=ends.high,
-            logs_rows=verdict.segments, note=reasons,
-        )  # fmt: skip
-
 
 MIN_ROWS = 500  # of the logs, for silence to mean health; and of each part that is compared
 MOST = 40  # parts, of the most rows
@@ -237,18 +198,10 @@ class RowDiagnosis:
         """Return the checks that could not be made, each with the reason in `note`."""
         return [row for row in self.comparisons if row.status == "not run"]
 
-    @property
-    def untrusted(self) -> list[str]:
-        """Return the conditions in which `restock twin gap` found the twin far from these logs."""
-        start = f"{GAP_CHECK}: "
-        off = (row.check for row in self.comparisons if row.off)
-        return [check.removeprefix(start) for check in off if check.startswith(start)]
-
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as JSON values."""
         return {
             "verdict": self.verdict,
-            "untrusted": self.untrusted,
             "findings": [asdict(one) for one in self.findings],
             "comparisons": [asdict(row) for row in self.comparisons],
             "about": self.about,
@@ -261,7 +214,6 @@ class OpenedRows(NamedTuple):
     rows: FedRows
     profile: Profile
     checks: list[Comparison | Flags]  # with the signals of their store
-    folders: list[Path]  # of the store and the panel: where a measured gap may be
     files: dict[str, str]  # recording -> its file's name
 
     @property
@@ -278,7 +230,6 @@ def diagnose_before_training(
     perturbation: Perturbation | None = None,
     layouts: str = DEFAULT,
     task_hash: str | None = None,
-    run: Path | str | None = None,
     seed: int = 0,
 ) -> RowDiagnosis:
     """Compare the rows of a panel or store with the twin and with the task's definitions.
@@ -289,7 +240,6 @@ def diagnose_before_training(
         perturbation: of the twin, as `restock twin fit` finds it; None: the nominal one.
         layouts: the floors that the twin drives on, as `env.layouts`.
         task_hash: whose rows, where a store has several tasks.
-        run: the run that was fed these rows, whose measured gap counts first.
 
     Raises:
         RunError: there is not a panel or a store.
@@ -307,8 +257,6 @@ def diagnose_before_training(
         opened.rows, fresh, reason, seed=seed, more=opened.checks, files=opened.files,
         floors=floors if twin else (),
     )  # fmt: skip
-    places = [*([Path(run)] if run is not None else []), *opened.folders]
-    diagnosis = replace(diagnosis, comparisons=[*diagnosis.comparisons, *gap_evidence(places)])
     diagnosis.about.update(
         path=str(path), profile=own.name, task_hash=own.task.hash,
         seconds=round(time.perf_counter() - begun, 1),
@@ -434,7 +382,7 @@ def open_rows(
                 not_run("fed labels", "labels against the store's", reason),
                 not_run("labels", "labels by stored signals", reason),
             ]
-            return OpenedRows(rows, _checked(own, rows, path), missing, [path], {})
+            return OpenedRows(rows, _checked(own, rows, path), missing, {})
         with Store(store_path, version=version) as store:
             own = _checked(own, rows, path)
             compared: list[Comparison | Flags] = [
@@ -442,14 +390,14 @@ def open_rows(
                 *_of_store(store, rows, own),
             ]
             rows = with_missions(store, rows)
-            return OpenedRows(rows, own, compared, [store_path, path], _files(store))
+            return OpenedRows(rows, own, compared, _files(store))
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
             rows = of_store(store, chosen)
             own = _checked(profile or _profile_of_store(store, chosen), rows, path)
             compared = _of_store(store, rows, own)
-            return OpenedRows(with_missions(store, rows), own, compared, [path], _files(store))
+            return OpenedRows(with_missions(store, rows), own, compared, _files(store))
     raise RunError(
         "is not a run, a panel or a store" if path.exists() else "does not exist",
         where=str(path),

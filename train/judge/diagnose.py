@@ -218,7 +218,6 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
             Path(path),
             profile=profile,
             perturbation=twin,
-            run=run.path,
             layouts=env.get("layouts", DEFAULT),
         )
         return found, ""
@@ -239,8 +238,6 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
         whose = "the run's own figures" if len(diagnosis.runs) == 1 else "the runs' own figures"
         said = [f"{diagnosis.cause} by {whose}, {cause} with the rows that were fed:"]
     said += [f"rows: {one.cause}: {one.text}" for one in rows.findings]
-    if rows.untrusted:
-        said.append(f"rows: the twin is far from these logs in {', '.join(rows.untrusted)}")
     return replace(
         diagnosis, cause=cause, evidence=[*diagnosis.evidence, *said], experiment=experiment
     )

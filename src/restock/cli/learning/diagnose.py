@@ -137,14 +137,11 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
 
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
-    from restock.train.judge.before_training import GAP_CHECK
-
     named = {check for one in diagnosis.findings for check in one.evidence}
     chosen = [
         row
         for row in diagnosis.comparisons
-        if row.check in named
-        or (row.status in ("off", "undecided") and not row.check.startswith(GAP_CHECK))
+        if row.check in named or row.status in ("off", "undecided")
     ]
     if chosen:
         print_parted(
@@ -176,12 +173,6 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
     for one in diagnosis.findings:
         print_text(f"  {one.cause}: {one.text}")
         print_text(f"    {one.remedy}")
-    if diagnosis.untrusted:
-        names = ", ".join(diagnosis.untrusted)
-        print_text(
-            f"  `restock twin gap` found the twin far from these logs: {names}."
-            " Where the two differ, either may be wrong"
-        )
     by_reason: dict[str, list[str]] = {}
     for row in diagnosis.not_run:
         by_reason.setdefault(row.note, []).append(row.check)
