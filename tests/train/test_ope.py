@@ -183,16 +183,6 @@ def test_the_verb_evaluates_and_says_why_it_refuses(store, panel, tmp_path, quic
     assert main(["eval", str(run), "--on-logs", str(tmp_path / "nowhere")]) == 2
 
 
-def test_a_horizon_gives_an_answer_where_the_whole_was_refused(panel: Panel) -> None:
-    dataset = load_ope_dataset(panel, TASK)
-    network = kept_network(NETWORK)
-    dataset = replace(dataset, evaluation=_known(dataset.evaluation))
-    config = OpeConfig(epsilon=1.0, horizon=1, model=QUICK)
-    rows = evaluate_off_policy(network, dataset, discount=0.97, measures=("return",), config=config)
-    whole = {r["estimator"]: r["value"] for r in rows if r["condition"] == "all"}
-    assert all(value is not None for value in whole.values())
-
-
 def test_training_evaluates_off_policy_before_it_drives(panel, tmp_path, quick_models, capsys):
     path = tmp_path / "run"
     argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]

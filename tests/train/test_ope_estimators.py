@@ -128,8 +128,6 @@ def test_gate_refuses_a_policy_far_from_the_logs() -> None:
     assert "of 60 episodes, less than 12.0" in str(answers["pdwis"].refused)
     reach = EssGate().measure(away)[1]
     assert 0 < reach < STEPS
-    again = {e.estimator: e for e in _estimates(away, horizon=reach)}
-    assert again["pdwis"].value is not None
 
 
 def test_too_few_episodes_are_not_called_a_policy_that_disagrees() -> None:
@@ -196,5 +194,5 @@ def test_cloning_finds_the_behaviour() -> None:
     np.testing.assert_allclose(chance, BEHAVIOUR[:-1], atol=0.05)
 
 
-def _estimates(of: OpeEpisodes, *, resamples: int = 200, horizon: int | None = None):
-    return estimate(of, rng=np.random.default_rng(0), resamples=resamples, horizon=horizon)
+def _estimates(of: OpeEpisodes, *, resamples: int = 200):
+    return estimate(of, rng=np.random.default_rng(0), resamples=resamples)

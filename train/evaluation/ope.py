@@ -18,7 +18,7 @@ is refused: a number from one episode is not printed as if it were from a hundre
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ from restock.train.evaluation.ope_dataset import (
     load_ope_dataset,
 )
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
-from restock.train.run.run import PolicyOrigin, Run
+from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.run.run_tables import TABLES
 
@@ -76,10 +76,6 @@ class OpeEpisodes:
             reward=self.reward[episodes],
             start_value=self.start_value[episodes],
         )
-
-    def until(self, horizon: int | None) -> OpeEpisodes:
-        """Return the first `horizon` steps; importance sampling then ignores later rewards."""
-        return replace(self, ratio=self.ratio[:, :horizon], reward=self.reward[:, :horizon])
 
     @property
     def discounts(self) -> F64:
@@ -171,7 +167,6 @@ def estimate(
     logged: OpeEpisodes,
     *,
     gate: EssGate = EssGate(),
-    horizon: int | None = None,
     rng: np.random.Generator,
     resamples: int = 2000,
 ) -> list[OpeEstimate]:
@@ -180,23 +175,18 @@ def estimate(
     The interval covers what other episodes would have changed. FQE has none: it is a model's value
     on the starts, and an interval over them would leave out what is wrong with the model.
     """
-    near = logged.until(horizon)
-    refused = gate.refusal(near)
+    refused = gate.refusal(logged)
     counts = cluster_counts(len(logged), resamples, rng)
     answers = []
-    for name, of, estimator in (
-        (LOGGED, logged, observed),
-        (FQE, logged, fitted),
-        (PDWIS, near, per_decision),
-    ):
+    for name, estimator in ((LOGGED, observed), (FQE, fitted), (PDWIS, per_decision)):
         if name == PDWIS and refused is not None:
             answers.append(OpeEstimate(name, None, refused=refused))
             continue
-        value = float(estimator(of, once(len(logged)))[0])
+        value = float(estimator(logged, once(len(logged)))[0])
         if name == FQE or len(logged) < 2:
             answers.append(OpeEstimate(name, value))
             continue
-        interval = percentiles(estimator(of, counts))
+        interval = percentiles(estimator(logged, counts))
         answers.append(OpeEstimate(name, value, *interval))
     return answers
 
@@ -210,19 +200,8 @@ class OpeConfig:
     """Settings of off-policy evaluation."""
 
     epsilon: float = 0.1  # probability of a random action: the greedy policy made soft
-    horizon: int | None = None  # steps that are weighted; None: all
     seed: int = 0
     model: FittedQConfig = field(default_factory=FittedQConfig)
-
-
-@dataclass(frozen=True)
-class OpeResult:
-    """Rows of the `off_policy` table, and notes on the logs."""
-
-    rows: list[dict[str, Any]]
-    notes: tuple[str, ...]
-    version: str  # of the policy
-    origin: PolicyOrigin | None = None
 
 
 @dataclass(frozen=True)
@@ -239,6 +218,10 @@ class OpePlan:
     @property
     def measures(self) -> tuple[Measure, ...]:
         return measures_of(self.task, self.dataset)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return notes_of(self.task, self.dataset, self.config)
 
     @property
     def updates(self) -> int:
@@ -262,8 +245,7 @@ class OpePlan:
             "fitted_rows": len(self.dataset.training.rows),
             "updates": self.updates,
             "epsilon": self.config.epsilon,
-            "horizon": self.config.horizon,
-            "notes": list(notes_of(self.task, self.dataset, self.config)),
+            "notes": list(self.notes),
         }
 
 
@@ -287,13 +269,11 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
 
 
 def evaluate_planned(
-    plan: OpePlan, progress: Callable[[int], None] | None = None, *, write: bool = True
-) -> OpeResult:
-    """Evaluate the policy of a run, and write `RUN/eval/off_policy.parquet`.
+    plan: OpePlan, progress: Callable[[int], None] | None = None
+) -> list[dict[str, Any]]:
+    """Evaluate the policy of a run; write `RUN/eval/off_policy.parquet`, and return its rows.
 
-    Args:
-        progress: called with 1 before every update of its models.
-        write: whether to write the file.
+    `progress` is called with 1 before every update of its models.
     """
     with torch_threads(plan.trained.threads):
         rows = evaluate_off_policy(
@@ -304,14 +284,11 @@ def evaluate_planned(
             config=plan.config,
             between=(lambda: None) if progress is None else (lambda: progress(1)),
         )
-    if write:
-        origin = plan.policy.origin
-        names = ("env_steps", "gradient_steps")
-        clocks = {name: None if origin is None else getattr(origin, name) for name in names}
-        table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
-        write_table(table, plan.path / "eval" / FILE)
-    notes = notes_of(plan.task, plan.dataset, plan.config)
-    return OpeResult(rows, notes, plan.policy.version, plan.policy.origin)
+    names = ("env_steps", "gradient_steps")
+    clocks = {name: getattr(plan.policy.origin, name, None) for name in names}
+    table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
+    write_table(table, plan.path / "eval" / FILE)
+    return rows
 
 
 def notes_of(task: Task, dataset: OpeDataset, config: OpeConfig) -> tuple[str, ...]:
@@ -373,7 +350,7 @@ def evaluate_off_policy(
             part = episodes
             if condition != ALL:
                 part = episodes.select(evaluation.condition == condition)
-            ess, ess_steps = gate.measure(part.until(config.horizon))
+            ess, ess_steps = gate.measure(part)
             shared = {
                 "measure": measure,
                 "condition": condition,
@@ -381,23 +358,12 @@ def evaluate_off_policy(
                 "ess": ess,
                 "ess_steps": ess_steps,
                 "steps": part.ratio.shape[1],
-                "horizon": config.horizon,
                 "epsilon": config.epsilon,
                 "discount": gamma,
                 "estimated_share": estimated,
             }
             rng = np.random.default_rng([config.seed, 12])
-            results += [
-                {
-                    **shared,
-                    "estimator": answer.estimator,
-                    "value": answer.value,
-                    "low": answer.low,
-                    "high": answer.high,
-                    "refused": answer.refused,
-                }
-                for answer in estimate(part, gate=gate, horizon=config.horizon, rng=rng)
-            ]
+            results += [shared | asdict(one) for one in estimate(part, gate=gate, rng=rng)]
     return results
 
 

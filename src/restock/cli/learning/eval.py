@@ -19,7 +19,7 @@ from restock.cli.words import Option, Positional, refuse
 from restock.errors import ExitCode, counted, policy_words
 
 if TYPE_CHECKING:
-    from restock.train.evaluation.ope import OpeConfig, OpeResult
+    from restock.train.evaluation.ope import OpePlan
 
 # Options that say what is driven, and what becomes of it.
 _DRIVES = (
@@ -159,8 +159,7 @@ class EvalCommand:
     def _evaluate_off_policy(self, logs: str) -> int:
         from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
 
-        config = OpeConfig()
-        plan = plan_off_policy(self.run_path, None if logs == "own" else logs, config)
+        plan = plan_off_policy(self.run_path, None if logs == "own" else logs, OpeConfig())
         document = plan.document()
         if self.dry_run:
             print_json(document)
@@ -171,8 +170,12 @@ class EvalCommand:
             f" {document['fitted_rows']:,} other rows"
         )
         with progress("off-policy evaluation", plan.updates) as advance:
-            result = evaluate_planned(plan, advance)
-        show_off_policy(self.run_path, result, config, as_json=self.json)
+            rows = evaluate_planned(plan, advance)
+        if self.json:
+            names = ("run", "policy", "trained", "notes")
+            print_json({**{name: document[name] for name in names}, "results": rows})
+        else:
+            show_off_policy(plan, rows)
         return 0
 
 
@@ -204,44 +207,34 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
         say("time lost is not known: add the planner to --policies once")
 
 
-def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
+def show_off_policy(plan: OpePlan, rows: list[dict[str, Any]]) -> None:
     """Print a row per measure and condition, and why weighting is refused if it is."""
-    if as_json:
-        print_json(
-            {
-                "run": str(path),
-                "policy": result.version,
-                "trained": None if result.origin is None else result.origin.document,
-                "notes": list(result.notes),
-                "results": result.rows,
-            }
-        )
-        return
     cells: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in result.rows:
+    for row in rows:
         key = row["measure"], row["condition"]
         shown = cells.setdefault(
             key, {"measure": key[0], "condition": key[1], "episodes": row["episodes"]}
         )
         shown[row["estimator"]] = _value(row)
         shown["weights worth"] = f"{row['ess']:.1f} episodes"
-    step = "" if result.origin is None else f" ({result.origin.text})"
+    origin = plan.policy.origin
+    step = "" if origin is None else f" ({origin.text})"
     print_table(
         list(cells.values()),
-        title=f"{result.version}{step}, greedy with {config.epsilon:.0%} random actions, "
+        title=f"{plan.policy.version}{step}, greedy with {plan.config.epsilon:.0%} random actions, "
         "off-policy on logs it did not learn from [95 % over episodes]",
     )
-    for row in result.rows:
+    for row in rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
             longest = f"; {row['ess_steps']} steps would be few enough" if row["ess_steps"] else ""
             say(f"{row['measure']}: pdwis is refused: {row['refused']}{longest}")
-    estimated = result.rows[0]["estimated_share"] if result.rows else 0.0
+    estimated = rows[0]["estimated_share"] if rows else 0.0
     if estimated:
         say(
             f"the behaviour policy's probabilities are estimated (cloned) for {estimated:.0%} of "
             "the rows: the logs do not contain them"
         )
-    for note in result.notes:
+    for note in plan.notes:
         say(note)
 
 
