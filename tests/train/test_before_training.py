@@ -37,7 +37,7 @@ from restock.train.judge.before_training import (
 from restock.train.judge.beside import PROPOSED, tallies
 from restock.train.judge.causes import findings
 from restock.train.judge.diagnose import Diagnosis, with_rows
-from restock.train.judge.fed_rows import FedRows, drive_twin, judged, over_parts
+from restock.train.judge.fed_rows import Comparison, FedRows, correct_over_parts, drive_twin, judged
 from restock.train.judge.row_checks import values
 from restock.train.twin.env.drivers import RandomPolicy
 from restock.train.twin.floors.floors import open_floors
@@ -218,8 +218,8 @@ def test_only_a_sure_opposite_sign_is_called_mirrored(high: float, named: str) -
             logs=value, twin=1.0, least=1 / GAIN, most=GAIN, logs_rows=600,
         )  # fmt: skip
         assert gain.off is off
-        answers.append(Answer(relation, (gain,), value, 0.0))
-    (found,) = findings(answers, [], [], TASK)
+        answers.append(Answer(relation, [gain], value, 0.0))
+    (found,) = findings(answers, [], TASK)
     assert found.cause == f"ACTIONS_{named}"
     assert not re.search(r"[2-9]\d\d%|1[1-9]\d%", found.text)  # no share above 1
 
@@ -451,9 +451,11 @@ def test_a_check_in_many_parts_is_corrected_for_their_number():
     row = judged("gain: x", "", "ratio", interval, logs=1.2, twin=1.0, most=1.08, logs_rows=9)
     sound = judged("gain: x", "", "ratio", ConfidenceInterval(1.0, 0.9, 1.1), logs=1.0, twin=1.0,
                    most=1.08, logs_rows=9)  # fmt: skip
-    assert over_parts([[row]])[0][0].off
-    among = over_parts([[row], *[[sound]] * 19])
-    assert [one[0].status for one in among] == ["undecided", *["ok"] * 19]
+    correct_over_parts([[row]])
+    assert row.off
+    parts = [[row], *([replace(sound)] for _ in range(19))]
+    correct_over_parts(parts)
+    assert [one.status for (one,) in parts] == ["undecided", *["ok"] * 19]
 
 
 @pytest.fixture(scope="module")
@@ -564,12 +566,16 @@ def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixt
     assert {row["status"] for row in document["comparisons"]} >= {"off", "not run"}
 
 
+def checked(opened: OpenedRows) -> list[Comparison]:
+    return [one.of(opened.rows) for one in opened.checks]
+
+
 def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None:
     logs, store = ROOT / "sample_logs/amr_tuesday", StoreWriter(tmp_path / "store")
     ingest(logs, load_profile("warehouse_amr"), store=store)
     as_stored = open_rows(tmp_path / "store")
     assert (np.diff(as_stored.rows.logged_ns)[as_stored.rows.joined[1:]] > 0).all()
-    compared = {row.check: row for row in as_stored.comparisons}
+    compared = {row.check: row for row in checked(as_stored)}
     assert len(compared) > 3
     assert {row.status for row in compared.values()} <= {"ok", "not run"}
     assert compared["terminations"].status == "ok"
@@ -584,7 +590,7 @@ def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None
     other = StoreWriter(tmp_path / "other")
     other.write(store.live(row["recording_id"]), replaced(rows, changed))
     opened = open_rows(tmp_path / "other")
-    off = [row.check for row in opened.comparisons if row.off]
+    off = [row.check for row in checked(opened) if row.off]
     assert off == ["labels: blocked_aisle", "terminations"]
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
@@ -612,7 +618,7 @@ def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> Non
     profile = load_profile("warehouse_amr")
     ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
     panel = panel_of(tmp_path / "store", EVERY + NO_SPLIT, tmp_path / "panel")
-    compared = [row for row in open_rows(panel.path).comparisons if row.check.startswith("fed ")]
+    compared = [row for row in checked(open_rows(panel.path)) if row.check.startswith("fed ")]
     assert len(compared) > 1
     assert {(row.status, row.logs) for row in compared} == {("ok", 0.0)}
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -389,12 +389,12 @@ class Broken:
     mended: dict[str, tuple[float, float]]  # by cause: the share that holds without it, its size
 
 
-@dataclass(frozen=True)
+@dataclass
 class Answer:
     """A relation in logs and twin."""
 
     relation: Relation
-    comparisons: tuple[Comparison, ...]
+    comparisons: list[Comparison]
     gain: float  # logs over twin; NaN: not known
     delay: float  # logs less twin, steps
     rows: FedRows | None = None  # of the logs, if these can be compared with other robots'
@@ -421,12 +421,9 @@ class Answer:
         return any(one.off and one.check.startswith(figure) for one in self.comparisons)
 
 
-def answers(
-    logs: FedRows, twin: FedRows | None, seed: int = 0, of_twin: TwinFits | None = None
-) -> list[Answer]:
+def answers(logs: FedRows, twin: FedRows | None, of_twin: TwinFits) -> list[Answer]:
     """Compare every relation. `of_twin` keeps the twin's fits for the next logs."""
-    rng = np.random.default_rng([seed, 1])
-    of_twin = {} if of_twin is None else of_twin
+    rng = np.random.default_rng([0, 1])
     return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
 
 
@@ -450,11 +447,11 @@ def _answer(
             f"{relation.zero}: {name}", what, "difference", figure, logs=found.gain, twin=0.0,
             least=-relation.most, most=relation.most, logs_rows=found.rows,
         )  # fmt: skip
-        return Answer(relation, (row,), 1.0, 0.0)
+        return Answer(relation, [row], 1.0, 0.0)
     if found is None or (twin is not None and expected is None):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")
         row = not_run(f"gain: {name}", what, reason)
-        return Answer(relation, (row,), float("nan"), 0.0, rows=logs)
+        return Answer(relation, [row], float("nan"), 0.0, rows=logs)
     if expected is None:
         return _by_definition(relation, found, what, logs)
     most, most_left = (
@@ -499,7 +496,7 @@ def _answer(
         )
     )  # fmt: skip
     by = delay.value if timed else 0.0
-    return Answer(relation, tuple(made), gain.value, by, logs, found)
+    return Answer(relation, made, gain.value, by, logs, found)
 
 
 def _by_definition(relation: Relation, found: Response, what: str, logs: FedRows) -> Answer:
@@ -507,7 +504,7 @@ def _by_definition(relation: Relation, found: Response, what: str, logs: FedRows
     name = relation.name
     if relation.gain is None:
         row = not_run(f"gain: {name}", what, "no twin to compare with")
-        return Answer(relation, (row,), float("nan"), 0.0)
+        return Answer(relation, [row], float("nan"), 0.0)
     of_unit = found.gain / relation.gain, found.gains / relation.gain
     gain = interval_of(*of_unit, found.clusters)
     delay = interval_of(found.delay, found.delays, found.clusters)
@@ -521,7 +518,7 @@ def _by_definition(relation: Relation, found: Response, what: str, logs: FedRows
                    least=-DELAY_STEPS, most=LATEST_STEPS, logs_rows=found.rows)
         )  # fmt: skip
     over = min(max(found.delay, 0.0), LATEST_STEPS)
-    return Answer(relation, tuple(made), gain.value, found.delay - over, logs, found)
+    return Answer(relation, made, gain.value, found.delay - over, logs, found)
 
 
 def held_motion(rows: FedRows) -> list[F64]:
@@ -534,11 +531,14 @@ def held_motion(rows: FedRows) -> list[F64]:
     return [motion[held & (rows.action == action)] for action in range(len(rows.task.actions))]
 
 
-def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comparison, int]]:
-    """Return how far each logged action's motion is from that action's in the twin.
+ACTION = "action: "
 
-    Without a twin, the task's table is compared with. Each comparison comes with the action whose
-    motion most of its rows have.
+
+def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
+    """Yield how far each logged action's motion is from that action's in the twin.
+
+    Without a twin, the task's table is compared with. The note is the action whose motion most of
+    its rows have: the check is off if that is surely another one.
     """
     expected = np.array(logs.task.actions, np.float64)
     scale = np.maximum(np.abs(expected).max(axis=0), 1e-9)
@@ -550,20 +550,17 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comp
         name = names[action]
         what = f"motion under the action {name!r}, held"
         if len(motion) < _MIN_HELD:
-            yield not_run(f"action: {name}", what, "hardly held in the logs"), action
+            yield not_run(ACTION + name, what, "hardly held in the logs")
             continue
         away = np.linalg.norm((motion[:, None] - expected) / scale, axis=2)  # (n, A)
         middle = np.median(away, axis=0)
         nearest = int(np.bincount(away.argmin(axis=1)).argmax())
         share = float((away.argmin(axis=1) == nearest).mean())
         is_other = nearest != action and middle[action] > _AWAY and share >= _MAX_ROWS
-        speed, turn = np.median(motion, axis=0)
-        distance = float(middle[action])
-        row = judged(
-            f"action: {name}", what, "distance", ConfidenceInterval(distance, distance, distance),
-            logs=distance, twin=float(middle[nearest]),
-            most=_AWAY if is_other else math.inf, logs_rows=len(motion),
-            note=f"{speed:+.2f} m/s, {turn:+.2f} rad/s: {share:.0%} nearest to {names[nearest]!r}",
-        )  # fmt: skip
         # A median decided by a share: there is no interval to show.
-        yield replace(row, low=None, high=None), nearest if is_other else action
+        yield Comparison(
+            ACTION + name, what, "distance", "off" if is_other else "ok",
+            logs=float(middle[action]), twin=float(middle[nearest]), effect=float(middle[action]),
+            most=_AWAY if is_other else None, logs_rows=len(motion), note=names[nearest],
+            p=0.0 if is_other else 1.0,
+        )  # fmt: skip

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError, RestockError, RunError, StoreError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.task.conditions import Condition
-from restock.ingest.task.task import Task
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
 from restock.train.feed.collector import conditions_in_twin
@@ -32,11 +31,12 @@ from restock.train.judge.fed_rows import (
     Comparison,
     FedRows,
     Flags,
+    correct_over_parts,
     drive_twin,
     not_run,
     of_panel,
     of_store,
-    over_parts,
+    unflagged,
 )
 from restock.train.judge.mission_checks import mission_checks, with_missions
 from restock.train.judge.row_checks import fed_labels, outcomes, row_order, stored, values
@@ -52,13 +52,20 @@ _SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wro
 _NAMED = 3
 
 
-@dataclass(frozen=True)
+@dataclass
 class Part:
     """Rows that are judged by themselves: all of them, or those of a robot or a recording."""
 
     name: str  # "" of all rows
     kind: str  # robots, recordings, …
     rows: FedRows
+    answers: list[Answer] = field(default_factory=list)
+    others: list[Comparison] = field(default_factory=list)
+
+    @property
+    def comparisons(self) -> list[Comparison]:
+        """Return all checks that were made of the rows."""
+        return [row for one in self.answers for row in one.comparisons] + self.others
 
 
 def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
@@ -198,28 +205,14 @@ class RowDiagnosis:
         """Return the checks that could not be made, each with the reason in `note`."""
         return [row for row in self.comparisons if row.status == "not run"]
 
-    def document(self) -> dict[str, Any]:
-        """Return the diagnosis as JSON values."""
-        return {
-            "verdict": self.verdict,
-            "findings": [asdict(one) for one in self.findings],
-            "comparisons": [asdict(row) for row in self.comparisons],
-            "about": self.about,
-        }
-
 
 class OpenedRows(NamedTuple):
     """Opened rows, and what comes with them from their store."""
 
     rows: FedRows
     profile: Profile
-    checks: list[Comparison | Flags]  # with the signals of their store
+    checks: list[Flags]  # with the signals of their store
     files: dict[str, str]  # recording -> its file's name
-
-    @property
-    def comparisons(self) -> list[Comparison]:
-        """Return the checks of all rows."""
-        return [one.of(self.rows) if isinstance(one, Flags) else one for one in self.checks]
 
 
 def diagnose_before_training(
@@ -254,7 +247,7 @@ def diagnose_before_training(
         _drive(own, perturbation, layouts, seed) if twin else (None, "it was not requested")
     )
     diagnosis = diagnose_rows(
-        opened.rows, fresh, reason, seed=seed, more=opened.checks, files=opened.files,
+        opened.rows, fresh, reason, more=opened.checks, files=opened.files,
         floors=floors if twin else (),
     )  # fmt: skip
     diagnosis.about.update(
@@ -264,54 +257,9 @@ def diagnose_before_training(
     return diagnosis
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """All checks of a part's rows."""
-
-    answers: list[Answer]
-    permuted: list[tuple[Comparison, int]]
-    others: list[Comparison]
-
-    @classmethod
-    def of(
-        cls, rows: FedRows, twin: FedRows | None, seed: int, of_twin: TwinFits,
-        more: Sequence[Comparison | Flags], floors: Sequence[Warehouse], others: FedRows | None,
-    ) -> _Checked:  # fmt: skip
-        elsewhere = [one.of(rows) if isinstance(one, Flags) else one for one in more]
-        return cls(
-            answers(rows, twin, seed, of_twin),
-            list(permuted_actions(rows, twin)),
-            [
-                *outcomes(rows, twin, seed),
-                *row_order(rows),
-                *values(rows, twin, seed),
-                *mission_checks(rows, twin, floors, others),
-                *elsewhere,
-            ],
-        )
-
-    @property
-    def comparisons(self) -> list[Comparison]:
-        of_relations = [row for one in self.answers for row in one.comparisons]
-        return [*of_relations, *(row for row, _ in self.permuted), *self.others]
-
-    def corrected(self, comparisons: Sequence[Comparison]) -> _Checked:
-        """Return the same with these comparisons, in the order of `comparisons`."""
-        left = iter(comparisons)
-        return _Checked(
-            [replace(one, comparisons=tuple(next(left) for _ in one.comparisons))
-             for one in self.answers],
-            [(next(left), other) for _, other in self.permuted],
-            list(left),
-        )  # fmt: skip
-
-    def findings(self, task: Task) -> list[Finding]:
-        return findings(self.answers, self.permuted, self.others, task)
-
-
 def diagnose_rows(
-    rows: FedRows, twin: FedRows | None, reason: str = "", *, seed: int = 0,
-    more: Sequence[Comparison | Flags] = (), floors: Sequence[Warehouse] = (),
+    rows: FedRows, twin: FedRows | None, reason: str = "", *,
+    more: Sequence[Flags] = (), floors: Sequence[Warehouse] = (),
     files: Mapping[str, str] | None = None,
 ) -> RowDiagnosis:  # fmt: skip
     """Diagnose opened rows, all of them and each robot's and recording's.
@@ -321,35 +269,33 @@ def diagnose_rows(
     """
     parts, compared = parts_of(rows)
     of_twin: TwinFits = {}  # the same for every part
-    checked = [
-        _Checked.of(
-            part.rows, twin, seed, of_twin, more, floors,
-            rows.take(~np.isin(rows.transition_id, part.rows.transition_id)) if part.name else None,
-        )
-        for part in parts
-    ]  # fmt: skip
-    for kind in {part.kind for part in parts[1:]}:
-        inside = [place for place, part in enumerate(parts) if part.kind == kind]
-        relations, of_values = beside_others(
-            [parts[place].rows for place in inside], [checked[place].answers for place in inside]
-        )
-        for place, own, more_of_it in zip(inside, relations, of_values, strict=True):
-            checked[place] = replace(checked[place], answers=own)
-            checked[place].others.extend(more_of_it)
-    checked = [
-        one.corrected(comparisons)
-        for one, comparisons in zip(
-            checked, over_parts([one.comparisons for one in checked]), strict=True
-        )
-    ]
-    some, whole = _of_parts(parts, [one.findings(rows.task) for one in checked], files or {})
-    found = some + whole
-    comparisons = list(checked[0].comparisons)
-    for part, one in zip(parts[1:], checked[1:], strict=True):
+    for part in parts:
+        own = part.rows
+        inside = np.isin(rows.transition_id, own.transition_id)
+        part.answers = answers(own, twin, of_twin)
+        part.others = [
+            *permuted_actions(own, twin),
+            *outcomes(own, twin),
+            *row_order(own),
+            *values(own, twin),
+            *mission_checks(own, twin, floors, rows.take(~inside) if part.name else None),
+            *(one.of(own) for one in more),
+        ]
+    for kind in dict.fromkeys(part.kind for part in parts[1:]):
+        some = [part for part in parts if part.kind == kind]
+        of_values = beside_others([part.rows for part in some], [part.answers for part in some])
+        for part, compared_values in zip(some, of_values, strict=True):
+            part.others += compared_values
+    correct_over_parts([part.comparisons for part in parts])
+    each = [findings(part.answers, part.others, rows.task) for part in parts]
+    of_some, of_all = _of_parts(parts, each, files or {})
+    found = of_some + of_all
+    comparisons = parts[0].comparisons
+    for part in parts[1:]:
         comparisons += [replace(row, check=f"{row.check}, {part.name}")
-                        for row in one.comparisons if row.off]  # fmt: skip
+                        for row in part.comparisons if row.off]  # fmt: skip
     if compared is not None:
-        comparisons.append(replace(compared, status="off" if some else compared.status))
+        comparisons.append(replace(compared, status="off" if of_some else compared.status))
     if twin is None:
         comparisons.append(not_run("twin", "rows of the twin", reason))
     verdict: Verdict = "BUFFER" if found else "HEALTHY"
@@ -378,25 +324,21 @@ def open_rows(
         store_path, version = Path(panel.header.store), panel.store_version
         if version < 0 or not is_store(store_path):
             reason = f"the panel's store is no longer at {store_path}"
-            missing: list[Comparison | Flags] = [
-                not_run("fed labels", "labels against the store's", reason),
-                not_run("labels", "labels by stored signals", reason),
+            missing = [
+                unflagged("fed labels", "labels against the store's", reason),
+                unflagged("labels", "labels by stored signals", reason),
             ]
             return OpenedRows(rows, _checked(own, rows, path), missing, {})
         with Store(store_path, version=version) as store:
             own = _checked(own, rows, path)
-            compared: list[Comparison | Flags] = [
-                *fed_labels(store, rows),
-                *_of_store(store, rows, own),
-            ]
-            rows = with_missions(store, rows)
-            return OpenedRows(rows, own, compared, _files(store))
+            compared = [*fed_labels(store, rows), *stored(store, rows, own, _conditions(own))]
+            return OpenedRows(with_missions(store, rows), own, compared, _files(store))
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
             rows = of_store(store, chosen)
             own = _checked(profile or _profile_of_store(store, chosen), rows, path)
-            compared = _of_store(store, rows, own)
+            compared = [*stored(store, rows, own, _conditions(own))]
             return OpenedRows(with_missions(store, rows), own, compared, _files(store))
     raise RunError(
         "is not a run, a panel or a store" if path.exists() else "does not exist",
@@ -420,10 +362,6 @@ def _files(store: Store) -> dict[str, str]:
     """Return the name of each recording's file."""
     found = store.connection.sql("SELECT recording_id, source_file FROM recordings").fetchall()
     return {str(name): Path(path).name for name, path in found}
-
-
-def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison | Flags]:
-    return list(stored(store, rows, profile, _conditions(profile)))
 
 
 def _conditions(profile: Profile) -> list[Condition]:

@@ -28,13 +28,13 @@ _DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # most beside the others; the latter of t
 
 def beside_others(
     parts: Sequence[FedRows], answers: Sequence[Sequence[Answer]]
-) -> tuple[list[list[Answer]], list[list[Comparison]]]:
+) -> list[list[Comparison]]:
     """Compare robots: each one's relations and repeated values with those of the others.
 
-    Returns the answers of each robot with these comparisons, and the comparisons of its values.
+    Adds comparisons to the answers of each robot, and returns the comparisons of its values.
     """
     if len(parts) < MIN_BESIDE:
-        return [list(one) for one in answers], [[] for _ in parts]
+        return [[] for _ in parts]
     each = [_largest(tallies(rows)) for rows in parts]
     values = _signals_beside(each)
     off = [{row.check for row in of_part if row.off} for of_part in values]
@@ -42,27 +42,24 @@ def beside_others(
         {"".join(key): one for key, one in of_part.items() if "".join(key) in names}
         for of_part, names in zip(each, off, strict=True)
     ]
-    relations = [_relation_beside(list(one), odd) for one in zip(*answers, strict=True)]
-    return [list(one) for one in zip(*relations, strict=True)], values
+    for of_relation in zip(*answers, strict=True):
+        _relation_beside(of_relation)
+        if of_relation[0].relation.lags is not ends.NOW:
+            _stretches(of_relation, odd)
+    return values
 
 
-def _relation_beside(made: list[Answer], odd: Sequence[Mapping[str, Tally]]) -> list[Answer]:
+def _relation_beside(answers: Sequence[Answer]) -> None:
     """Compare one relation in several robots: each with the middle of the others."""
-    answers = tuple(made)
     for figure, least, most in _allowed(answers[0].relation):
         rows = [_of_figure(one, figure) for one in answers]
         for place, own in enumerate(rows):
             others = [one for other, one in enumerate(rows) if other != place and one is not None]
             if own is None or (beside := _beside(figure, own, others, least, most)) is None:
                 continue
-            one = made[place]
-            made[place] = replace(one, comparisons=(*one.comparisons, beside))
-            if beside.off and beside.effect is not None:
-                if figure == "gain":
-                    made[place] = replace(made[place], gain=beside.effect)
-                elif figure == "delay":
-                    made[place] = replace(made[place], delay=beside.effect)
-    return made if answers[0].relation.lags is ends.NOW else _stretches(made, odd)
+            answers[place].comparisons.append(beside)
+            if beside.off and beside.effect is not None and figure != "unexplained":
+                setattr(answers[place], figure, beside.effect)
 
 
 def _allowed(relation: Relation) -> list[tuple[str, float, float]]:
@@ -118,8 +115,10 @@ def _beside(
 
 
 def _only_off(row: Comparison) -> Comparison:
-    """Return a comparison that counts only if it is off: to differ raises no suspicion."""
-    return row if row.off else replace(row, status="ok")
+    """Let a comparison count only if it is off: to differ raises no suspicion."""
+    if not row.off:
+        row.status = "ok"
+    return row
 
 
 _WINDOW = 10  # steps of a stretch
@@ -130,7 +129,7 @@ _COUNTS = 0.1  # of the largest of a kernel: what less counts for is not part of
 _STEPS = (*range(-10, 0), *range(1, 11))  # of a shift
 
 
-def _stretches(answers: list[Answer], odd: Sequence[Mapping[str, Tally]]) -> list[Answer]:
+def _stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) -> None:
     """Compare in how many stretches of a drive each robot's relation breaks, beside the others'.
 
     All are held against one response: the middle of the robots' own.
@@ -138,7 +137,7 @@ def _stretches(answers: list[Answer], odd: Sequence[Mapping[str, Tally]]) -> lis
     relation = answers[0].relation
     fits = [one.found for one in answers if one.found is not None]
     if len(fits) < MIN_BESIDE - 1:
-        return answers
+        return
     kernel = np.median([one.kernel for one in fits], axis=0)
     centred = relation.offset < math.inf
     offset = float(np.median([one.offset for one in fits])) if centred else 0.0
@@ -166,14 +165,12 @@ def _stretches(answers: list[Answer], odd: Sequence[Mapping[str, Tally]]) -> lis
                 _IN_PART,
             )
         )
-        one = answers[place]
-        found = None
+        answers[place].comparisons.append(row)
         if row.off:
             usual = np.concatenate([drives[other].left for other in others]).mean()
             mended = drive.mended(broken, most, usually, _of_ends(relation, kernel, odd[place]))
-            found = Broken(drive.left[broken].mean() ** 0.5, usual**0.5, mended)
-        answers[place] = replace(one, comparisons=(*one.comparisons, row), broken=found)
-    return answers
+            off_by = drive.left[broken].mean() ** 0.5
+            answers[place].broken = Broken(off_by, usual**0.5, mended)
 
 
 def _of_ends(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[str, Bools]:

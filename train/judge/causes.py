@@ -18,6 +18,7 @@ import msgspec
 
 from restock.ingest.task.task import Task
 from restock.train.judge.answers import (
+    ACTION,
     ACTION_SPEED,
     ACTION_TURN,
     DELAY_STEPS,
@@ -66,28 +67,22 @@ class Finding:
     evidence: tuple[str, ...]  # the comparisons it rests on, by `check`
 
 
-def findings(
-    answers: Sequence[Answer],
-    permuted: Sequence[tuple[Comparison, int]],
-    others: Iterable[Comparison],
-    task: Task,
-) -> list[Finding]:
+def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task) -> list[Finding]:
     """Return the faults, the least understood last."""
     of_signals: dict[str, Comparison] = {}  # by the kind of check, and the signal
-    rest = []
+    moved, rest = [], []
     for row in others:
         if row.off and row.check.startswith(OF_SIGNALS):
             of_signals[row.check] = row
         elif row.off:
-            rest.append(row)
+            (moved if row.check.startswith(ACTION) else rest).append(row)
     of_rows = _of_rows(rest)
     first = [one for one in of_rows if one.cause in _FIRST]
     if first:  # what rows are made of, and all that is compared with their next, follows from it
         return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
     found, shown = _of_signals(of_signals, of_rows, answers)
     ends = odd_ends([one for one in answers if not _has(one, shown)])
-    moved = [(row, place, other) for place, (row, other) in enumerate(permuted) if other != place]
-    one_to_one = len({other for _, _, other in moved}) == len(moved)
+    one_to_one = len({row.note for row in moved}) == len(moved)
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
     # Actions that are late or early are found in place of others, too.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
@@ -293,16 +288,16 @@ def _surely_reversed(off: Sequence[Answer]) -> bool:
     return bool(gains) and all(row.high is not None and row.high < 0 for row in gains)
 
 
-def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Finding:
-    evidence = tuple(row.check for row, _, _ in moved)
-    mirror = all(
-        task.actions[other] == (task.actions[place][0], -task.actions[place][1])
-        for _, place, other in moved
-    )
-    names = task.action_names
-    pairs = "; ".join(f"{names[place]!r} is {names[other]!r}" for _, place, other in moved)
+def _permuted(moved: Sequence[Comparison], task: Task) -> Finding:
+    motion = dict(zip(task.action_names, task.actions, strict=True))
+    names = [(row.check.removeprefix(ACTION), row.note) for row in moved]
+    mirror = all(motion[of] == (motion[name][0], -motion[name][1]) for name, of in names)
+    pairs = "; ".join(f"{name!r} is {of!r}" for name, of in names)
     return TABLES.ends["opposite" if mirror else "permuted"].finding(
-        evidence, key=TABLES.keys[ACTION_TURN], way=TABLES.ways[ACTION_TURN], pairs=pairs
+        tuple(row.check for row in moved),
+        key=TABLES.keys[ACTION_TURN],
+        way=TABLES.ways[ACTION_TURN],
+        pairs=pairs,
     )
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import chain
 from statistics import NormalDist
 from typing import Any, Literal
 
@@ -37,7 +38,7 @@ Status = Literal["ok", "off", "undecided", "not run"]
 TAIL = 0.025  # of a 95 % interval
 
 
-@dataclass(frozen=True)
+@dataclass
 class Comparison:
     """The result of a check: `effect` is a ratio or a difference, as `measure` says.
 
@@ -109,25 +110,18 @@ def _beyond(interval: ConfidenceInterval, least: float, most: float) -> float:
     return 1.0 if math.isnan(z) else NormalDist().cdf(-z)
 
 
-def over_parts(parts: Sequence[Sequence[Comparison]]) -> list[list[Comparison]]:
+def correct_over_parts(parts: Sequence[Sequence[Comparison]]) -> None:
     """Correct each check for the number of parts (robots, recordings) that it is made in.
 
     By Holm's method: the chance that a check is off in any part of sound logs is that of one test.
     """
-    by_check: dict[str, list[float]] = {}
-    for one in parts:
-        for row in one:
-            by_check.setdefault(row.check, []).append(row.p)
-    adjusted = {check: iter(holm(p)) for check, p in by_check.items()}
-    return [
-        [
-            replace(row, status="undecided")
-            if next(adjusted[row.check]) > TAIL and row.off
-            else row
-            for row in one
-        ]
-        for one in parts
-    ]
+    by_check: dict[str, list[Comparison]] = {}
+    for row in chain.from_iterable(parts):
+        by_check.setdefault(row.check, []).append(row)
+    for rows in by_check.values():
+        for row, adjusted in zip(rows, holm([row.p for row in rows]), strict=True):
+            if row.off and adjusted > TAIL:
+                row.status = "undecided"
 
 
 def not_run(check: str, what: str, reason: str) -> Comparison:
@@ -167,6 +161,11 @@ def shares_compared(
         check, what, "difference", interval, logs=p, twin=q, least=least, most=most,
         logs_rows=logs[1], twin_rows=twin[1], note=note,
     )  # fmt: skip
+
+
+def unflagged(check: str, what: str, reason: str) -> Flags:
+    """Return a check of rows that could not be made of any, with the reason."""
+    return Flags(check, what, np.zeros(0, np.int64), np.zeros(0, np.bool_), 0.0, reason)
 
 
 @dataclass(frozen=True)

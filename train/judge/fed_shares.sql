@@ -12,7 +12,7 @@ WITH fed AS (
         sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY side) AS share,
         sum(weight) / sum(sum(weight)) OVER (PARTITION BY side) AS effective_share
     FROM fed
-    GROUP BY ALL
+    GROUP BY side, source, condition
 )
 SELECT
     source,

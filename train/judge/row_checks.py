@@ -36,6 +36,7 @@ from restock.train.judge.fed_rows import (
     not_run,
     share_judged,
     shares_compared,
+    unflagged,
 )
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
@@ -153,14 +154,13 @@ def _progress(rows: FedRows) -> F64:
     return np.asarray(shorter)
 
 
-def outcomes(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
+def outcomes(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     """Check rewards, then ends."""
-    rng = np.random.default_rng([seed, 2])
-    yield from _rewards(logs, twin, rng)
+    yield from _rewards(logs, twin)
     yield from _ends(logs, twin)
 
 
-def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
+def _rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     what = "reward against the task's own, of the same observations"
     implied = implied_reward(logs)
     telling = np.abs(implied) > _TELLING  # False for NaN
@@ -171,7 +171,7 @@ def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> I
         return
     ratio = logs.reward[telling] / implied[telling]
     (scale,) = clustered_quantiles(
-        ratio, logs.cluster[telling], (0.5,), rng=rng, resamples=RESAMPLES
+        ratio, logs.cluster[telling], (0.5,), rng=np.random.default_rng([0, 2]), resamples=RESAMPLES
     )
     yield judged(
         "reward scale", what, "ratio", scale, logs=float(np.median(ratio)), twin=1.0,
@@ -255,16 +255,16 @@ _DRIVING_MPS = 0.25
 _FAR = 0.97  # of the lidar's range
 
 
-def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
+def values(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     """Check ranges and spreads of measured values, then the lidar's bearing and scale."""
     if twin is None:
         yield not_run("range", "values against the twin's", "no twin to compare with")
     else:
         few = len(np.unique(logs.episode)) < MIN_CLUSTERS
         for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:
-            for row in _entry(name, logs, twin, np.random.default_rng([seed, 4])):
+            for row in _entry(name, logs, twin, np.random.default_rng([0, 4])):
                 yield replace(row, status="undecided") if few and row.off else row
-    yield from _lidar(logs, twin, np.random.default_rng([seed, 3]))
+    yield from _lidar(logs, twin, np.random.default_rng([0, 3]))
 
 
 def _entry(
@@ -378,7 +378,7 @@ _ENDS = "termination of the row does not agree with its signals"
 
 def stored(
     store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
-) -> Iterator[Comparison | Flags]:
+) -> Iterator[Flags]:
     """Check commands, labels and terminations, in whole recordings of about 40,000 rows.
 
     `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
@@ -387,7 +387,7 @@ def stored(
     recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
     if not recordings:
         for check, what in (("labels", _LABELS), ("terminations", _ENDS)):
-            yield not_run(check, what, left_out)
+            yield unflagged(check, what, left_out)
         return
     steps = logged_steps(store, rows.task.hash, recordings)
     whole = _whole(steps)
@@ -456,9 +456,9 @@ def _whole(steps: LoggedSteps) -> Bools:
 
 def _labels(
     steps: LoggedSteps, whole: Bools, conditions: Sequence[Condition], note: str
-) -> Iterator[Comparison | Flags]:
+) -> Iterator[Flags]:
     if not whole.any():
-        yield not_run("labels", _LABELS, "no episode is stored whole")
+        yield unflagged("labels", _LABELS, "no episode is stored whole")
         return
     kept = np.flatnonzero(whole)
     ends = np.flatnonzero(whole[steps.ending])
@@ -476,7 +476,7 @@ def _labels(
     try:
         again = label(table, list(conditions))
     except ConfigError as error:
-        yield not_run("labels", _LABELS, str(error))
+        yield unflagged("labels", _LABELS, str(error))
         return
     is_row = order < len(kept)
     back = np.argsort(order[is_row])

@@ -74,7 +74,7 @@ class DiagnoseCommand:
         if found is not None:
             diagnosis = with_rows(diagnosis, found)
         if self.json:
-            of_rows = None if found is None else found.document()
+            of_rows = None if found is None else asdict(found)
             print_json(_document(diagnosis, self.places) | {"rows": of_rows})
         else:
             _show(diagnosis, self.places)
@@ -99,7 +99,7 @@ class DiagnoseCommand:
             else load_perturbation(self.perturbation),
         )
         if self.json:
-            print_json(diagnosis.document())
+            print_json(asdict(diagnosis))
         else:
             _show_rows(diagnosis)
         failed = self.check and diagnosis.verdict != "HEALTHY"
