@@ -1,4 +1,4 @@
-"""Pair the episodes that two policies both drove, and compare their success and return.
+"""Pair the episodes that two policies both drove, and compare their success.
 
 Differences are paired by episode: both policies drive the same episode, so only the policies
 differ.
@@ -6,14 +6,13 @@ differ.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from restock.stats import mean_over_strata
+from restock.stats import ConfidenceInterval, mean_over_strata
 from restock.train.run.kept_evaluations import cell_name, shown_evaluation
 from restock.train.run.run import Run
 
@@ -45,40 +44,40 @@ def by_cell(table: pa.Table) -> Episodes:
 
 
 def paired(first: Episodes, second: Episodes) -> list[dict[str, Any]]:
-    """Compare two policies on the episodes of both: a row per perturbation and condition.
+    """Compare success on the episodes of both policies: a row per perturbation and condition.
 
     Differences are those of the second, with 95 % intervals over episodes. The second is `worse` if
     its success is lower by more than `MARGIN` and the interval below 0, `better` if the interval is
-    above 0. From fewer than `MIN_EPISODES` neither is told: the row is `inconclusive`.
+    above 0. From fewer than `MIN_EPISODES` neither is told: the row is `inconclusive`. A task
+    without a goal has no rows.
     """
-    rngs = [np.random.default_rng(seed) for seed in (0, 1)]
+    rng = np.random.default_rng(0)
     driven = list(dict.fromkeys(perturbation for perturbation, _ in first))
     rows = []
     for cell in sorted(first, key=lambda cell: (driven.index(cell[0]), cell[1])):
         shared = sorted(first[cell].keys() & second.get(cell, {}).keys())
-        if not shared:
+        a, b = (np.array([of[cell][key][0] for key in shared]) for of in (first, second))
+        if not len(shared) or np.isnan(a + b).any():
             continue
-        pairs = np.array([[first[cell][key], second[cell][key]] for key in shared])  # (n, 2, 2)
-        row = {"perturbation": cell[0], "condition": cell[1], "episodes": len(shared)}
-        for place, (name, prefix) in enumerate((("success", ""), ("return", "return_"))):
-            a, b = pairs[:, :, place].T
-            means: list[float | None] = [float(a.mean()), float(b.mean()), None, None, None]
-            if np.isnan(pairs[:, :, place]).any():  # the task has no goal
-                means[:2] = None, None
-            else:
-                found = mean_over_strata([b - a], rng=rngs[place])
-                means[2] = found.value
-                if len(shared) >= MIN_EPISODES:
-                    means[3:] = found.low, found.high
-            names = (f"{prefix}difference{end}" for end in ("", "_low", "_high"))
-            row |= dict(zip((f"{name}_a", f"{name}_b", *names), means, strict=True))
-        rows.append(row | {"verdict": _verdict(row)})
+        difference = mean_over_strata([b - a], rng=rng)
+        few = len(shared) < MIN_EPISODES
+        rows.append(
+            {
+                "perturbation": cell[0],
+                "condition": cell[1],
+                "episodes": len(shared),
+                "success_a": float(a.mean()),
+                "success_b": float(b.mean()),
+                "difference": difference.value,
+                "difference_low": None if few else difference.low,
+                "difference_high": None if few else difference.high,
+                "verdict": "inconclusive" if few else _verdict(difference),
+            }
+        )
     return rows
 
 
-def _verdict(row: Mapping[str, Any]) -> Verdict:
-    if row["difference_low"] is None:
-        return "inconclusive"
-    if row["difference_high"] < 0 and row["difference"] < -MARGIN:
+def _verdict(difference: ConfidenceInterval) -> Verdict:
+    if difference.high < 0 and difference.value < -MARGIN:
         return "worse"
-    return "better" if row["difference_low"] > 0 else "no difference shown"
+    return "better" if difference.low > 0 else "no difference shown"

@@ -14,11 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -27,7 +25,6 @@ from restock.arrays import F64
 from restock.errors import RestockError, RunError, counted, quoted
 from restock.replay.fleet.panel_difference import diff_panels
 from restock.replay.panel.panel import Panel
-from restock.replay.store.query import rows_of
 from restock.stats import (
     ConfidenceInterval,
     difference_of_arms,
@@ -309,51 +306,28 @@ def last_evaluation(run: Run) -> pa.Table:
     return table.filter(pc.equal(table["gradient_steps"], last))
 
 
-Rows = list[dict[str, Any]]
-
-
-def diff_runs(first: Path | str, second: Path | str) -> dict[str, Any]:
-    """Return what is different in `second`, as `restock coverage diff --json` prints it.
+def diff_runs(a: Run, b: Run) -> dict[str, Any]:
+    """Return the settings and rows that differ in `b`, and the episodes that both drove.
 
     Raises:
-        RunError: one of them is missing or damaged, or they are of different tasks.
+        RunError: they are of different tasks.
     """
-    a, b = Run.open(first), Run.open(second)
     tasks = [str(run.document.get("task_hash")) for run in (a, b)]
     if tasks[0] != tasks[1]:
         raise RunError(
-            f"was trained on task {tasks[1]}, {first} on {tasks[0]}: their returns and episodes "
+            f"was trained on task {tasks[1]}, {a.path} on {tasks[0]}: their returns and episodes "
             "have different meanings",
-            where=str(second),
+            where=str(b.path),
             remedy="compare runs of one profile (`profile` in their configs)",
         )
-    settings = [asdict(difference) for difference in differences(a, b)]
-    source, evaluation, note = _evaluations(a, b)
+    try:
+        _, tables = _episodes([a, b])
+    except RunError:  # one was not evaluated
+        tables = []
     return {
-        "kind": "run",
-        "different": bool(settings) or any(row["difference"] for row in evaluation),
-        "a": _side(a),
-        "b": _side(b),
-        "settings": settings,
+        "settings": [asdict(difference) for difference in differences(a, b)],
         "panels": _panels(a, b),
-        "fed": _fed(a, b),
-        "ages": _ages(a, b),
-        "evaluated_by": source,
-        "evaluation": evaluation,
-        "evaluation_note": note,
-    }
-
-
-def _side(run: Run) -> dict[str, Any]:
-    progress = run.table("progress")
-    last = progress.slice(max(progress.num_rows - 1, 0)).to_pylist()
-    fed = run.document.get("panel") or {}
-    return {
-        "path": str(run.path),
-        "env_steps": last[0]["env_steps"] if last else 0,
-        "gradient_steps": last[0]["gradient_steps"] if last else 0,
-        "panel": fed.get("id"),
-        "task": run.document.get("task_hash"),
+        "evaluation": paired(*map(by_cell, tables)) if tables else [],
     }
 
 
@@ -370,36 +344,3 @@ def _panels(a: Run, b: Run) -> dict[str, Any] | None:
         return diff_panels(*panels)
     except RestockError as error:
         return {"note": str(error)}
-
-
-def _fed(a: Run, b: Run) -> Rows:
-    """Return a line per source and condition: its share of the rows drawn, plain and weighted."""
-    query = files("restock.train.judge").joinpath("fed_shares.sql")
-    with duckdb.connect() as connection:
-        for side, run in (("a", a), ("b", b)):
-            connection.register(f"fed_{side}", run.table("sampled_episodes"))
-        return rows_of(connection, query.read_text(encoding="utf-8"))
-
-
-def _ages(a: Run, b: Run) -> Rows:
-    """Return a line per source and unit: median and 90th percentile age in the last interval."""
-    lines: dict[tuple[str, str], dict[str, Any]] = {}
-    for side, run in (("a", a), ("b", b)):
-        table = run.table("ages")
-        for row in table.to_pylist():
-            key = row["source"], row["unit"]
-            line = lines.setdefault(key, {"source": key[0], "unit": key[1]})
-            line |= {f"{name}_{side}": row[name] for name in ("p50", "p90")}
-    empty = dict.fromkeys(("p50_a", "p50_b", "p90_a", "p90_b"))
-    return [{**empty, **line} for line in lines.values()]
-
-
-def _evaluations(a: Run, b: Run) -> tuple[str | None, Rows, str | None]:
-    """Return the episodes' origin and a line per perturbation and condition, or why none."""
-    try:
-        source, tables = _episodes([a, b])
-    except RunError as error:
-        return None, [], str(error)
-    rows = paired(*(by_cell(table) for table in tables))
-    none = "they have no episode in common: evaluate both with the same --seed"
-    return source, rows, None if rows else none

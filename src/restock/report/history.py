@@ -140,9 +140,9 @@ def _seen(path: Path) -> _Seen:
 
 
 def _change(before: Run, run: Run) -> dict[str, Any]:
-    """Return what `restock coverage diff` finds between two runs, or why it cannot."""
+    """Return what differs between two runs, or why they cannot be compared."""
     try:
-        return diff_runs(before.path, run.path)
+        return diff_runs(before, run)
     except RestockError as error:
         return {"why": str(error), "settings": [], "evaluation": []}
 
@@ -215,7 +215,6 @@ def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
             "settings": _settings(change["settings"]),
             "logs": "" if "why" in change else _logs(change["panels"]),
             "success": _outcome(change),
-            "restock compare": "" if "why" in change else change["comparable"]["algorithm"],
         }
         for (before, name), change in zip(itertools.pairwise(names), changes, strict=True)
     ]
@@ -224,7 +223,7 @@ def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
         "What changed from run to run?",
         intro="Each run beside the one before it: settings, rows of the panel, and conditions"
         " whose success differs by the 95 % interval over the missions that both drove. Another"
-        " training seed may change as much. `restock coverage diff RUN RUN` prints the whole.",
+        " training seed may change as much.",
         tables=[Table(table)],
     )
 

@@ -1,4 +1,4 @@
-"""`restock coverage diff`: compare two stores, versions, panels or runs."""
+"""`restock coverage diff`: compare two stores, versions or panels."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from typing import Annotated, Any
 
 from restock.cli import output
 from restock.cli.words import Positional
-from restock.errors import ExitCode, RestockError
+from restock.errors import ExitCode, RestockError, quoted
 
 
 @dataclass
 class DiffCommand:
-    """Show the differences between two stores, two versions of a store, two panels or two runs.
+    """Show the differences between two stores, two versions of a store, or two panels.
 
         restock coverage diff monday/ tuesday/
         restock coverage diff store@11 store        # versions; store@2026-11-01 is as of that day
         restock coverage diff panels/a panels/b
-        restock coverage diff runs/a runs/b
 
     Stores: recordings and episodes that were added or removed, rows whose labels changed, and the
-    shares of conditions, zones and policies. Panels: mixture, rows, shares and weights. Runs:
-    settings, what their critics were fed, and their evaluations side by side. Sources of different
-    tasks are refused, as their rows have different meanings. The command only reads.
+    shares of conditions, zones and policies. Panels: mixture, rows, shares and weights. Sources of
+    different tasks are refused, as their rows have different meanings. The command only reads.
+    `restock compare` compares runs.
     """
 
     first: Annotated[str, Positional("A")]
-    """The first (earlier) store, store@VERSION, panel or run."""
+    """The first (earlier) store, store@VERSION or panel."""
     second: Annotated[str, Positional("B")]
     """The second (later) one, of the same kind."""
     exit_code: bool = False
@@ -52,8 +51,7 @@ def _difference(first: str, second: str) -> dict[str, Any]:
     if len(set(kinds.values())) > 1:
         raise RestockError(
             f"{first} is a {kinds[first]}, {second} a {kinds[second]}",
-            remedy="give two stores, two panels or two runs; the store of a run or panel is in "
-            "its config.json or panel.json",
+            remedy="give two stores or two panels; a panel's store is in its panel.json",
         )
     kind = kinds[first]
     if kind == "panel":
@@ -62,9 +60,8 @@ def _difference(first: str, second: str) -> dict[str, Any]:
 
         return diff_panels(Panel.open(first), Panel.open(second))
     if kind == "run":
-        from restock.train.judge.compare import diff_runs
-
-        return diff_runs(Path(first), Path(second))
+        remedy = f"`restock compare {quoted(first)} {quoted(second)}` compares runs"
+        raise RestockError("is a run", where=first, remedy=remedy)
     from restock.replay.fleet.store_difference import diff_stores
     from restock.replay.store.store import Store
 
@@ -95,20 +92,11 @@ _STRATA = {
     **{"stratum": "stratum", "rows": "rows", "natural_share": "natural", "wanted_share": "wanted"},
     **{"share": "drawn", "effective_share": "weighted"},
 }
-_FED = {
-    **{"source": "source", "condition": "condition", "share": "drawn"},
-    **{"effective_share": "weighted", "episodes": "episodes"},
-}
-_EVALUATION = {
-    **{"perturbation": "perturbation", "condition": "condition", "episodes": "episodes"},
-    **{"success": "success", "difference": "difference", "return": "return"},
-    "return_difference": "of return",
-}
 
 
 def show(document: dict[str, Any]) -> None:
     """Print a difference of any kind."""
-    {"store": _print_stores, "panel": _print_panels, "run": _print_runs}[document["kind"]](document)
+    {"store": _print_stores, "panel": _print_panels}[document["kind"]](document)
 
 
 def _print_stores(document: dict[str, Any]) -> None:
@@ -157,27 +145,6 @@ def _print_panels(document: dict[str, Any]) -> None:
     section("strata: % of rows, wanted, drawn, after weights", strata)
 
 
-def _print_runs(document: dict[str, Any]) -> None:
-    _sides(document, ("env_steps", "gradient_steps", "panel"))
-    settings = [{**row, "a": row["first"], "b": row["second"]} for row in document["settings"]]
-    section("settings that differ", _lines(settings, _same("setting", "kind", "a", "b")))
-    if (panels := document["panels"]) is not None:
-        if "note" in panels:
-            output.print_text(f"panels: {panels['note']}")
-        else:
-            output.print_text("\nTheir panels:")
-            _print_panels(panels)
-    section("what the critics were fed, % of all rows drawn", _lines(document["fed"], _FED))
-    ages = _lines(document["ages"], _same("source", "unit", "p50", "p90"))
-    section("ages of the rows drawn, last interval", ages)
-    if document["evaluation_note"]:
-        output.print_text(f"evaluation: {document['evaluation_note']}")
-    section(
-        f"evaluation ({document['evaluated_by']}): paired differences b - a, 95 % over episodes",
-        _lines(document["evaluation"], _EVALUATION),
-    )
-
-
 def _sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
     heads = [f"{side}: {document[side]['path']}" for side in "ab"]
     output.print_table(
@@ -198,7 +165,7 @@ def _same(*names: str) -> dict[str, str]:
 
 
 def _lines(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:
-    """Return columns of the rows under titles: of both sides, or with an interval if they have."""
+    """Return columns of the rows under titles: of both sides, if they have those."""
     return [
         {title: value for name, of in columns.items() for title, value in _cells(row, name, of)}
         for row in rows
@@ -209,8 +176,6 @@ def _cells(row: dict[str, Any], name: str, title: str) -> Iterator[tuple[str, An
     if f"{name}_a" in row:
         for side in "ab":
             yield f"{title} {side}", _value(name, row[f"{name}_{side}"])
-    elif f"{name}_low" in row:
-        yield title, _with_interval(row, name)
     else:
         yield title, _value(name, row[name])
 
@@ -223,16 +188,6 @@ def _value(name: str, value: Any) -> Any:
         return value
     text = " ".join(str(value).split()) if value is not None else "(none)"
     return text if len(text) <= 100 or not sys.stdout.isatty() else f"{text[:99]}…"
-
-
-def _with_interval(row: dict[str, Any], name: str) -> str:
-    value, low, high = (row[key] for key in (name, f"{name}_low", f"{name}_high"))
-    if value is None:
-        return "no goal"
-    if value != value:
-        return "unknown"
-    known = low is not None and low == low
-    return f"{value:+.2f}" + (f" ({low:+.2f} to {high:+.2f})" if known else "")
 
 
 def _print_labels(labels: dict[str, Any]) -> None:
