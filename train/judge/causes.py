@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from statistics import median
 from typing import Any
@@ -42,7 +42,7 @@ _FIRST = (  # nothing can be told of rows before these
 # What one value shows, first what explains the others.
 OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, COPIED, HELD)
 _PARTS = ("shifted", "scaled", "biased", "spikes")  # of causes that mend alike, the first
-_UNDONE = {"opposite": "scaled", "reversed": "scaled", "early": "shifted"}  # else by its own name
+_UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # else by its own name
 _ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # by figures that should be 0
 _OPPOSITE, _NONE = -0.6, 0.3  # of what is expected, at most
 MENDED = 0.8  # of the stretches that break, those that hold once a cause is undone, at least
@@ -194,7 +194,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # the first of each figure
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
     scale, steps, bias = (*_distortion(end, off), 0.0)
-    kind, some, mended = "", named.get("stretches"), _mended(end, off)
+    kind, some, mended, in_part = "", named.get("stretches"), _mended(end, off), ""
     if all(one.holds for one in off):
         bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
         kind = _of_all(end, scale, steps, off, named)
@@ -205,25 +205,27 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         share, by = mended[best]
         if share >= MENDED:
             scale, steps, bias = (by * (best == one) for one in ("scaled", "shifted", "biased"))
+            kind, in_part = best, TABLES.in_part.format(some=some)
             if best == "scaled" and by < _NONE:
-                best = "opposite" if by < _OPPOSITE else "still"
-            kind = "part " + best
+                kind = "reversed" if by < _OPPOSITE else "still"
     gain = 1 / scale if scale else math.inf
     units = ((scale, ""), (gain, "the inverse of "))
     unit = [f": {inverse}{name}?" for by, inverse in units for (low, high), name in _UNITS
             if low <= by <= high]  # fmt: skip
     turn, arm = (row.effect or 0.0 if (row := named.get(one)) else 0.0 for one in ("turn", "arm"))
     degrees = math.degrees(math.atan(turn))
-    return TABLES.ends[kind or "unlike"].finding(
-        tuple(row.check for row in rows), end=end, key=TABLES.keys[end], scale=scale, some=some,
+    found = TABLES.ends[kind or "unlike"].finding(
+        tuple(row.check for row in rows), end=end, key=TABLES.keys[end], scale=scale,
         what="ACTIONS" if is_action else "SENSOR", scaled="COMMAND" if is_action else "SENSOR",
         way=TABLES.ways.get(end, TABLES.ways["actions"]), unit="".join(unit[:1]), gain=gain,
-        steps=abs(steps), late="late" if steps > 0 else "early",
+        steps=round(abs(steps), 1), late="late" if steps > 0 else "early",
+        mirrored="MIXED" if in_part else "MIRRORED",
         seconds=abs(steps) * task.control_period_s, degrees=abs(degrees),
         side="left" if degrees > 0 else "right", arm=arm, bias=bias, rate=off[0].relation.unit,
         unlike="ACTIONS_MIXED" if is_action else "SENSOR_MIXED" if some else "UNLIKE_TWIN",
         does="do" if end in GROUPS else "does", how=_how(end, off, named),
     )  # fmt: skip
+    return replace(found, text=in_part + found.text)
 
 
 def _of_all(
@@ -235,7 +237,7 @@ def _of_all(
         kind = "opposite" if is_action else "reversed"
         return kind if _surely_reversed(off) else ""
     if _is_shift(scale, steps):
-        return "early" if is_action and steps < 0 else "shifted"
+        return "shifted"
     if scale != 1:  # no scale mends a zero, and a lidar's is in what it is compared with, too
         return "scaled" if "offset" not in named and end != LIDAR else ""
     return next((kind for figure, kind in _ZEROS.items() if figure in named), "")
@@ -345,6 +347,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class _Tables:
+    in_part: str
     keys: dict[str, str]
     ways: dict[str, str]
     follow: dict[str, tuple[str, ...]]
