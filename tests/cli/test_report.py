@@ -7,20 +7,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import vl_convert
 from support.page_scripts import Page, charts_of
 from support.panels import EVERY, NO_SPLIT, panel_of
-from support.stores import TASK, recording_transitions, with_clear_view, write_store
+from support.stores import TASK
 
 from restock import cli
 from restock.errors import RunError
-from restock.replay.store.store import Store
 from restock.report import build_report
-from restock.report.look.blocks import ask, statements
 from restock.report.run.facts import Facts, evaluation_bias, gather
 from restock.report.run.headline import headline
 from restock.report.run.page import floor_section, success
@@ -28,7 +25,6 @@ from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
-from restock.train.twin.floors.occupancy_grid import into_frame
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -226,32 +222,12 @@ def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> Facts:
 def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> None:
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
-    for ended_on, failed in (("hall.toml", 18), ("default", 0)):
-        section = floor_section(_on_floors(run, tmp_path / f"on {ended_on}", str(hall), ended_on))
-        assert section is not None
-        (figure,) = section.figures
-        assert 'rect width="800" height="200"' in figure.drawing.svg[470]
-        assert figure.drawing.svg[470].count('stroke-width="3.4"') == failed
-
-
-def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
-    table = with_clear_view(recording_transitions(1))
-    store = write_store(tmp_path / "store", [table])
-    origin = (1.5, -2.0, 0.7)
-    x_m, y_m, yaw_rad = origin
-    recordings = [table["recording_id"][0].as_py(), "none"]
-    query = statements("restock.report.run", "store.sql")["visited"]
-    with Store(store) as opened:
-        cells = ask(
-            opened.connection, query, cell_m=1e-3, recordings=recordings,
-            x_m=x_m, y_m=y_m, yaw_rad=yaw_rad,
-        )  # fmt: skip
-    poses = np.column_stack([table[name].to_numpy() for name in ("pose_x_m", "pose_y_m")])
-    expected = into_frame(poses[np.isfinite(poses).all(axis=1)], origin)
-    assert sum(row["rows"] for row in cells) == len(expected)
-    found = np.array([(row["x_m"], row["y_m"]) for row in cells for _ in range(row["rows"])])
-    for axis in (0, 1):
-        np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
+    section = floor_section(_on_floors(run, tmp_path / "hall", str(hall), "hall.toml"))
+    assert section is not None
+    (figure,) = section.figures
+    assert 'rect width="800" height="200"' in figure.drawing.svg[470]
+    assert figure.drawing.svg[470].count('stroke-width="3.4"') == 18
+    assert floor_section(_on_floors(run, tmp_path / "default", str(hall), "default")) is None
 
 
 def test_the_verb_writes_the_page(run, tmp_path, shell):

@@ -19,9 +19,9 @@ MAP_PX = 470
 def draw(
     size_m: tuple[float, float],
     racks: Sequence[tuple[float, float, float, float]],
-    cells: Sequence[Row],
-    cell_m: float,
-    logged: Sequence[Row],
+    cells: Sequence[Row] = (),
+    cell_m: float = 0.0,
+    logged: Sequence[Row] = (),
     failures: Sequence[Row] = (),
 ) -> tuple[Drawing, Markup]:
     """Draw where the logs have been, where rare conditions were logged and where the agent failed.

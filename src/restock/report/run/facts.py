@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import duckdb
-import numpy as np
 
 from restock.errors import RestockError, RunError
 from restock.files import read_table
@@ -27,12 +27,9 @@ from restock.train.run.run_profile import run_panel
 from restock.train.twin.calibration.twin_gap import TwinGap, gap_folder, read_gap
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
-from restock.train.twin.floors.placed import COMPARED, logged_drives, placed_on
 
 PACKAGE = "restock.report.run"
-CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined."
-MAX_DOTS = 1500
 _TABLES = (  # of a run, which run.sql reads
     *("strata", "conditions", "ages", "policies", "practice"),
     *("evaluations", "probe", "progress"),
@@ -68,11 +65,7 @@ class Facts:
     off_policy: Rows  # off-policy estimates, over all conditions
     teacher: Rows  # what its filter did in the last interval
     panel: Panel | None = None
-    floor: Warehouse | None = None  # the floor that is drawn
-    floors: int = 1  # number of floors that the run drives on
-    visited: Rows = field(default_factory=list)  # cells of the floor, by recordings in its frame
-    rare: Rows = field(default_factory=list)  # where rare conditions were logged there
-    elsewhere: int = 0  # recordings in other frames
+    floors: Sequence[Warehouse] = ()  # that the run drives on
     logged: Rows = field(default_factory=list)  # share of logged episodes per condition
     gap: TwinGap | None = None  # between the twin and the logs
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
@@ -148,6 +141,7 @@ def gather(path: Path) -> Facts:
     if not facts.cells and twin:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
+    facts.floors = _floors(facts)
     facts.gap = _find_gap(facts)
     return facts
 
@@ -194,37 +188,15 @@ def _add_panel(facts: Facts) -> None:
         )
         assert held is not None
         with Store(held.header.store) as store:
-            _add_floor(facts, held, store)
-            facts.logged = _store_rows(store, "logged")
+            query = statements(PACKAGE, "store.sql")["logged"]
+            facts.logged = ask(store.connection, query)
     except RestockError as error:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
 
 
-def _add_floor(facts: Facts, panel: Panel, store: Store) -> None:
-    """Add the floor that is drawn, the first with logs, and what was logged there."""
-    floors = _floors(facts)
-    if not floors:
-        return
-    recordings, rows = np.unique(panel.meta_column("recording_id").astype(str), return_counts=True)
-    largest = recordings[np.argsort(-rows, kind="stable")][:COMPARED].tolist()
-    drives = logged_drives(store.connection, panel.task, largest)
-    on = {
-        floor.name: [name for name, drive in drives.items() if placed_on(floor, drive)]
-        for floor in floors
-    }
-    facts.floor = next((floor for floor in floors if on[floor.name]), floors[0])
-    facts.floors = len(floors)
-    here = on[facts.floor.name]
-    facts.elsewhere = len(drives) - len(here)
-    x_m, y_m, yaw_rad = facts.floor.map_origin
-    frame = {"recordings": here, "x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}
-    facts.visited = _store_rows(store, "visited", cell_m=CELL_M, **frame)
-    facts.rare = _store_rows(store, "rare", most=MAX_DOTS, **frame)
-
-
 def _floors(facts: Facts) -> tuple[Warehouse, ...]:
     """Return the run's floors; none if it drove on none, or they cannot be read."""
-    layouts = facts.config["config"].get("env", {}).get("layouts", DEFAULT)
+    layouts = facts.config.get("config", {}).get("env", {}).get("layouts", DEFAULT)
     if not facts.twin and layouts == DEFAULT:  # the logs are of another floor
         return ()
     try:
@@ -232,10 +204,6 @@ def _floors(facts: Facts) -> tuple[Warehouse, ...]:
     except RestockError as error:
         facts.missing.append(f"The floor is not drawn, since it could not be read: {error}")
         return ()
-
-
-def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:
-    return ask(store.connection, statements(PACKAGE, "store.sql")[name], **parameters)
 
 
 def mean_success(cells: Rows) -> float:

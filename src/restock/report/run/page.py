@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from typing import Any
 
 import msgspec
@@ -14,7 +15,7 @@ from restock.replay.plan.exclusions import DAY_NS
 from restock.replay.sampling.rules import RULES
 from restock.report.look import charts, floor_map
 from restock.report.look.blocks import Figure, Rows, Section, Table, cell, pretty, shown, words
-from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
+from restock.report.run.facts import NO_GOAL, Facts, evaluation_bias
 from restock.report.run.headline import headline, judged_section, lead, losses, off_policy_table
 from restock.report.run.twin_gap import run_section
 from restock.train.run.kept_evaluations import cell_name, measured_row
@@ -349,40 +350,33 @@ def provenance(facts: Facts) -> Section:
 
 
 def floor_section(facts: Facts) -> Section | None:
-    """Show on the map where the logs have been, and where the agent failed."""
-    layout = facts.floor
-    if layout is None:
+    """Show on the floor where the agent failed; on the one of most failures, if there are several.
+
+    None if it did not fail.
+    """
+    clean = [row for row in facts.failures if row["perturbation"] == "none"]
+    names = {floor.name for floor in facts.floors}
+    failed = Counter(row["layout"] for row in clean if row["layout"] in names)
+    if not failed:
         return None
-    racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in layout.racks]
-    failures = [
-        row
-        for row in facts.failures
-        if row["perturbation"] == "none" and row["layout"] == layout.name
-    ]
+    ((name, episodes),) = failed.most_common(1)
+    layout = next(floor for floor in facts.floors if floor.name == name)
     drawing, legend = floor_map.draw(
         (layout.width_m, layout.depth_m),
-        racks,
-        facts.visited,
-        CELL_M,
-        facts.rare,
-        failures,
+        [(r.x_min, r.y_min, r.x_max, r.y_max) for r in layout.racks],
+        failures=[row for row in clean if row["layout"] == name],
     )
-    first = f", the first of {facts.floors} with logs" if facts.floors > 1 else ""
     notes = [
-        f"{sum(row['rows'] for row in facts.visited):,} logged steps, stronger where there are "
-        "more (logarithmic); dots are rare conditions in the logs, crosses the agent's "
-        f"{counted(len(failures), 'failed clean episode')}; the bar is {floor_map.BAR_M} m. Drawn "
-        f"on the run's floor, {layout.name}{first}."
+        f"Crosses are the ends of the agent's {counted(episodes, 'failed clean episode')}; the bar"
+        f" is {floor_map.BAR_M} m. Drawn on the floor {name}."
     ]
-    if facts.elsewhere:
-        notes.append(f"Not drawn: {counted(facts.elsewhere, 'recording')} in other frames.")
     if layout.starts_m:
         notes.append(
             f"Its missions start at {len(layout.starts_m)} places where the robot was in the logs, "
             f"and go to {len(layout.goals)}."
         )
     caption = legend + Markup("<br>") + " ".join(notes)
-    return Section("map", "Where did it happen?", figures=[Figure(drawing, caption=caption)])
+    return Section("map", "Where did it fail?", figures=[Figure(drawing, caption=caption)])
 
 
 FILMS, FILMS_FILE = "eval/films", "films.json"
