@@ -69,13 +69,6 @@ def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> Non
         load_ope_dataset(None, TASK)
 
 
-def test_without_a_panel_half_the_episodes_are_evaluated_on(store: Path) -> None:
-    dataset = load_ope_dataset(None, TASK, str(store))
-    assert len(dataset.evaluation.condition) + len(dataset.training.condition) == 24
-    assert len(dataset.evaluation.condition) > 3
-    assert "no panel" in dataset.notes[0]
-
-
 def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
     table = recording_transitions(1)
     stops = table["terminated"].to_numpy() & (table["episode_index"].to_numpy() % 3 == 0)

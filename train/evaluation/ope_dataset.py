@@ -90,45 +90,37 @@ def load_ope_dataset(
     """Load episodes that a run did not learn from, and the rows that it did.
 
     Args:
-        trained: the panel that the run learnt from. For a run without one the models are fitted
-            on half of the episodes of `logs`, chosen by hash.
+        trained: the panel that the run learnt from; the models are fitted on its rows.
         task: that the run was trained on.
         logs: a store, or a panel, whose held-out rows then count; default the run's own panel.
         seed: of the choice of rows for the models, where there are many.
 
     Raises:
-        RunError: no episode is left, or the logs are of another task.
+        RunError: the run had no panel, no episode is left, or the logs are of another task.
         StoreError, PanelError: no store or panel there, or it is no longer what it was.
     """
-    if logs is None and trained is None:
-        raise RunError("did not learn from a panel", remedy="give logs with --on-logs STORE")
+    if trained is None:
+        raise RunError(
+            "did not learn from a panel, whose rows the models are fitted on",
+            remedy="evaluate it in the twin: `restock eval RUN`",
+        )
     notes: list[str] = []
     with ExitStack() as opened:
         store, ids = _open(logs, trained, task)
         opened.enter_context(store)
-        if trained is None:
-            ids, training_ids = _halves(store, ids)
-            training_store = store
-            notes.append("the run had no panel: the models are fitted on one half of the episodes")
-        elif logs is None and trained.header.split_by == "within_episode":
+        training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
+        if logs is None and trained.header.split_by == "within_episode":
             notes.append(f"held out: {trained.header.split_note}, not whole episodes")
-            training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
-            training_store = opened.enter_context(panel_store(trained))
         else:
             ids, left_out = _unseen(store, trained, ids)
             if left_out:
                 notes.append(f"{left_out:,} episodes left out: some of their rows were trained on")
-            training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
-            training_store = store if logs is None else opened.enter_context(panel_store(trained))
+        training_store = store if logs is None else opened.enter_context(panel_store(trained))
         if not len(ids) or not len(training_ids):
             raise RunError(
                 "contains no episode that the run did not learn from"
-                + (
-                    f" (held out: {trained.header.split_note})"
-                    if trained is not None and _unsplit(trained)
-                    else ""
-                ),
-                where=logs or (str(trained.path) if trained is not None else None),
+                + (f" (held out: {trained.header.split_note})" if _unsplit(trained) else ""),
+                where=logs or str(trained.path),
                 remedy="mix with [evaluation_split] share above 0, or name other logs with"
                 " --on-logs",
             )
@@ -153,9 +145,9 @@ def load_ope_dataset(
     return OpeDataset(training, evaluation, tuple(notes), hindsight)
 
 
-def _unsplit(trained: Panel | None) -> bool:
+def _unsplit(trained: Panel) -> bool:
     """Return whether a panel's logs had no rows to hold out."""
-    return trained is not None and not trained.splits and bool(trained.header.split_note)
+    return not trained.splits and bool(trained.header.split_note)
 
 
 def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
@@ -168,9 +160,9 @@ def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
     return bool(found)
 
 
-def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, Ints]:
+def _open(logs: str | None, trained: Panel, task: Task) -> tuple[Store, Ints]:
     """Open the store of the logs, and return the ids of the rows in question."""
-    panel = trained
+    panel: Panel | None = trained
     if logs is not None:
         location = Location.of(logs)
         folder = location.folder
@@ -297,14 +289,3 @@ def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
             " SEMI JOIN wanted USING (transition_id) ANTI JOIN trained USING (episode_id)"
         ).fetchnumpy()["transition_id"]
     return np.asarray(rest, np.int64), int(left_out)
-
-
-def _halves(store: Store, ids: Ints) -> tuple[Ints, Ints]:
-    """Split episodes by their hash into rows to evaluate on and rows for the models."""
-    with passed_in(store.connection, wanted=pa.table({"transition_id": ids})):
-        columns = store.connection.sql(
-            "SELECT transition_id, hash(episode_id) % 2 = 0 AS evaluation"
-            " FROM transitions SEMI JOIN wanted USING (transition_id)"
-        ).fetchnumpy()
-    rows, evaluation = np.asarray(columns["transition_id"], np.int64), columns["evaluation"]
-    return rows[evaluation], rows[~evaluation]
