@@ -70,12 +70,11 @@ class Comparison:
     checks: list[Check]  # of the feed
     source: str | None  # of the outcomes: restock eval, or the training's own evaluations
     rows: list[dict[str, Any]]
-    identical: bool = False  # both arms are the same runs: comparable whatever the checks show
 
     @property
     def deciding_checks(self) -> list[Check]:
         """Return the checks that decide: those of the feed too, unless it is the treatment."""
-        return [] if self.identical else _deciding(self.treatment, self.totals, self.checks)
+        return _deciding(self.treatment, self.totals, self.checks)
 
     @property
     def why(self) -> str:
@@ -103,8 +102,6 @@ class Comparison:
     @property
     def sentence(self) -> str:
         """Say what the checks came to."""
-        if self.identical:
-            return "COMPARABLE: both sides are the same runs"
         if self.verdict != "comparable":
             undecided = ", inconclusive" if self.verdict == "inconclusive" else ""
             return f"REFUSED{undecided}: {self.why}"
@@ -121,7 +118,6 @@ class Comparison:
         return {
             "treatment": self.treatment,
             "verdict": self.verdict,
-            "identical": self.identical,
             "why": self.why,
             "refused": [difference.setting for difference in self.refused],
             "differences": [asdict(difference) for difference in self.differences],
@@ -143,18 +139,16 @@ def compare(
 ) -> Comparison:
     """Compare the runs of two arms.
 
-    The same runs on both sides are comparable by identity.
-
     Raises:
         RunError: a run is missing, has no updates, or does not belong to its arm; two of an arm
-            are one run or have one seed; an arm has no run; or only some of the runs are in both
-            arms. Also an unknown treatment.
+            are one run or have one seed; an arm has no run; or a run is in both arms. Also an
+            unknown treatment.
     """
     if treatment not in ALLOWED:
         what = f"there is no treatment {treatment!r}"
         raise RunError(what, remedy=f"choose from {', '.join(ALLOWED)}")
     arms = Arm("first", first), Arm("second", second)
-    identical = _identical(*arms)
+    _refuse_shared(*arms)
     rng = np.random.default_rng(seed)
     differing = [d for d in differences(arms[0].runs[0], arms[1].runs[0]) if d.kind != "free"]
     allowed = ALLOWED[treatment] | {"software"}
@@ -163,26 +157,19 @@ def compare(
     checks = check_feeds(*feeds(*arms), rng)
     deciding = _deciding(treatment, totals, checks)
     verdict = "incomparable" if refused else worst([check.verdict for check in deciding])
-    if identical:  # what was fed is the same by identity: there is nothing to estimate
-        verdict = "comparable"
     source, rows = _outcomes(*arms) if verdict == "comparable" else (None, [])
-    return Comparison(
-        treatment, verdict, differing, refused, totals, checks, source, rows, identical
-    )
+    return Comparison(treatment, verdict, differing, refused, totals, checks, source, rows)
 
 
-def _identical(first: Arm, second: Arm) -> bool:
-    """Return whether both arms are the same runs; raise RunError if only some are in both."""
-    both = [(a, b) for a in first.runs for b in second.runs if same_run(a, b)]
-    if both and not len(both) == len(first.runs) == len(second.runs):
-        a, b = both[0]
+def _refuse_shared(first: Arm, second: Arm) -> None:
+    """Raise RunError if a run, or a copy of it, is in both arms."""
+    for a, b in ((a, b) for a in first.runs for b in second.runs if same_run(a, b)):
         copy = "" if a.path.resolve() == b.path.resolve() else f" as a copy of {a.path}"
         raise RunError(
             f"is in both arms{copy}: the arms then vary together",
             where=str(b.path),
             remedy="leave it out of one of them",
         )
-    return bool(both)
 
 
 def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:

@@ -84,9 +84,7 @@ def _show(comparison: Comparison, names: tuple[str, str]) -> None:
     from restock.report import gate_section, outcome_section
 
     found = plain(comparison.as_json())
-    # Too few episodes show nothing of the same runs.
-    checks = [] if comparison.identical else found["checks"]
-    failed = [check for check in checks if check["verdict"] != "comparable"]
+    failed = [check for check in found["checks"] if check["verdict"] != "comparable"]
     print_sections([gate_section({**found, "checks": failed}, *names)], folded=True)
     say(comparison.sentence)
     if comparison.rows:
