@@ -170,7 +170,7 @@ class Relation:
     y: str
     lags: Ints
     of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
-    gain: float | None = 1.0  # by definition, where there is no twin to ask
+    defined: bool = True  # x is y, so that the gain is 1 where there is no twin to ask
     zero: str = ""  # instead of a gain, a figure of this name, which is 0 in the twin too
     most: float = GAIN  # times the twin's gain, or its inverse
     offset: float = math.inf  # most of y where x is 0, less the twin's, in y's unit
@@ -353,16 +353,16 @@ RELATIONS = (
     Relation("motion of the pose to its turn", POSE, POSE, NOW, lambda rows: _swinging(rows),
              zero="arm", most=ARM_M),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
-             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None,
+             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), False,
              offset=BIAS_MPS2, unit="m/s2"),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
-             lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), None),
+             lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), False),
     Relation("remaining distance to the speed of the pose", POSE, PLAN, PLANS,
-             lambda rows: (rows.after("localised_speed"), _route_speed(rows)), None),
+             lambda rows: (rows.after("localised_speed"), _route_speed(rows)), False),
     Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
-             lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), None),
+             lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), False),
     Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, NOW,
-             lambda rows: _scan_flow(rows, wheel_turn(rows)), None),
+             lambda rows: _scan_flow(rows, wheel_turn(rows)), False),
 )  # fmt: skip
 
 
@@ -409,7 +409,7 @@ class Answer:
     def holds(self) -> bool:
         """Return whether a scale, a delay and a zero of its own make the relation hold."""
         left = self.found.unexplained if self.found is not None else 0.0
-        return not self.is_off("unexplained") and (self.relation.gain is None or left <= _LEFT)
+        return not self.is_off("unexplained") and (not self.relation.defined or left <= _LEFT)
 
     @property
     def fine(self) -> bool:
@@ -448,17 +448,27 @@ def _answer(
             least=-relation.most, most=relation.most, logs_rows=found.rows,
         )  # fmt: skip
         return Answer(relation, [row], 1.0, 0.0)
-    if found is None or (twin is not None and expected is None):
+    if found is None or (expected is None and (twin is not None or not relation.defined)):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")
+        if found is not None and twin is None:
+            reason = "no twin to compare with"
         row = not_run(f"gain: {name}", what, reason)
         return Answer(relation, [row], float("nan"), 0.0, rows=logs)
-    if expected is None:
-        return _by_definition(relation, found, what, logs)
     most, most_left = (
-        (relation.most, UNEXPLAINED)
-        if relation.gain is not None
-        else (NOISY_GAIN, NOISY_UNEXPLAINED)
+        (relation.most, UNEXPLAINED) if relation.defined else (NOISY_GAIN, NOISY_UNEXPLAINED)
     )
+    if expected is None:  # a speed equals a speed, and commands precede what they cause
+        gain = interval_of(found.gain, found.gains, found.clusters)
+        delay = interval_of(found.delay, found.delays, found.clusters)
+        made = [judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,
+                       least=1 / most, most=most, logs_rows=found.rows)]  # fmt: skip
+        if abs(gain.value) > _KNOWN_GAIN:
+            made.append(
+                judged(f"delay: {name}", what, "steps later", delay, logs=found.delay, twin=None,
+                       least=-DELAY_STEPS, most=LATEST_STEPS, logs_rows=found.rows)
+            )  # fmt: skip
+        over = min(max(found.delay, 0.0), LATEST_STEPS)
+        return Answer(relation, made, gain.value, found.delay - over, logs, found)
     fewer = min(found.clusters, expected.clusters)
     gain = ratio_of(found.gains, expected.gains, (found.gain, expected.gain), fewer)
     delay = difference_of(found.delays, expected.delays, (found.delay, expected.delay), fewer)
@@ -497,28 +507,6 @@ def _answer(
     )  # fmt: skip
     by = delay.value if timed else 0.0
     return Answer(relation, made, gain.value, by, logs, found)
-
-
-def _by_definition(relation: Relation, found: Response, what: str, logs: FedRows) -> Answer:
-    """Judge without a twin: a speed equals a speed, and commands precede what they cause."""
-    name = relation.name
-    if relation.gain is None:
-        row = not_run(f"gain: {name}", what, "no twin to compare with")
-        return Answer(relation, [row], float("nan"), 0.0)
-    of_unit = found.gain / relation.gain, found.gains / relation.gain
-    gain = interval_of(*of_unit, found.clusters)
-    delay = interval_of(found.delay, found.delays, found.clusters)
-    made = [
-        judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,
-               least=1 / relation.most, most=relation.most, logs_rows=found.rows),
-    ]  # fmt: skip
-    if abs(gain.value) > _KNOWN_GAIN:
-        made.append(
-            judged(f"delay: {name}", what, "steps later", delay, logs=found.delay, twin=None,
-                   least=-DELAY_STEPS, most=LATEST_STEPS, logs_rows=found.rows)
-        )  # fmt: skip
-    over = min(max(found.delay, 0.0), LATEST_STEPS)
-    return Answer(relation, made, gain.value, found.delay - over, logs, found)
 
 
 def held_motion(rows: FedRows) -> list[F64]:

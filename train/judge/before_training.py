@@ -69,52 +69,44 @@ class Part:
 
 
 def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
-    """Return all rows, then each robot's and each recording's, if several have enough rows."""
+    """Return all rows, then each robot's and each recording's, if several have enough rows.
+
+    Recordings are compared by themselves if each is long enough, else with those around them, or
+    by robot if all are tagged with theirs.
+    """
     parts = [Part("", "", logs)]
-    recordings = len(np.unique(logs.recording))
-    if recordings < 2:
+    recordings, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
+    if len(recordings) < 2:
         return parts, None
-    part, kind = _parts(logs)
-    robots = np.char.add("robot ", logs.robot)
-    levels = [(part, kind)]
-    if len(np.unique(logs.robot)) > 1 and (logs.robot != "").all() and kind != "robots":
-        levels.insert(0, (robots, "robots"))
-        if len(np.unique(part)) == len(np.unique(robots)):  # a recording each
-            levels.pop()
+    robots, short = np.unique(logs.robot), (rows < MIN_ROWS)[place.reshape(-1)]
+    levels = []
+    if len(robots) > 1 and "" not in robots:
+        levels.append(("robots", np.char.add("robot ", logs.robot)))
+    if not levels or (len(robots) < len(recordings) and not short.any()):
+        kind, part = "recordings", logs.recording.astype(object)
+        if short.any():
+            kind, part[short] = "groups of recordings", _by_start(logs.take(short))
+        levels.append((kind, part.astype(np.str_)))
     compared = []
-    for names_of, each in levels:
-        names, rows = np.unique(names_of, return_counts=True)
+    for kind, part in levels:
+        names, rows = np.unique(part, return_counts=True)
         chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= MIN_ROWS).sum(), MOST)]
         if len(chosen) > 1:
-            parts += [Part(name, each, logs.take(names_of == name)) for name in chosen.tolist()]
-            inside = np.unique(logs.recording[np.isin(names_of, chosen)])
+            parts += [Part(name, kind, logs.take(part == name)) for name in chosen.tolist()]
+            inside = np.unique(logs.recording[np.isin(part, chosen)])
             compared.append(
-                f"{len(chosen)} {each} with {MIN_ROWS} rows were compared: {len(inside)} of"
-                f" {recordings} recordings"
+                f"{len(chosen)} {kind} with {MIN_ROWS} rows were compared: {len(inside)} of"
+                f" {len(recordings)} recordings"
             )
-    what = f"each of the {kind} by itself"
+    what = f"each of the {levels[-1][0]} by itself"
     if not compared:
-        reason = f"there are no two {kind} with {MIN_ROWS} rows"
+        reason = f"there are no two {levels[-1][0]} with {MIN_ROWS} rows"
         return parts, not_run(RECORDINGS_CHECK, what, reason)
     rows_compared = sum(len(one.rows) for one in parts[1:] if one.kind == parts[1].kind)
     return parts, Comparison(
         RECORDINGS_CHECK, what, "recordings", "ok", logs_rows=rows_compared,
         note="; ".join(compared),
     )  # fmt: skip
-
-
-def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
-    """Return the part that each row (N,) is compared with, and the names of the parts."""
-    place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)[1:]
-    is_short = (rows < MIN_ROWS)[place.reshape(-1)]
-    tagged = is_short & (logs.robot != "")
-    part = np.where(tagged, np.char.add("robot ", logs.robot), logs.recording).astype(object)
-    untagged = is_short & ~tagged
-    if untagged.any():
-        part[untagged] = _by_start(logs.take(untagged))
-        return part.astype(np.str_), "groups of recordings"
-    kind = "recordings" if not tagged.any() else "robots" if is_short.all() else ""
-    return part.astype(np.str_), kind or "recordings and robots"
 
 
 def _by_start(logs: FedRows) -> NDArray[np.str_]:

@@ -66,7 +66,7 @@ def _allowed(relation: Relation) -> list[tuple[str, float, float]]:
     """Return the figures in which robots may be compared, and their ranges beside the others."""
     if relation.y == ends.PLAN:  # where robots are sent differs
         return []
-    gain = GAIN if relation.most == ends.ALIKE else NOISY if relation.gain is None else ANSWER
+    gain = GAIN if relation.most == ends.ALIKE else ANSWER if relation.defined else NOISY
     return [
         ("gain", 1 / gain, gain),
         ("delay", -_DELAY_STEPS, _DELAY_STEPS),

@@ -146,7 +146,7 @@ def _mends(check: str, answers: Sequence[Answer]) -> bool:
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
     """Return the ends that faulty relations have in common, each with those relations."""
     left = [one for one in answers if one.off]
-    fine = [one for one in answers if one.fine and one.relation.gain is not None]
+    fine = [one for one in answers if one.fine and one.relation.defined]
     names = dict.fromkeys(end for one in left for end in (one.relation.x, one.relation.y))
     candidates = {name: (name,) for name in names} | GROUPS
     odd: dict[str, list[Answer]] = {}

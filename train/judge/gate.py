@@ -123,25 +123,21 @@ class Cell:
     measure: Measure
     margin: float  # in the measure's unit
     error_high: float  # of calling it worse
-    scale: float | None = None  # what the margin is of a difference; None before the first round
-    sequence: ConfidenceSequence | None = None
+    scale: float = 1.0  # what one unit of the margin is of a difference between two episodes
     pairs: int = 0
     unknown: int = 0  # pairs in which the measure says nothing
 
+    def __post_init__(self) -> None:
+        self.sequence = ConfidenceSequence(
+            self.measure.bound,
+            -self.margin * self.scale,
+            variance=self.measure.variance,
+            error_low=ERROR,
+            error_high=self.error_high,
+        )
+
     def add(self, pairs: Sequence[tuple[EpisodeResult, EpisodeResult]]) -> None:
         """Take a round of pairs (policy, baseline) into account."""
-        if self.scale is None:
-            self.scale = _scale(self.measure, pairs)
-            self.sequence = ConfidenceSequence(
-                self.measure.bound,
-                -self.margin * self.scale,
-                variance=self.measure.variance,
-                error_low=ERROR,
-                error_high=self.error_high,
-            )
-            if self.measure.name == BUMPS:  # these pairs gave the scale: they decide nothing
-                return
-        assert self.sequence is not None
         for policy, baseline in pairs:
             self.pairs += 1
             if (better := self.measure.better(policy, baseline)) is None:
@@ -166,15 +162,13 @@ class Cell:
     @property
     def verdict(self) -> str:
         """Return what is shown here."""
-        if self.sequence is None or (self.sequence.above_at or self.sequence.below_at) is None:
-            return NOT_SHOWN
-        return NOT_WORSE if self.sequence.above_at is not None else WORSE
+        if self.sequence.above_at is not None:
+            return NOT_WORSE
+        return WORSE if self.sequence.below_at is not None else NOT_SHOWN
 
     def document(self) -> dict[str, Any]:
         """Return the cell as JSON values: differences and bounds in the measure's unit."""
-        of, scale = self.sequence, self.scale or 1.0
-        low = [value / scale for value in of.low] if of is not None else []
-        high = [value / scale for value in of.high] if of is not None else []
+        of, scale = self.sequence, self.scale
         return {
             "name": self.name,
             "layouts": self.layouts,
@@ -183,20 +177,18 @@ class Cell:
             "measure": self.measure.name,
             "unit": self.measure.unit,
             "margin": self.margin,
-            "pairs": len(low),
+            "pairs": of.pairs,
             "pairs_driven": self.pairs,
             "pairs_unknown": self.unknown,
-            "difference": of.mean / scale if of is not None and of.mean is not None else None,
-            "low": low[-1] if low else None,
-            "high": high[-1] if high else None,
+            "difference": None if of.mean is None else of.mean / scale,
+            "low": of.low[-1] / scale if of.low else None,
+            "high": of.high[-1] / scale if of.high else None,
             "verdict": self.verdict,
         }
 
 
-def _scale(measure: Measure, pairs: Sequence[tuple[EpisodeResult, EpisodeResult]]) -> float:
-    """Return what one unit of the margin is of a difference between two episodes."""
-    if measure.name != BUMPS:
-        return 1.0
+def _km_driven(pairs: Sequence[tuple[EpisodeResult, EpisodeResult]]) -> float:
+    """Return the kilometres that the baseline drove in an episode, on average."""
     km = [(baseline.distance_m or 0.0) / 1000 for _, baseline in pairs]
     return max(sum(km) / len(km), 1e-6)
 
@@ -428,8 +420,11 @@ def _drive(
             for measure, margin in gate.margins.items():
                 key = plan.layouts, name, condition, measure
                 if key not in cells:
+                    scale = _km_driven(several) if measure == BUMPS else 1.0
                     error = ERROR / gate.cells
-                    cells[key] = Cell(*key[:3], MEASURES[measure], margin, error)
+                    cells[key] = Cell(*key[:3], MEASURES[measure], margin, error, scale)
+                    if measure == BUMPS:  # these pairs gave the scale: they decide nothing
+                        continue
                 cells[key].add(several)
         for name, kind, _ in open_:
             missions[name, kind] += ROUND

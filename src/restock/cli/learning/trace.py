@@ -102,35 +102,19 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
     if origin.frames:
         files = list(dict.fromkeys(frame["file"] for frame in origin.frames))
         output.print_table(
-            [
-                {
-                    "camera": frame["camera"],
-                    "topic": frame["topic"],
-                    "frame": frame["frame_index"],
-                    "stamp_ns": frame["stamp_ns"],
-                    "age_s": frame["age_s"],
-                    "image": f"{frame['width']} x {frame['height']} {frame['encoding']}",
-                    "bytes": frame["size_bytes"],
-                }
-                for frame in origin.frames
-            ],
+            origin.frames,
+            ["camera", "topic", "frame_index", "stamp_ns", "age_s", "size_bytes"],
             title=f"the frames of its cameras, in {', '.join(files)}",
         )
         output.print_text()
     if origin.messages:
         output.print_parted(
             [
-                {
-                    "input": message.input,
-                    "topic": message.topic,
-                    "log_time_ns": message.log_time_ns,
-                    "stamp_ns": message.stamp_ns,
-                    "age_s": message.age_s,
-                    "max_age_s": message.max_age_s,
-                    "fields": "; ".join(f"{k} {_short(v)}" for k, v in message.fields.items()),
-                }
+                asdict(message)
+                | {"fields": "; ".join(f"{k} {_short(v)}" for k, v in message.fields.items())}
                 for message in origin.messages
             ],
+            ["input", "topic", "log_time_ns", "stamp_ns", "age_s", "max_age_s", "fields"],
             key=("input",),
             title="the messages from which it was made",
         )
