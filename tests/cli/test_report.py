@@ -20,7 +20,7 @@ from restock.errors import RunError
 from restock.report import build_report
 from restock.report.run.facts import Facts, evaluation_bias, gather
 from restock.report.run.headline import headline
-from restock.report.run.page import floor_section, success
+from restock.report.run.page import floor_section
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -264,30 +264,6 @@ def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
             build_report(place)
         assert refused.value.where == str(place)
         assert cli.main(["report", str(place)]) == 2
-
-
-def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_path: Path) -> None:
-    own = success(gather(run))
-    assert own is not None
-    copy = shutil.copytree(run, tmp_path / "run")
-    file = copy / "eval" / "episodes.parquet"
-    drawn = pq.read_table(file).to_pylist()
-    driven = [  # before the others, and of two ways in all
-        {**row, "layouts": "hall.toml, ways of the logs", "success": row["policy"] == "agent"}
-        for row in drawn
-        if row["episode_seed"] < 2 and row["condition"] == "nominal"
-    ]
-    named = [{**row, "layouts": "hall.toml"} for row in drawn]
-    pq.write_table(pa.Table.from_pylist([*driven, *named], schema=EVAL_EPISODES), file)
-    facts = gather(copy)
-    section = success(facts)
-    assert section is not None
-    *before, table = section.tables
-    assert [one.rows for one in before] == [one.rows for one in own.tables]
-    assert "4 of 84 episodes" in table.caption
-    shown = {row["policy"]: row["success"] for row in table.rows}
-    assert shown == {"agent": "1.00 [0.34, 1.00]", "planner": "0.00 [0.00, 0.66]"}
-    assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
 
 
 def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:

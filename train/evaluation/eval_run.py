@@ -26,7 +26,6 @@ from restock.toml import read_toml, typed
 from restock.train.dqn.config import LAST_SEED, TrainConfig, parse_config
 from restock.train.dqn.network import torch_threads
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
-from restock.train.evaluation.logged_ways import EVERY, HELD_OUT, LoggedMissions, logged_missions
 from restock.train.evaluation.policies import (
     CLONED,
     GreedyPolicy,
@@ -38,7 +37,6 @@ from restock.train.evaluation.policies import (
 )
 from restock.train.run.kept_evaluations import (
     LIMITED,
-    WAYS,
     CloneQuality,
     add_evaluation,
     read_clones,
@@ -46,11 +44,10 @@ from restock.train.run.kept_evaluations import (
     summary_rows,
 )
 from restock.train.run.run import PolicyOrigin, Run
-from restock.train.run.run_profile import profile_of_run, run_panel
+from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
-from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.missions import DEFAULT_CONDITIONS, KINDS
 from restock.train.twin.physics.episode import EpisodeSpec, refuse_unfit, unfit_kinds
 from restock.train.twin.physics.perturbation import (
@@ -98,7 +95,6 @@ def reference(name: str, seed: int = 0) -> Policy:
 
 
 CLEAN = "none"
-DRAWN = "drawn"  # missions by the seeds, on the floor
 POLICIES = ("agent", "planner", "random")
 _PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
 
@@ -118,41 +114,29 @@ class EvaluationPlan:
     layouts: str = "default"
     limits: Limits | None = None  # every policy once more, with this limiter in front
     left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
-    missions: LoggedMissions | None = None  # None: drawn on the floor, by their seeds
     loaded: dict[str, Policy] = field(default_factory=dict)  # those of runs and files, by name
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Return the requested kinds of episodes that every floor has room for."""
-        fit = [kind for kind in KINDS if kind in self.episodes and kind not in self.left_out]
-        if self.missions is not None:
-            fit = [kind for kind in fit if kind in self.missions.specs]
-        return tuple(fit)
+        return tuple(k for k in KINDS if k in self.episodes and k not in self.left_out)
 
     @property
     def specs(self) -> list[EpisodeSpec]:
-        """Return the episodes of each perturbation, kinds interleaved; logged routes only once."""
-        of = {
-            kind: range(self.first_seed, self.first_seed + n) for kind, n in self.episodes.items()
-        }
-        drawn = {kind: [EpisodeSpec(kind, seed) for seed in of[kind]] for kind in self.kinds}
-        if self.missions is not None:
-            drawn = {k: list(self.missions.specs[k][: self.episodes[k]]) for k in self.kinds}
-        most = max(map(len, drawn.values()))
-        return [drawn[k][at] for at in range(most) for k in self.kinds if at < len(drawn[k])]
-
-    @property
-    def floors(self) -> str:
-        """Return the floors by name, for the record."""
-        return self.layouts if self.missions is None else self.layouts + WAYS
+        """Return the episodes of each perturbation, kinds interleaved."""
+        most = max(self.episodes[kind] for kind in self.kinds)
+        return [
+            EpisodeSpec(kind, self.first_seed + at)
+            for at in range(most)
+            for kind in self.kinds
+            if at < self.episodes[kind]
+        ]
 
     @property
     def warnings(self) -> list[str]:
         """Warn of episodes that also selected the kept policy: their results are too good."""
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
-        if self.missions is not None:
-            return [self.missions.text]
         if "agent" not in self.policies or not (
             chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
         ):
@@ -186,12 +170,10 @@ def plan_evaluation(
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
     limiter: str | None = None,
-    missions: str = DRAWN,
 ) -> EvaluationPlan:
     """Check a request. `layouts` None: the run's, with training floors' test split.
 
-    `missions` is "drawn", or "logged" (or "logged:all"): the ways of logged episodes that the run's
-    panel holds out (or of all of them). `limiter` is "profile", by the `[limiter]` of the run's
+    `limiter` is "profile", by the `[limiter]` of the run's
     profile, or a TOML file with one.
 
     Raises:
@@ -217,8 +199,7 @@ def plan_evaluation(
         first_seed,
         layouts=layouts,
         limits=None if limiter is None else _limits(run, limiter),
-        left_out=unfit_kinds(floors) if missions == DRAWN else {},
-        missions=_missions(run, missions, floors, tuple(of_kind)),
+        left_out=unfit_kinds(floors),
     )
     if not plan.kinds:
         refuse_unfit(floors, list(of_kind))
@@ -304,27 +285,6 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
     return reference(name, plan.first_seed) if named is None else named
 
 
-def _missions(
-    run: Run, named: str, floors: Sequence[Warehouse], kinds: Sequence[str]
-) -> LoggedMissions | None:
-    """Return the missions of the logs, if they are requested.
-
-    Raises:
-        ConfigError: no such missions, no logs, or none of them can be driven.
-    """
-    if named == DRAWN:
-        return None
-    where = f"--missions {named}"
-    if named not in (HELD_OUT, EVERY):
-        remedy = f"choose from {DRAWN}, {HELD_OUT}, {EVERY}"
-        raise ConfigError("there are no such missions", where=where, remedy=remedy)
-    if (panel := run_panel(run.document)) is None:
-        raise ConfigError("the run did not learn from logs", where=where, remedy="leave it out")
-    if panel.task.goal == "none":
-        raise ConfigError("the task has no goal", where=where, remedy="leave it out")
-    return logged_missions(panel, floors, kinds, every=named == EVERY)
-
-
 def _limits(run: Run, named: str) -> Limits:
     """Return the limits of a run's robot, by its profile or by a TOML file.
 
@@ -375,7 +335,6 @@ def settings(plan: EvaluationPlan) -> dict[str, Any]:
         "episodes_per_kind": dict(plan.episodes),
         "first_seed": plan.first_seed,
         "layouts": plan.layouts,
-        "missions": DRAWN if plan.missions is None else plan.missions.text,
         "limiter": None if plan.limits is None else msgspec.to_builtins(plan.limits),
         "kinds": list(plan.kinds),
         "left_out": plan.left_out,
@@ -529,7 +488,7 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
             "failure": result.failure,
             "version": versions[policy],
             "trained_env_steps": origins.get(policy.removeprefix(LIMITED)),
-            "layouts": plan.floors,
+            "layouts": plan.layouts,
         }
         for (policy, perturbation), episodes in results.items()
         for result in episodes

@@ -34,7 +34,6 @@ from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
-WAYS = ", ways of the logs"  # after the floors: missions from logged episodes
 LIMITED = "limited:"  # a policy with the limiter in front of it
 _NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
@@ -95,22 +94,13 @@ def mission_of(row: Mapping[str, Any]) -> Mission:
     return row["layouts"], row["condition"], row["episode_seed"], values
 
 
-def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
+def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
     """Return the episodes to show and compare, and a text that counts them.
-
-    With `ways` only those on the ways of logs are looked at; without, the others, if there are any.
 
     Raises:
         RunError: the file is damaged.
     """
     table = read_evaluations(run)
-    every = table.num_rows
-    requested = pa.array(
-        [str(on).endswith(WAYS) == ways for on in table["layouts"].to_pylist()], pa.bool_()
-    )
-    some = table.filter(requested)
-    if some.num_rows or ways:
-        table = some
     if not table.num_rows:
         return table, ""
     last = table.slice(table.num_rows - 1).to_pylist()[0]
@@ -125,7 +115,7 @@ def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
     ]
     shown = table.filter(pa.array(mask, pa.bool_()))
     seeds = shown["episode_seed"]
-    text = f"{shown.num_rows:,} of {every:,} episodes that `restock eval` drove: "
+    text = f"{shown.num_rows:,} of {table.num_rows:,} episodes that `restock eval` drove: "
     text += f"floors {_floors(last['layouts'] or 'not named')}, policy {version or 'not named'}"
     if (step := trained_step(shown)) is not None:
         text += f" of step {step:,}"
@@ -141,10 +131,9 @@ def trained_step(shown: pa.Table) -> int | None:
 
 def _floors(layouts: str) -> str:
     """Shorten a run's floors: files by name, of many only the first and last."""
-    ways = WAYS if layouts.endswith(WAYS) else ""
-    names = [part.rpartition("/")[2].strip() for part in layouts.removesuffix(ways).split(",")]
+    names = [part.rpartition("/")[2].strip() for part in layouts.split(",")]
     some = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
-    return ", ".join(some) + ways
+    return ", ".join(some)
 
 
 def _changes(policy: str) -> bool:

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpePlan
 
 # Options that say what is driven, and what becomes of it.
-_DRIVES = (
-    *("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "missions"),
-    "video",
-)
+_DRIVES = (*("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "video"),)
 
 
 @dataclass
@@ -74,9 +71,6 @@ class EvalCommand:
     limiter: Annotated[str | None, Option("profile|FILE.toml")] = None
     """Also drive each policy with a limiter after it, as limited:NAME. The limiter is the profile's
     [limiter], or that of a file (docs/deploy.md)."""
-    missions: str = "drawn"
-    """drawn: missions drawn from the seeds. logged: start and goal of the logged episodes that the
-    run's panel holds out, on the floor of the logs. logged:all: of all logged episodes."""
     dry_run: bool = False
     """Check everything and print what would be driven; write nothing."""
     json: bool = False
@@ -107,7 +101,6 @@ class EvalCommand:
             episodes=self.episodes if drive else "20",
             first_seed=self.seed,
             layouts=self.layouts,
-            missions=self.missions,
             limiter=self.limiter,
         )
         if self.dry_run:

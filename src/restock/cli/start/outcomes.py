@@ -192,12 +192,6 @@ def driven(document: Document) -> list[str]:
     return lines + [clone["text"] for clone in document.get("clones", [])]
 
 
-def driven_on_ways(document: Document) -> list[str]:
-    """Say which routes were driven, and the success of each policy there."""
-    bare = {**document, "clones": []}  # the next evaluation says how good the clone is
-    return [str(document["missions"]), *driven(bare)]
-
-
 def on_logs(document: Document) -> list[str]:
     """Compare the policy's worth by held-out logs with what the logs' drivers achieved."""
     shown: dict[str, list[str]] = {}

@@ -252,18 +252,6 @@ def evaluate(to: Settings, *policies: str) -> Stage:
     )
 
 
-def evaluate_on_ways(to: Settings) -> Stage:
-    """Evaluate on the routes of the logged episodes that the panel holds out, on their floor."""
-    policies = ("--policies", "agent,cloned,planner", "--perturbations", "none")
-    return Stage(
-        "ways",
-        "Evaluate on the routes of the logs",
-        ["eval", str(to.run), "--episodes", to.of_each_kind, "--missions", "logged", *policies],
-        outcome=outcomes.driven_on_ways,
-        shows_progress=True,
-    )
-
-
 def judge(to: Settings) -> Stage:
     """Evaluate off-policy, on logs that the policy did not learn from."""
     return Stage(

@@ -198,8 +198,6 @@ class Way:
         """Evaluate in the twin and on held-out logs, and write one page."""
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
-            if floor.good and decisions.has_goal(to.profile):
-                do(stages.evaluate_on_ways(to))  # fails, and says so, if no route is on the floor
             judged.append(do(stages.evaluate(to, "cloned")))
         if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
             judged.append(do(stages.judge(to)))

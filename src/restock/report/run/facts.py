@@ -56,8 +56,6 @@ class Facts:
     clocks: dict[str, Any]  # environment steps, updates and seconds of training
     cells: Rows  # measures of `restock eval` per policy, perturbation and condition
     evaluation: str  # which of the driven episodes are shown
-    ways: Rows  # as `cells`, but on the routes of the logs
-    evaluation_on_ways: str  # which routes these are
     policy: PolicyOrigin | None  # the run's policy that would drive now
     driven_step: int | None  # training step of the policy in `cells`
     clones: list[CloneQuality]  # clones of the logs' drivers
@@ -103,9 +101,6 @@ def gather(path: Path) -> Facts:
     """
     run = Run.open(path)
     evaluated, shown = shown_evaluation(path)
-    on_ways, ways = shown_evaluation(path, ways=True)
-    if ways == shown:  # they are what was driven last, and shown already
-        on_ways, ways = on_ways.slice(0, 0), ""
     with duckdb.connect() as connection:
         connection.register("evaluated", evaluated)
         for name in _TABLES:
@@ -126,8 +121,6 @@ def gather(path: Path) -> Facts:
         clocks={name: max(value, latest.get(name, value)) for name, value in clocks.items()},
         cells=summary_rows(evaluated.to_pylist()),
         evaluation=shown,
-        ways=summary_rows(on_ways.to_pylist()),
-        evaluation_on_ways=ways,
         policy=kept_policy(run),
         driven_step=trained_step(evaluated),
         clones=read_clones(path),

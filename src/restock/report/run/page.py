@@ -58,7 +58,7 @@ def page(facts: Facts) -> dict[str, Any]:
 
 
 def success(facts: Facts) -> Section | None:
-    """Show each policy's success by kind of episode: on drawn missions, and on logged routes."""
+    """Show each policy's success by kind of episode."""
     if not facts.cells:
         return None
     cells = _evaluated(facts.cells)
@@ -75,12 +75,6 @@ def success(facts: Facts) -> Section | None:
         )
         for name in dict.fromkeys(row["perturbation"] for row in cells)
     ]
-    if facts.ways:
-        caption = (
-            "Start and goal of logged episodes, each route once, on the floor of the logs (`restock"
-            f" eval --missions logged`). {facts.evaluation_on_ways}"
-        )
-        tables.append(_measures(_evaluated(facts.ways), "On routes that robots drove", caption))
     return Section(
         "success",
         "Does it reach the goal?",
