@@ -18,7 +18,7 @@ TRAINING_KEYS = {
     "network.ensemble": _MEAN,
     "network.members": _MEAN,
     "loss.margin_policies": "it was removed: set teacher.policies",
-    "evaluation.missions": "it was removed: restock eval --missions logged drives them afterwards",
+    "evaluation.missions": "it was removed: a floor made from the logs starts where they did",
     "record.tensorboard": "it was removed: record.trackers names tensorboard, or does not",
 }
 STUDY_KEYS = {
@@ -79,6 +79,8 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "demo --logs": "`restock start BAGS --out DIR` takes recordings of your own",
     "demo --profile": "`restock start BAGS --out DIR` takes recordings of your own",
     "diagnose --before-training": "give the panel or store itself: restock diagnose PANEL",
+    "diagnose --confirm": "the experiment it prints is a `--set` of `restock train`",
+    "eval --missions": "a floor of `restock twin layout --from STORE` starts where the logs did",
     "eval --baseline": "`restock gate RUN --baseline NAME` compares by episode, and decides",
     "eval --no-drive": "it is --episodes 0 now",
     "eval --save-as-baseline": "export the policy (--to onnx): `restock gate` takes the file",
