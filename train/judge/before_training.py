@@ -214,8 +214,6 @@ def diagnose_before_training(
     twin: bool = True,
     perturbation: Perturbation | None = None,
     layouts: str = DEFAULT,
-    task_hash: str | None = None,
-    seed: int = 0,
 ) -> RowDiagnosis:
     """Compare the rows of a panel or store with the twin and with the task's definitions.
 
@@ -224,7 +222,6 @@ def diagnose_before_training(
         twin: False: only the checks that need none.
         perturbation: of the twin, as `restock twin fit` finds it; None: the nominal one.
         layouts: the floors that the twin drives on, as `env.layouts`.
-        task_hash: whose rows, where a store has several tasks.
 
     Raises:
         RunError: there is not a panel or a store.
@@ -232,12 +229,10 @@ def diagnose_before_training(
         ConfigError: the profile's task is not that of the rows.
     """
     begun = time.perf_counter()
-    opened = open_rows(Path(path), profile, task_hash)
+    opened = open_rows(Path(path), profile)
     own = opened.profile
     floors = open_floors(layouts)
-    fresh, reason = (
-        _drive(own, perturbation, layouts, seed) if twin else (None, "it was not requested")
-    )
+    fresh, reason = _drive(own, perturbation, layouts) if twin else (None, "it was not requested")
     diagnosis = diagnose_rows(
         opened.rows, fresh, reason, more=opened.checks, files=opened.files,
         floors=floors if twin else (),
@@ -302,9 +297,7 @@ def diagnose_rows(
     return RowDiagnosis(verdict, found, comparisons, about)
 
 
-def open_rows(
-    path: Path, profile: Profile | None = None, task_hash: str | None = None
-) -> OpenedRows:
+def open_rows(path: Path, profile: Profile | None = None) -> OpenedRows:
     """Open the rows of a panel or a store.
 
     Raises:
@@ -327,7 +320,7 @@ def open_rows(
             return OpenedRows(with_missions(store, rows), own, compared, _files(store))
     if is_store(path):
         with Store(path) as store:
-            chosen = task_hash or store.task().hash
+            chosen = store.task().hash
             rows = of_store(store, chosen)
             own = _checked(profile or _profile_of_store(store, chosen), rows, path)
             compared = [*stored(store, rows, own, _conditions(own))]
@@ -368,13 +361,11 @@ def _profile_of_store(store: Store, task_hash: str) -> Profile:
 
 
 def _drive(
-    profile: Profile, perturbation: Perturbation | None, layouts: str, seed: int
+    profile: Profile, perturbation: Perturbation | None, layouts: str
 ) -> tuple[FedRows | None, str]:
     task, robot, conditions = profile.task, profile.robot, _conditions(profile)
     try:
-        rows = drive_twin(
-            task, conditions, robot=robot, perturbation=perturbation, layouts=layouts, seed=seed
-        )
+        rows = drive_twin(task, conditions, robot=robot, perturbation=perturbation, layouts=layouts)
         return rows, ""
     except RestockError as error:  # no such robot in the twin: the other checks still say much
         return None, f"the twin cannot be driven with this profile: {error.what}"
