@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -69,8 +68,6 @@ def test_equal_policies_pass_before_the_budget(run: Path, driven: Any) -> None:
     assert {"nominal", "blocked_aisle (partial)", "blocked_aisle (full)"} <= {*conditions}
     episodes = pq.read_table(run / "gate" / "episodes.parquet").to_pylist()
     assert {row["policy"] for row in episodes} == {"agent", "planner"}
-    suite = ElementTree.parse(run / "gate" / "junit.xml").getroot()[0]
-    assert (suite.get("tests"), suite.get("failures")) == (str(len(conditions)), "0")
     page = (run / "gate" / "gate.html").read_text()
     assert "shown not worse" in page
     assert "<svg" in page

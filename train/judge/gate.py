@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import pyarrow as pa
 
@@ -543,20 +542,3 @@ def passed_gate(path: Path, baseline: str) -> Document:
     if document["policy"] != (None if origin is None else origin.document):
         raise RunError("judged another policy of the run", where=str(file), remedy=again)
     return document
-
-
-def junit(document: Document) -> str:
-    """Write the cells as JUnit XML: each is a test, and fails unless it is shown not worse."""
-    cells = document["cells"]
-    failures = sum(cell["verdict"] != NOT_WORSE for cell in cells)
-    root = ElementTree.Element("testsuites")
-    suite = ElementTree.SubElement(
-        root, "testsuite", name="gate", tests=str(len(cells)), failures=str(failures), errors="0"
-    )
-    for cell in cells:
-        name = f"{cell['name']} on {cell['layouts']}"
-        case = ElementTree.SubElement(suite, "testcase", classname="gate", name=name)
-        if cell["verdict"] != NOT_WORSE:
-            ElementTree.SubElement(case, "failure", message=cell["verdict"])
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"

@@ -21,8 +21,8 @@ class GateCommand:
     policy that is worse by the margin in any of them passes with a probability of at most 5 %.
 
     Exits with 0 if it is shown not to be worse, with 1 if that is not shown or it is shown to be
-    worse, and with 2 if a verdict would mean nothing. Writes RUN/gate: gate.json, gate.html, the
-    episodes, and junit.xml for pipelines.
+    worse, and with 2 if a verdict would mean nothing. Writes RUN/gate: gate.json, gate.html and the
+    episodes. `restock audit STORE RUN --baseline NAME --junit FILE` has its cells for pipelines.
 
     Example: `restock gate runs/a --baseline planner --margins success=0.05,bumps_per_km=1`
     """
@@ -52,9 +52,8 @@ class GateCommand:
     """Print the document as JSON: claim, evidence and limits."""
 
     def run(self) -> int:
-        from restock.files import write_text
         from restock.report import gate_page, write_page
-        from restock.train.judge.gate import FOLDER, drive_gate, junit, plan_gate
+        from restock.train.judge.gate import FOLDER, drive_gate, plan_gate
         from restock.train.judge.sequential import NOT_WORSE
 
         plan = plan_gate(
@@ -72,7 +71,6 @@ class GateCommand:
             document = drive_gate(plan, lambda text: advance(note=text))
         content = gate_page(document)
         page = write_page(content, self.run_path / FOLDER / "gate.html")
-        write_text(self.run_path / FOLDER / "junit.xml", junit(document))
         if self.json:
             print_json(document)
         else:
