@@ -27,7 +27,6 @@ def make_run(
     agreement: Mapping[str, float] | None = None,
     unexplained: Mapping[str, float] | None = None,
     explained: float | Mapping[str, float] | None = 0.8,
-    strata: bool = True,  # named as the conditions are; else there is one of all rows
     until: int | None = None,  # the window in which the symptoms end
     held_out: Mapping[str, int] | None = None,  # rows of a condition in each evaluation
     lags: Sequence[float] | None = None,  # L of each window, in place of `lag`
@@ -59,8 +58,6 @@ def make_run(
             if share:
                 fed = {"drawn_rows": round(share * 10_000), "td_abs_mean": replay_td}
                 append(run, "conditions", clocks, source="logs", condition=name, **fed)
-                stratum = {"stratum": name if strata else "all", "quota_share": share}
-                append(run, "strata", clocks, source="logs", **stratum, **fed)
         ends = {"target_q_lag": lag if ill else 0.05, "q_abs_max": q_abs_max if ill else 10.0}
         append(run, "progress", clocks, updates=500, **ends)
     append(run, "audit", {}, reward=-1.5)
@@ -87,7 +84,6 @@ def append(run: Run, table: str, clocks: Mapping[str, int], **values: Any) -> No
         ({"agreement": {"blocked_aisle": 0.03}}, "BUFFER"),
         ({"unexplained": {"blocked_aisle": 1.2}}, "BUFFER"),
         ({"unexplained": dict.fromkeys(CONDITIONS, 1.2)}, "HEALTHY"),  # a noisy robot is no fault
-        ({"strata": False, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
         ({"clock": 8.0}, "TARGET"),
         ({"gap": 7.0}, "TARGET"),
         ({"q_abs_max": 149.0}, "HEALTHY"),

@@ -1,5 +1,5 @@
 -- What a diagnosis looks at: one row an evaluation (a window) and condition. run_evaluation_buffer,
--- run_conditions, run_strata and run_progress are the run's tables.
+-- run_conditions and run_progress are the run's tables.
 WITH windows AS (
     SELECT gradient_steps AS until,
            coalesce(lag(gradient_steps) OVER (ORDER BY gradient_steps), 0) AS since
@@ -9,16 +9,6 @@ WITH windows AS (
            sum(td_abs_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS replay_td
     FROM run_conditions
     JOIN windows ON gradient_steps > since AND gradient_steps <= until
-    GROUP BY ALL
-), quota AS (  -- what a stratum of that name was to get of its source, and got
-    SELECT until, stratum AS condition,
-           sum(drawn_rows) / nullif(sum(quota_share * source_rows), 0) AS quota_met
-    FROM (
-        SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows
-        FROM run_strata
-    )
-    JOIN windows ON gradient_steps > since AND gradient_steps <= until
-    WHERE quota_share IS NOT NULL
     GROUP BY ALL
 ), clock AS (
     SELECT until, max(target_q_lag) AS lag, max(q_abs_max) AS q_abs_max
@@ -42,12 +32,10 @@ SELECT h.gradient_steps AS gradient_steps,
        coalesce(replay_rows, 0) AS replay_rows,
        coalesce(replay_rows, 0) / nullif(all_rows, 0) AS replay_share,
        replay_td,
-       quota.quota_met AS quota_met,
        clock.lag AS lag,
        clock.q_abs_max AS q_abs_max
 FROM run_evaluation_buffer h
 JOIN clock ON clock.until = h.gradient_steps
 LEFT JOIN drawn ON drawn.until = h.gradient_steps
-LEFT JOIN quota ON quota.until = h.gradient_steps AND quota.condition = h.condition
 LEFT JOIN replay ON replay.until = h.gradient_steps AND replay.condition = h.condition
 ORDER BY ALL

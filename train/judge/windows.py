@@ -51,7 +51,6 @@ class DiagnosisLimits:
     agreement: float = 0.1  # of a condition's logged rows that look like it
     unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
     unexplained_relative: float = 1.6  # and over that of the condition with the least
-    quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
 
 
 LIMITS = DiagnosisLimits()
@@ -68,7 +67,6 @@ class Symptom:
     met_share: float | None  # of the evaluations' steps
     agreement: float | None  # of its logged rows with fresh ones
     unexplained: float | None  # of the variance of its logged rows' next observations
-    quota_met: float | None
 
     @property
     def supply(self) -> float | None:
@@ -112,8 +110,6 @@ class Window:
                     f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and "
                     "the condition is not in replay"
                 )
-            if reasons and symptom.quota_met is not None and symptom.quota_met < LIMITS.quota_met:
-                reasons.append(f"got {symptom.quota_met:.0%} of its quota")
             if reasons:
                 doubts[symptom.condition] = reasons
         return doubts
@@ -219,7 +215,7 @@ def windows_of(run: Run) -> list[Window]:
     """Return the windows of a run, one an evaluation that had updates before it."""
     query = files("restock.train.judge").joinpath("diagnose.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
-        for name in ("evaluation_buffer", "conditions", "strata", "progress"):
+        for name in ("evaluation_buffer", "conditions", "progress"):
             connection.register(f"run_{name}", run.table(name))
         rows = connection.sql(query).to_arrow_table().to_pylist()
     rows = [row for row in rows if row["q_abs_max"] is not None]  # None: no batch was audited yet
@@ -249,7 +245,6 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
             row["met_share"],
             row["agreement"],
             row["unexplained"],
-            row["quota_met"],
         )
         for row in known_well
     ]
