@@ -62,7 +62,7 @@ MAY_IMPORT = {
         " replay/sampling"
     ),
     "train/judge": (
-        "train dqn evaluation feed run twin/calibration"
+        "dqn evaluation feed run twin/calibration"
         " twin/missions twin/env twin/floors twin/physics replay/fleet replay/panel replay/store"
         " ingest/profile ingest/store ingest/task"
     ),
@@ -105,7 +105,7 @@ MAY_IMPORT = {
     ),
     "cli/fleet": (
         "cli report report/fleet ingest ingest/profile ingest/store ingest/task replay replay/fleet"
-        " replay/review replay/mixture replay/panel replay/store train/judge train/twin/missions"
+        " replay/review replay/mixture replay/panel replay/store train/twin/missions"
     ),
     "cli/learning": (
         "cli report ingest/profile replay replay/fleet replay/mixture replay/trace"

@@ -358,6 +358,7 @@ def evaluate_off_policy(
                 "ess": ess,
                 "ess_steps": ess_steps,
                 "steps": part.ratio.shape[1],
+                "horizon": None,  # all of them are weighted
                 "epsilon": config.epsilon,
                 "discount": gamma,
                 "estimated_share": estimated,
