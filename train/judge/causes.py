@@ -70,7 +70,8 @@ class Finding:
 def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task) -> list[Finding]:
     """Return the faults, the least understood last."""
     of_signals: dict[str, Comparison] = {}  # by the kind of check, and the signal
-    moved, rest = [], []
+    moved: list[Comparison] = []
+    rest: list[Comparison] = []
     for row in others:
         if row.off and row.check.startswith(OF_SIGNALS):
             of_signals[row.check] = row
