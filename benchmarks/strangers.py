@@ -35,7 +35,7 @@ from restock.errors import RestockError
 from restock.ingest import open_recording, recordings_in
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import GoalRules, parse_profile
-from restock.ingest.propose.propose import propose_profile
+from restock.ingest.propose.drives import propose_profile
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.episodes import Split, Steps, split, steps_of
 from restock.ingest.steps.needs import read_topics

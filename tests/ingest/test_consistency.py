@@ -22,8 +22,8 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.propose.drives import propose_profile
 from restock.ingest.propose.gather import Given
-from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.episodes import steps_of
 

@@ -15,13 +15,14 @@ from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose import drives as drives_module
 from restock.ingest.propose.drives import (
     Lidar,
+    Proposal,
     RobotTraits,
     drives_by_kind,
     propose_for_drives,
     robot_kinds,
     robot_traits,
+    tried,
 )
-from restock.ingest.propose.propose import Proposal, tried
 
 TWIST = "geometry_msgs/msg/Twist"
 WHEELS = "".join(

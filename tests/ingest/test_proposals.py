@@ -36,8 +36,8 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.commands import Commands
+from restock.ingest.propose.drives import propose_profile
 from restock.ingest.propose.proposal_lines import actions_of
-from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import RobotProposal
 from restock.ingest.steps.align import NS
 from restock.ingest.task.task import Body, Task

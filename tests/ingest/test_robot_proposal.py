@@ -13,9 +13,9 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.description import Description, read_description
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.described_robot import DescribedRobot, described_robot
+from restock.ingest.propose.drives import propose_profile
 from restock.ingest.propose.footprint import descriptions, footprint_of
 from restock.ingest.propose.gather import Given
-from restock.ingest.propose.propose import propose_profile
 from restock.ingest.propose.robot_choice import propose_robot
 from restock.ingest.propose.roles import robots_in
 

@@ -10,7 +10,7 @@ from support.ingested import answered, ingested, proposed
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.propose import propose_profile
+from restock.ingest.propose.drives import propose_profile
 from restock.ingest.propose.roles import choose_robot
 
 NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")

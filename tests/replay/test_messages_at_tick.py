@@ -17,7 +17,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, parse_profile
-from restock.ingest.propose.propose import propose_profile
+from restock.ingest.propose.drives import propose_profile
 from restock.ingest.steps.frames import rotations
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
