@@ -79,7 +79,6 @@ OPTIONS = {  # of one command, or of all; what to type instead
     "demo --logs": "`restock start BAGS --out DIR` takes recordings of your own",
     "demo --profile": "`restock start BAGS --out DIR` takes recordings of your own",
     "diagnose --before-training": "give the panel or store itself: restock diagnose PANEL",
-    "diagnose --confirm": "the experiment it prints is a `--set` of `restock train`",
     "eval --missions": "a floor of `restock twin layout --from STORE` starts where the logs did",
     "eval --baseline": "`restock gate RUN --baseline NAME` compares by episode, and decides",
     "eval --no-drive": "it is --episodes 0 now",

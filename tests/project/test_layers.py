@@ -62,7 +62,7 @@ MAY_IMPORT = {
         " replay/sampling"
     ),
     "train/judge": (
-        "dqn evaluation feed run twin/calibration"
+        "train dqn evaluation feed run twin/calibration"
         " twin/missions twin/env twin/floors twin/physics replay/fleet replay/panel replay/store"
         " ingest/profile ingest/store ingest/task"
     ),

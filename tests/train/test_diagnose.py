@@ -11,8 +11,18 @@ import pyarrow.parquet as pq
 import pytest
 
 from restock.cli import main
-from restock.train.dqn.config import Hard, Polyak, TargetRule, TrainConfig
-from restock.train.judge.diagnose import diagnose
+from restock.errors import RunError
+from restock.train.dqn.config import (
+    Hard,
+    Polyak,
+    TargetRule,
+    TeacherConfig,
+    TrainConfig,
+    apply_overrides,
+    parse_config,
+)
+from restock.train.judge.diagnose import confirm, diagnose, swapped
+from restock.train.prepare import Prepared
 from restock.train.run.run import Run
 
 CONDITIONS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision", "recovery")
@@ -137,12 +147,13 @@ def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "to confirm: train again with more or corrected rows of blocked_aisle" in shown
     assert main(["diagnose", str(tmp_path / "r"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["cause"] == "BUFFER"
+    assert (document["cause"], document["confirmation"]) == ("BUFFER", None)
     assert len(document["runs"][0]["windows"]) == 4
 
 
 def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Run.create(tmp_path / "young", {"config": msgspec.to_builtins(TrainConfig())})
+    make_run(tmp_path / "well")
     early = make_run(tmp_path / "early")  # stopped before a batch was audited
     progress = early.table("progress").drop(["q_abs_max"])
     none = pa.nulls(len(progress), pa.float64())
@@ -153,15 +164,91 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
         ([str(tmp_path)], "is not a run, a panel or a store"),
         ([], "needs a run"),
         (["nowhere"], "nowhere: does not exist"),
+        ([".", "--confirm", "run"], "--confirm: applies only to a run"),
+        ([str(tmp_path / "well"), "--confirm", str(tmp_path / "c")], "there is nothing to confirm"),
     ):
         assert main(["diagnose", *words]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "c").exists()
 
 
 @pytest.mark.parametrize(
     ("rule", "tau"),
     [(Polyak(tau=0.01), 0.04), (Hard(400), 0.02), (Hard(10**6), 0.005), (Polyak(tau=1.0), 0.005)],
 )
-def test_the_experiment_on_a_target_changes_its_rule(tmp_path, rule, tau):
+@pytest.mark.parametrize("cause", ["TARGET", "BOTH"])
+def test_the_experiment_on_a_target_changes_its_rule(tmp_path, rule, tau, cause):
     run = make_run(tmp_path / "r", lag=0.9, every=5000, target=rule)
-    assert f"{Polyak(tau=tau)} in place of {rule}" in diagnose([run]).experiment
+    changed = parse_config(
+        apply_overrides(run.document["config"], swapped(run, cause)), where="test"
+    )
+    assert changed.target == Polyak(tau=tau) != rule
+    assert f"{changed.target} in place of {rule}" in diagnose([run]).experiment
+
+
+def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
+    run = str(make_run(tmp_path / "r", lag=0.9).path)
+    assert main(["diagnose", run, "--confirm", run]) == 2
+    shown = capsys.readouterr()
+    assert not shown.out  # refused before anything else
+    said = " ".join(shown.err.split())
+    assert "already exists give --confirm another directory" in said
+    assert "--out" not in said
+
+
+@pytest.mark.parametrize("source", ["none", "planner"])
+def test_an_experiment_repeats_a_run_without_a_teacher(source, tmp_path, monkeypatch):
+    """Its config has the other settings of `teacher`, resolved, which nobody may give."""
+    run = make_run(tmp_path / "r", lag=0.9)
+    run.document["config"]["teacher"] |= {"source": source, "successes": False, "ratio": 0.2}
+    run.document["panel"] = None
+    taught: list[TeacherConfig] = []
+
+    def stop(prepared: Prepared) -> None:
+        taught.append(prepared.config.teacher)
+        raise RunError("prepared")
+
+    monkeypatch.setattr(Prepared, "open", stop)
+    with pytest.raises(RunError, match="prepared"):
+        confirm(run, diagnose([run]), tmp_path / "c")
+    assert (taught[0].source, taught[0].ratio) == (source, TeacherConfig().ratio)
+
+
+@pytest.mark.parametrize(
+    ("after", "cause", "confirmed"),
+    [
+        ({"lag": 0.9}, "TARGET", False),  # another target rule, and the target is at fault again
+        ({"gap": {"blocked_aisle": 6.0}}, "BUFFER", True),  # what else is at fault is left
+        ({"windows": 2}, "UNDETERMINED", None),
+    ],
+)
+def test_of_two_faults_the_target_is_answered_for(tmp_path, monkeypatch, after, cause, confirmed):
+    run = make_run(tmp_path / "r", lag=0.9, gap={"blocked_aisle": 6.0})
+    found = diagnose([run])
+    assert found.cause == "BOTH"
+
+    class Trained:
+        def __init__(self, out: Path, *_: Any) -> None:
+            make_run(out, **after)
+
+        def open(self) -> "Trained":
+            return self
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr("restock.train.judge.diagnose.prepare_new", Trained)
+    monkeypatch.setattr("restock.train.judge.diagnose.train", lambda session: None)
+    answer = confirm(run, found, tmp_path / "c")
+    assert (answer["cause"], answer["confirmed"]) == (cause, confirmed)
+
+
+@pytest.mark.parametrize("cause", ["BUFFER", "TARGET", "DIVERGENCE"])
+def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None:
+    run = make_run(tmp_path / "r")
+    config = run.document["config"]
+    changed = parse_config(apply_overrides(config, swapped(run, cause)), where="test")
+    sections = {"BUFFER": {"replay", "env"}, "TARGET": {"target"}, "DIVERGENCE": {"optimizer"}}
+    before, after = config, msgspec.to_builtins(changed)
+    changes = {key for key in before if before[key] != after[key]}
+    assert changes
+    assert changes <= sections[cause]

@@ -6,9 +6,9 @@ its *target* may follow too slowly, not at all, or too fast: then it is wrong ev
 networks disagree. Steps of the evaluations, in no replay, tell which: `windows` has the figures and
 their limits. Each figure is its median over the last evaluations.
 
-A diagnosis names the experiment that would confirm it: the same run with one suspect replaced. If
-the target was at fault, another target rule on the same feed repairs it; if the feed was, the same
-target rule on another feed does. What stays the same is evidence, too.
+An experiment confirms a diagnosis: the same run with one suspect replaced. If the target was at
+fault, another target rule on the same feed repairs it; if the feed was, the same target rule on
+another feed does. What stays the same is evidence, too.
 """
 
 from __future__ import annotations
@@ -18,11 +18,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isinf
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from restock.errors import RestockError, RunError, counted
-from restock.train.dqn.config import Polyak, TargetRule
+from restock.train.dqn.config import (
+    Polyak,
+    TargetRule,
+    apply_overrides,
+    as_overrides,
+    has_effect,
+    parse_config,
+)
 from restock.train.judge.before_training import RowDiagnosis, diagnose_before_training
 from restock.train.judge.comparability import refuse_dependent
 from restock.train.judge.windows import (
@@ -32,7 +40,9 @@ from restock.train.judge.windows import (
     median_window,
     windows_of,
 )
-from restock.train.run.run import Run
+from restock.train.loop import train
+from restock.train.prepare import prepare_new
+from restock.train.run.run import Run, check_free
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.floors.layout import DEFAULT
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
@@ -241,3 +251,93 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
     return replace(
         diagnosis, cause=cause, evidence=[*diagnosis.evidence, *said], experiment=experiment
     )
+
+
+_NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
+
+
+def check_place(out: Path) -> None:
+    """Raise RunError if the experiment's run cannot be made at `out`."""
+    try:
+        check_free(out)
+    except RunError as taken:
+        raise RunError(
+            taken.what,
+            where=taken.where,
+            remedy="give --confirm another directory, or remove this one",
+        ) from taken
+
+
+def confirm(
+    run: Run, diagnosis: Diagnosis, out: Path, *, rows_at_fault: bool = False
+) -> dict[str, Any]:
+    """Train again into `out` with one thing swapped, and diagnose that run.
+
+    `diagnosis` is of the run's own figures (`diagnose`), without its rows: rows that are wrong
+    alike leave no trace in any run's figures, so that a new run without such a trace would confirm
+    nothing. `rows_at_fault` says that the rows are, for a run whose figures are not.
+
+    Returns `changed` (settings), the new run's `cause`, and `confirmed`: True where the cause is
+    gone, False where it stayed, None where the new run does not say.
+
+    Raises:
+        RunError: something is at `out`, there is nothing to confirm, or no setting changes what
+            is suspected.
+    """
+    check_place(out)
+    config, where = run.document["config"], str(run.path)
+    cause, remedy = diagnosis.cause, diagnosis.experiment
+    changed = [] if cause in _NOTHING else swapped(run, cause)
+    what = None
+    if rows_at_fault and cause in _NOTHING:
+        what = "by its own figures, and only its rows are at fault: another run cannot confirm that"
+        remedy = "correct the rows, mix again, and check them with `restock diagnose PANEL`"
+    elif cause in _NOTHING:
+        what = "there is nothing to confirm"
+    elif parse_config(apply_overrides(config, changed), where=where) == parse_config(
+        config, where=where
+    ):
+        what = f"it has the settings of the experiment already: {', '.join(changed)}"
+    if what is not None:
+        raise RunError(f"is {cause}: {what}", where=where, remedy=remedy)
+    panel = run.document["panel"]
+    given = config["teacher"]  # resolved, with settings that its source does not have
+    resolved = parse_config(config, where=where)
+    has = {"source", *(key for key in given if has_effect(resolved, key))}
+    taught = {key: value for key, value in given.items() if key in has}
+    settings = as_overrides(config | {"teacher": taught}) + changed
+    prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)
+    session = prepared.open()
+    try:
+        train(session)
+    finally:
+        session.close()
+    after = diagnose([Run.open(out)])
+    suspected = "TARGET" if diagnosis.cause == "BOTH" else diagnosis.cause  # what was swapped
+    still = after.cause in (suspected, "BOTH")
+    return {
+        "changed": changed,
+        "run": str(out),
+        "cause": after.cause,
+        "confirmed": None if after.cause == "UNDETERMINED" else not still,
+        "evidence": after.evidence,
+    }
+
+
+def swapped(run: Run, cause: Cause) -> list[str]:
+    """Return the settings that replace what is suspected."""
+    config = run.document["config"]
+    if cause == "DIVERGENCE":
+        return [f"optimizer.learning_rate={min(config['optimizer']['learning_rate'] / 10, 3e-4)}"]
+    if cause in ("TARGET", "BOTH"):
+        tau = other_target(target_rule(run)).tau
+        return [f"target={{rule='polyak', tau={tau:g}}}"]
+    # The feed: all conditions that were evaluated, equally often, and fresh rows alone.
+    share = 1 / len(config["env"]["conditions"])
+    names = list(config["env"]["conditions"])
+    natural = "practice={rule='natural'}"
+    return [
+        "replay.logs_share=0.0",
+        natural,
+        *(f"env.conditions.{name}={share:.6g}" for name in names),
+    ]

@@ -48,11 +48,13 @@ class DiagnoseCommand:
     diagnosed; those of a panel or store are checked only against the task's definitions."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
+    confirm: Path | None = None
+    """Run the experiment that would confirm the verdict, in this new run directory."""
     json: bool = False
     """Print the verdict, the evidence and every window as JSON."""
 
     def run(self) -> int:
-        from restock.train.judge.diagnose import diagnose, rows_of, with_rows
+        from restock.train.judge.diagnose import check_place, confirm, diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
         if not self.places:
@@ -69,17 +71,31 @@ class DiagnoseCommand:
             remedy="leave it out",
         )
         runs = [Run.open(path) for path in self.places]
-        diagnosis = diagnose(runs)
+        if self.confirm is not None:
+            check_place(self.confirm)
+        own = diagnosis = diagnose(runs)
         found, reason = rows_of(runs) if self.twin else (None, "")
         if found is not None:
-            diagnosis = with_rows(diagnosis, found)
-        if self.json:
-            of_rows = None if found is None else asdict(found)
-            print_json(_document(diagnosis, self.places) | {"rows": of_rows})
-        else:
+            diagnosis = with_rows(own, found)
+        if not self.json:
             _show(diagnosis, self.places)
             if found is None and self.twin:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
+        confirmation = None
+        # It confirms what the run's own figures show: no further run can tell if rows are at fault.
+        if self.confirm is not None:
+            confirmation = confirm(
+                runs[0],
+                own,
+                self.confirm,
+                rows_at_fault=found is not None and bool(found.findings),
+            )
+        if self.json:
+            of_rows = None if found is None else asdict(found)
+            document = _document(diagnosis, self.places)
+            print_json(document | {"rows": of_rows, "confirmation": confirmation})
+        elif confirmation is not None:
+            _show_confirmation(confirmation)
         failed = self.check and diagnosis.cause != "HEALTHY"
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
@@ -89,6 +105,7 @@ class DiagnoseCommand:
         from restock.train.twin.floors.layout import DEFAULT
         from restock.train.twin.physics.perturbation import load_perturbation
 
+        refuse(self, ("confirm",), "applies only to a run", remedy="leave it out")
         diagnosis = diagnose_before_training(
             path,
             profile=None if self.profile is None else load_profile(self.profile),
@@ -184,6 +201,12 @@ def _range(least: float | None, most: float | None) -> str:
     if least is None:
         return "" if most is None else f"at most {most:.3g}"
     return f"at least {least:.3g}" if most is None else f"{least:.3g} to {most:.3g}"
+
+
+def _show_confirmation(confirmation: dict[str, Any]) -> None:
+    answer = {True: "CONFIRMED", False: "REFUTED", None: "NOT DECIDED"}[confirmation["confirmed"]]
+    changed = ", ".join(confirmation["changed"])
+    print_text(f"{answer}: with {changed} it is {confirmation['cause']} ({confirmation['run']})")
 
 
 def _document(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:
