@@ -45,10 +45,10 @@ def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_store(path, [recording_transitions(index) for index in (1, 2, 3)])
 
 
-@pytest.fixture
-def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
+@pytest.fixture(scope="session")
+def shell() -> Shell:
     """Run verbs as a user does."""
-    return Shell(capsys)
+    return Shell()
 
 
 @pytest.fixture

@@ -58,12 +58,11 @@ def test_a_job_must_be_named(words: list[str], capsys: pytest.CaptureFixture[str
     assert all(job in printed for job in cli.JOBS[words[0]])
 
 
-def test_an_unknown_verb_suggests_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["inget"]) == ExitCode.USAGE
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert "no verb named 'inget'" in captured.err
-    assert "restock ingest" in captured.err
+def test_an_unknown_verb_suggests_the_near_one(shell: Shell) -> None:
+    out, err = shell.printed("inget", code=2)
+    assert out == ""
+    assert "no verb named 'inget'" in err
+    assert "restock ingest" in err
 
 
 def test_the_version_is_printed() -> None:

@@ -34,6 +34,12 @@ FILES = (
 )
 
 
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no charts of what was read: they are most of a page's time."""
+    monkeypatch.setattr("restock.report.look.charts._svg", lambda spec: "<svg/>")
+
+
 def damage(path: Path, how: str) -> None:
     content = path.read_bytes()
     path.chmod(0o644)
@@ -180,7 +186,7 @@ def test_a_store_with_a_damaged_file_is_said(table, how, root, tmp_path, capsys)
 
 
 @pytest.mark.parametrize("task", ["a key", "{", ""])
-def test_a_task_of_another_restock_is_said(task, root, tmp_path, capsys):
+def test_a_task_of_another_restock_is_said(task, root, tmp_path, shell):
     store = tmp_path / "store"
     shutil.copytree(root / "store", store)
     for file in (store / "recordings").glob("*.parquet"):
@@ -191,8 +197,7 @@ def test_a_task_of_another_restock_is_said(task, root, tmp_path, capsys):
             row["task_json"] = newer if task == "a key" else task
         pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), file)
     for argv in store_verbs(store, tmp_path):
-        assert cli.main(argv) == 2, argv
-        said = capsys.readouterr().err
+        said = shell.err(*argv)
         assert f"{store}: the task in its recordings' manifests cannot be read" in said
         assert "newer Restock" in said
 

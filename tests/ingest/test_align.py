@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import START_NS, Drive, columns, typed_topics, write_topics
-from support.ingested import answered
 
 from restock.cli import main
 from restock.errors import RecordingError
@@ -130,10 +129,10 @@ def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str,
     return found
 
 
-def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path):
+def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, shell):
     topics = logged_at(Drive(8.0), lambda time, place: 0 if place % 40 == 1 else time)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
-    (row,) = answered("ingest", bag, "--dry-run", codes=(3,))["recordings"]
+    (row,) = shell.json("ingest", bag, "--dry-run", code=3)["recordings"]
     assert row["transitions"] > 25
     assert any(loss.startswith("/odom: left out, as their stamps") for loss in row["losses"])
     assert any("the alignment clock was set" in note for note in row["notes"])
@@ -151,22 +150,22 @@ def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path):
     assert out.exists()
 
 
-def test_stamps_that_a_driver_left_at_zero_are_named(tmp_path, capsys):
+def test_stamps_that_a_driver_left_at_zero_are_named(tmp_path, shell):
     topics = typed_topics(Drive(4.0))
     for name in ("/odom", "/imu"):
         topics[name][1].fields[STAMP][:] = 0
     bag = write_topics(topics, tmp_path / "bag")
-    assert main(["ingest", str(bag), "--dry-run"]) == 2
-    said = capsys.readouterr().err
+    said = shell.err("ingest", bag, "--dry-run")
     for name in ("/odom", "/imu"):
         assert f"200 of 200 messages of {name} were left out: their header stamps do not" in said
     assert 'set [clock] alignment = "log_time" in the profile' in said
-    assert main(["profile", "check", "warehouse_amr", str(bag)]) == 2
-    assert "200 of 200 messages of /imu were left out" in capsys.readouterr().err
+    assert "200 of 200 messages of /imu were left out" in shell.err(
+        "profile", "check", "warehouse_amr", bag
+    )
 
 
 @pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
-def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path, capsys):
+def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path, shell):
     topics = logged_at(Drive(4.0), lambda time, place: 0)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     profile = msgspec.structs.replace(
@@ -174,5 +173,6 @@ def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path
     )
     with pytest.raises(RecordingError, match=r"bag: all [\d,]+ messages on /\w+ have the same log"):
         ingest(bag, profile, store=None)
-    assert main(["profile", "new", str(bag), "--out", str(tmp_path / "new.toml")]) == 3
-    assert "have the same log time" in capsys.readouterr().err
+    assert "have the same log time" in shell.err(
+        "profile", "new", bag, "--out", tmp_path / "new.toml", code=3
+    )

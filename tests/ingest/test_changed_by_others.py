@@ -10,7 +10,6 @@ import pytest
 from deltalake import DeltaTable
 from support.stores import one, shown
 
-from restock import cli
 from restock.errors import StoreError
 from restock.ingest.store import commits
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
@@ -40,13 +39,12 @@ def features(*names: str, reading: bool = True) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("feature", ["deletionVectors", "typeWidening", "fromTheFuture"])
-def test_a_reader_feature_that_is_not_known_is_refused_by_name(store, capsys, feature):
+def test_a_reader_feature_that_is_not_known_is_refused_by_name(store, feature, shell):
     """Rows that deletion vectors delete are in the Parquet files still."""
     before = sum(shown(store).values())
     with_protocol(store, **features(feature))
     for verb in (["sql", str(store), "FROM coverage"], ["store", "compact", str(store)]):
-        assert cli.main(verb) == 2
-        said = capsys.readouterr().err
+        said = shell.err(*verb)
         assert f"its table `transitions` uses Delta's feature `{feature}`" in said
         assert "DROP FEATURE" in said
         assert "Traceback" not in said
@@ -160,7 +158,7 @@ def same_as_rows(store: Path) -> None:
 
 
 @pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
-def test_rows_changed_by_another_tool_count_and_are_joined(store, capsys, way):
+def test_rows_changed_by_another_tool_count_and_are_joined(store, way, shell):
     """Summaries never outvote the rows."""
     expected = changed(store, way)
     kinds = {
@@ -174,8 +172,9 @@ def test_rows_changed_by_another_tool_count_and_are_joined(store, capsys, way):
     with Store(store) as opened:
         changes = len(opened.changed_by_others)
     assert changes == (1 if way == "merged" else 2)
-    assert cli.main(["info", str(store), "--json"]) == 0
-    assert f"not used: another tool may have changed {changes} recording" in capsys.readouterr().out
+    assert f"not used: another tool may have changed {changes} recording" in shell.out(
+        "info", store, "--json"
+    )
     writer = StoreWriter(store)
     kept = writer.rows(f"{2:016x}", f"{2:016x}-a")
     assert kept.schema.field("zone").type == pa.string()

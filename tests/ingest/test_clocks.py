@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.bag_samples import write_mcap
 from support.driven_robot import LATENCY_NS, SPEED_MPS, START_NS, Drive, write_bag
-from support.ingested import answered, ingested
+from support.ingested import ingested
 
-from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns, join
 from restock.ingest.profile.profile import load_profile
@@ -62,16 +61,15 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_bag(Odd(), tmp_path_factory.mktemp("clocks") / "bag")
 
 
-def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
+def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, shell):
     store = tmp_path / "store"
-    assert main(["ingest", str(bag), "--store", str(store)]) == 3  # the zero stamp is lost
-    shown = capsys.readouterr().out
+    shown = shell.out("ingest", bag, "--store", store, code=3)  # the zero stamp is lost
     line = " ".join(shown[shown.index(" /odom ") :].split())  # long cells are wrapped
     # 19 -> 20 and 29 -> 30 go back; and the zero stamp is off the clock, so it is left out.
     assert "2 backsteps, 1 repeated stamp, 1 zero stamp, 1 left out" in line
     assert "0.002" in line[: line.index("backsteps")]
     question = "SELECT unnest(clocks, recursive := true) FROM recordings"
-    rows = {row["topic"]: row for row in answered("sql", store, question)}
+    rows = {row["topic"]: row for row in shell.json("sql", store, question)}
     odom = rows["/odom"]
     assert (odom["messages"], odom["offset_ns"], odom["stamped"]) == (300, 2_000_000, True)
     assert (odom["backsteps"], odom["duplicates"], odom["zero_stamps"]) == (2, 1, 1)
@@ -80,9 +78,9 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
     assert rows["/cmd_vel"]["offset_ns"] is None
 
 
-def test_messages_logged_out_of_order_are_counted(tmp_path):
+def test_messages_logged_out_of_order_are_counted(tmp_path, shell):
     # Its messages step back in log time once; see bag_samples.
-    (said,) = answered("info", write_mcap(tmp_path / "a.mcap"), "--clocks")["recordings"]
+    (said,) = shell.json("info", write_mcap(tmp_path / "a.mcap"), "--clocks")["recordings"]
     assert said["topics"]["/odom"]["clock"]["log_backsteps"] == 1
 
 

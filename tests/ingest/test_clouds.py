@@ -15,7 +15,6 @@ from support.driven_robot import Drive, seen_alike, write_bag
 from support.ingested import ingested, steps_in
 from support.profile_texts import WAREHOUSE
 
-from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import Ragged, offsets_of
@@ -238,10 +237,11 @@ def test_what_makes_no_scan_of_a_cloud_is_refused(old, new, what):
         parse_profile(PROFILE.replace(old, new, 1), where="cloud.toml")
 
 
-def test_a_proposal_says_how_to_read_a_cloud(tmp_path, capsys):
+def test_a_proposal_says_how_to_read_a_cloud(tmp_path, shell):
     bag, profile = with_clouds(tmp_path / "clouds"), tmp_path / "robot.toml"
-    assert main(["profile", "new", str(bag), "--out", str(profile)]) == 0
-    assert "a slice can be read as a scan" in capsys.readouterr().err
+    assert "a slice can be read as a scan" in shell.err(
+        "profile", "new", bag, "--out", profile, code=0
+    )
     text = profile.read_text().replace("sectors = 0", "sectors = 36")
     table = re.search(r"(?m)^# \[inputs\.scan\].*(\n# .*)+", text)[0]
     own = table[2:].replace("\n# ", "\n").replace("[LOW, HIGH]", "[-0.2, 0.6]")

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from support.driven_robot import START_NS, Drive, columns, typed_topics, without, write_topics
-from support.ingested import answered, ingested, proposed
+from support.ingested import ingested, proposed
 from support.profile_texts import WAREHOUSE
 
-from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.live.node import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
@@ -218,11 +217,12 @@ def test_sources_that_show_nothing_are_refused(text, said):
         parse_profile(WAREHOUSE + text, where="p")
 
 
-def test_a_button_that_is_not_there_is_named_with_its_key(plain, tmp_path, capsys):
+def test_a_button_that_is_not_there_is_named_with_its_key(plain, tmp_path, shell):
     bag = write_topics(taken_over(2.0), tmp_path / "bag")
     profile = profile_of(plain, tmp_path, PRESSED.replace("buttons", "button"))
-    assert main(["profile", "check", str(profile), str(bag)]) == 2
-    assert "`command_sources.teleop.fields`: /joy: no field 'button'" in capsys.readouterr().err
+    assert "`command_sources.teleop.fields`: /joy: no field 'button'" in shell.err(
+        "profile", "check", profile, bag
+    )
 
 
 def test_a_proposal_finds_the_multiplexer_by_its_commands(tmp_path):
@@ -302,12 +302,12 @@ def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
     assert proposed(bag, tmp_path / "p.toml").command_sources == {}
 
 
-def test_what_a_policy_would_have_driven_does_not_drive(tmp_path):
+def test_what_a_policy_would_have_driven_does_not_drive(tmp_path, shell):
     """In shadow it publishes twists beside the command, more of them."""
     bag, file = write_topics(in_shadow(), tmp_path / "bag"), tmp_path / "p.toml"
     profile = proposed(bag, file)
     assert profile.inputs.command.topic == "/cmd_vel"
     assert profile.inputs.nav_command is None
     assert profile.command_sources == {}
-    assert answered("profile", "new", bag)["commands"] == []
+    assert shell.json("profile", "new", bag)["commands"] == []
     assert not any(line.startswith("# [signals.restock") for line in file.read_text().splitlines())

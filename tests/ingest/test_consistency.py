@@ -16,9 +16,8 @@ from support.driven_robot import (
     without,
     write_topics,
 )
-from support.ingested import answered, ingested, proposed, steps_in
+from support.ingested import ingested, proposed, steps_in
 
-from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, parse_profile
@@ -255,23 +254,22 @@ def test_what_contradicts_itself_is_kept_and_said(profile, case):
     assert 0 < one.steps <= len(steps["stamp_ns"])
 
 
-def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
+def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, shell):
     clean, wrong = (
         written(one, tmp_path / name)
         for name, one in (("clean", winding()), ("wrong", two_publishers(winding())))
     )
     file, store = tmp_path / "p.toml", tmp_path / "store"
     proposed(clean, file, "--hindsight-goals")
-    capsys.readouterr()
-    assert main(["profile", "check", str(file), str(wrong)]) == 3
-    assert "contradicts itself: /odom: its poses step at" in capsys.readouterr().out
+    assert "contradicts itself: /odom: its poses step at" in shell.out(
+        "profile", "check", file, wrong, code=3
+    )
     ingest = ["ingest", str(clean), str(wrong), "--profile", str(file), "--store", str(store)]
-    assert main([*ingest, "--verbose"]) == 3
-    assert capsys.readouterr().out.count("contradicts itself: /odom") == 1
+    assert shell.out(*ingest, "--verbose", code=3).count("contradicts itself: /odom") == 1
     query = "SELECT kind, topic, repaired FROM (SELECT unnest(findings, recursive := true)"
-    (row,) = answered("sql", store, f"{query} FROM recordings)")
+    (row,) = shell.json("sql", store, f"{query} FROM recordings)")
     assert row == {"kind": "sources", "topic": "/odom", "repaired": False}
-    said = answered("audit", store, codes=(0, 1, 3))["audits"]
+    said = shell.json("audit", store, code={0, 1, 3})["audits"]
     (audit,) = [each for each in said if each["audit"] == "contradictions"]
     assert (audit["status"], audit["rows"]) == ("warn", 1)
 

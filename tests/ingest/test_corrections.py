@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
-from support.ingested import answered
 from support.panels import panel_of
 from support.profile_texts import WAREHOUSE
 from support.stores import one
@@ -213,11 +212,11 @@ def test_episodes_tell_repeated_times_apart() -> None:
     assert moments.covered(moved).tolist() == [True, False, True, False]
 
 
-def test_label_uses_the_profile_kept_in_the_store(store, tmp_path):
+def test_label_uses_the_profile_kept_in_the_store(store, tmp_path, shell):
     text = (tmp_path / "amr.toml").read_text().replace('name = "warehouse_amr"', 'name = "own"', 1)
     (tmp_path / "amr.toml").write_text(text)
     assert ingest(tmp_path, force=True) == 0
     (tmp_path / "amr.toml").unlink()
     relabel_store(StoreWriter(store), lambda name: [Condition("always", "pre", "true")])
-    recordings = answered("store", "label", store)["recordings"]
+    recordings = shell.json("store", "label", store)["recordings"]
     assert [row["changed"] for row in recordings] == [0]

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake.schema import ArrayType, Field
 from support.driven_robot import Drive, columns
-from support.ingested import answered, ingested
+from support.ingested import ingested
 from support.paths import ROOT, sample_transitions
 from support.profile_texts import WAREHOUSE as TEXT
 from support.ragged import nested, ragged
@@ -158,7 +158,7 @@ def test_a_value_that_is_no_number_names_the_key():
         steps_with(signal("s", "a"), {"a": np.zeros((1, 3))}, [0.0])
 
 
-def test_check_says_what_the_topic_offers_instead(tmp_path):
+def test_check_says_what_the_topic_offers_instead(tmp_path, shell):
     profile = tmp_path / "p.toml"
     joints = {"topic": "/joint_states", "kind": "sensor_msgs/msg/JointState"}
     profile.write_text(
@@ -170,7 +170,7 @@ def test_check_says_what_the_topic_offers_instead(tmp_path):
             signal("e", "data", topic="/bumpr", kind="std_msgs/msg/Bool"),
         )
     )
-    said = answered("profile", "check", profile, SAMPLE, codes=(2,))
+    said = shell.json("profile", "check", profile, SAMPLE, code=2)
     assert said["outcome"] is None
     assert [problem.split(":")[0] for problem in said["problems"]] == [
         "/bumper holds std_msgs/msg/Bool, not std_msgs/msg/Float64 (signals.d)",
@@ -206,8 +206,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "store"
 
 
-def test_they_are_columns_of_the_table_with_units(store):
-    (row,) = answered(
+def test_they_are_columns_of_the_table_with_units(store, shell):
+    (row,) = shell.json(
         "sql",
         store,
         "SELECT count(*) AS rows, count(left_radps) AS left, count(beams_m) AS beams,"
@@ -219,14 +219,14 @@ def test_they_are_columns_of_the_table_with_units(store):
     assert row["fewest"] == 2
     assert 20 < row["battery"] < 30
     assert row["follows"] > 0.5
-    docs = answered("sql", store, "FROM columns WHERE view = 'transitions'")
+    docs = shell.json("sql", store, "FROM columns WHERE view = 'transitions'")
     said = {doc["column_name"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
     assert said["left_radps"] == ("DOUBLE", "rad/s", "velocity[left_wheel_joint] of /joint_states")
     assert said["beams_m"] == ("FLOAT[]", "m", "some beams")
     (file,) = (store / "transitions").glob("*/*.parquet")
     field = pq.read_schema(file).field("left_radps")
     assert field.metadata[b"unit"] == b"rad/s"
-    rows = answered("sql", store, "SELECT unnest(signals, recursive := true) FROM recordings")
+    rows = shell.json("sql", store, "SELECT unnest(signals, recursive := true) FROM recordings")
     said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
     assert said == [
         ("left_radps", "rad/s", "number", 83),
@@ -235,45 +235,49 @@ def test_they_are_columns_of_the_table_with_units(store):
     ]
 
 
-def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path):
+def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, shell):
     """Stored signals are enough: no recording is read, and the audit names the old labels."""
     by_hand = "SELECT count(*) AS n FROM transitions WHERE left_radps > {} AND battery_v > 20"
     labelled = "SELECT count(*) AS n FROM transitions WHERE primary_condition = 'fast_wheel'"
-    (before,), (five,) = answered("sql", store, labelled), answered("sql", store, by_hand.format(5))
+    (before,), (five,) = (
+        shell.json("sql", store, labelled),
+        shell.json("sql", store, by_hand.format(5)),
+    )
     assert before == five
     assert before["n"] > 0
     changed = tmp_path / "changed.toml"
     changed.write_text(with_signals(*OWN, FAST.format(7)))
     assert main(["store", "label", str(store), "--profile", str(changed)]) == 0
-    (after,), (seven,) = answered("sql", store, labelled), answered("sql", store, by_hand.format(7))
+    (after,), (seven,) = (
+        shell.json("sql", store, labelled),
+        shell.json("sql", store, by_hand.format(7)),
+    )
     assert after == seven
     assert 0 < after["n"] < before["n"]
     versions = "SELECT count(DISTINCT labels_version) AS n FROM transitions"
-    assert answered("sql", store, versions) == [{"n": 1}]
+    assert shell.json("sql", store, versions) == [{"n": 1}]
 
 
-def test_a_condition_on_an_unstored_signal_needs_an_ingest(store, tmp_path, capsys):
+def test_a_condition_on_an_unstored_signal_needs_an_ingest(store, tmp_path, shell):
     more = signal("imu_z", "linear_acceleration.z", topic="/imu", kind="sensor_msgs/msg/Imu")
     own = '[[condition]]\nname = "heavy"\ntiming = "pre"\nsql = "imu_z > 9"\n'
     profile = tmp_path / "p.toml"
     profile.write_text(with_signals(*OWN, more, own))
-    assert main(["store", "label", str(store), "--profile", str(profile)]) == 2
-    said = capsys.readouterr().err
+    said = shell.err("store", "label", store, "--profile", profile)
     assert "condition 'heavy'" in said
     assert "imu_z" in said
     assert "ingest the recordings again" in said
 
 
-def test_another_meaning_of_a_stores_column_is_refused(store, tmp_path, capsys):
+def test_another_meaning_of_a_stores_column_is_refused(store, tmp_path, shell):
     other = OWN[0].replace('"rad/s"', '"rpm"')
     profile = tmp_path / "p.toml"
     profile.write_text(with_signals(other))
     command = ["ingest", str(SAMPLE), "--store", str(store), "--profile", str(profile)]
-    assert main(command) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*command)
     assert "its column `left_radps` is a number in rad/s, and `signals.left_radps`" in said
     assert "rename the signal" in said
-    assert answered("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": ROWS}]
+    assert shell.json("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": ROWS}]
 
 
 def test_a_vector_has_one_length_and_others_are_null_and_counted():

@@ -11,7 +11,6 @@ from support.long import one_in
 from support.s3_server import files_of
 from support.stores import one, shown
 
-from restock.cli import main
 from restock.errors import QueryError, StoreError
 from restock.ingest.store import commits, lineage
 from restock.ingest.store import writer as writer_module
@@ -122,7 +121,7 @@ def test_a_damaged_manifest_is_named_and_dropped(writer, tmp_path, how):
     assert shown(tmp_path / "s") == expected((1, "b", 0), (2, "a", 0))
 
 
-def test_damaged_rows_are_ingested_with_force(tmp_path, capsys):
+def test_damaged_rows_are_ingested_with_force(tmp_path, shell):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))
     file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
@@ -133,8 +132,7 @@ def test_damaged_rows_are_ingested_with_force(tmp_path, capsys):
     store = str(tmp_path / "s")
     query = ["sql", store, "SELECT sum(reward) FROM transitions"]
     for command in (query, ["audit", store], ["mix", store, "--dry-run"]):
-        assert main(command) == 2
-        told = capsys.readouterr().err
+        told = shell.err(*command)
         assert f"its file {file} cannot be read" in told
         assert "--force" in told
     writer.write(*one(1, "b"))
@@ -161,15 +159,14 @@ def test_a_file_that_only_now_cannot_be_read_is_not_dropped(tmp_path, monkeypatc
     assert shown(tmp_path / "s") == WHOLE
 
 
-def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
+def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, shell):
     place = tmp_path / "s"
     writer = StoreWriter(place)
     writer.write_all([one(1), one(2)])
     file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
     damage(place, file, "numbers")
     before, version = active(place, TRANSITIONS), writer.path.open_table(TRANSITIONS).version()
-    assert main(["store", "compact", str(place)]) == 2
-    assert f"its file {file} cannot be read" in capsys.readouterr().err
+    assert f"its file {file} cannot be read" in shell.err("store", "compact", place)
     assert active(place, TRANSITIONS) == before
     assert writer.path.open_table(TRANSITIONS).version() == version
     assert not [one for one in files_of(place) if "transitions/compacted" in one]
@@ -220,17 +217,15 @@ def test_rows_that_are_lost_with_their_manifests_are_counted(tmp_path):
     assert shown(tmp_path / "s") == expected((2, "b", 7))
 
 
-def test_the_command_names_what_is_lost_and_exits_3(tmp_path, capsys):
+def test_the_command_names_what_is_lost_and_exits_3(tmp_path, shell):
     place = tmp_path / "s"
     writer = joined(place)
-    assert main(["store", "compact", str(place), "--drop-damaged"]) == 0
-    assert "no file is damaged" in capsys.readouterr().err
+    assert "no file is damaged" in shell.err("store", "compact", place, "--drop-damaged", code=0)
     writer.clean(retention_hours=0)
     file = next(one for one in active(place, TRANSITIONS) if "compacted" in one)
     damage(place, file, "cut")
     for options in (["--dry-run"], ["--json"]):
-        assert main(["store", "compact", str(place), "--drop-damaged", *options]) == 3
-        out, said = capsys.readouterr()
+        out, said = shell.printed("store", "compact", place, "--drop-damaged", *options, code=3)
         assert file in said
         assert "logs/1.mcap (recording 0000000000000001" in said
         assert "logs/3.mcap" in said
@@ -240,7 +235,7 @@ def test_the_command_names_what_is_lost_and_exits_3(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("gone", [TRANSITIONS, RECORDINGS])
-def test_a_store_without_one_table_is_not_made_again(tmp_path, capsys, gone):
+def test_a_store_without_one_table_is_not_made_again(tmp_path, gone, shell):
     place, log = tmp_path / "s", tmp_path / "log.mcap"
     StoreWriter(place).write_all([one(1), one(2)])
     log.touch()
@@ -252,8 +247,7 @@ def test_a_store_without_one_table_is_not_made_again(tmp_path, capsys, gone):
         ["store", "compact", str(place)],
         ["ingest", str(log), "--store", str(place)],
     ):
-        assert main(command) == 2
-        said = capsys.readouterr().err
+        said = shell.err(*command)
         assert f"`{gone}` is missing" in said
         assert "from a copy" in said
         assert "makes a store" not in said

@@ -6,7 +6,6 @@ from functools import partial
 import numpy as np
 import pytest
 from support.driven_robot import FREE_M, PERIOD_S, Drive, columns, scans, write_bag
-from support.ingested import answered
 from support.paths import ROOT
 
 from restock.ingest.containers.open_recording import open_recording
@@ -63,7 +62,7 @@ class Told(Drive):
 
 
 @pytest.mark.long
-def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path):
+def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, shell):
     drives = {
         "slow": Told(duration_s=12.0, speed_mps=0.2),
         "fast": Told(duration_s=9.0, speed_mps=0.7, every_s=0.1),
@@ -73,7 +72,7 @@ def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path):
     for name, drive in drives.items():
         write_bag(drive, tmp_path / "bags" / name)
     file = tmp_path / "trolley.toml"
-    said = answered("profile", "new", tmp_path / "bags", "--out", file)
+    said = shell.json("profile", "new", tmp_path / "bags", "--out", file)
     profile = load_profile(str(file))
     # The fastest command is of one drive, the outline and the wheels of another.
     assert max(speed for speed, _ in profile.task.actions) == pytest.approx(0.7)
@@ -87,7 +86,7 @@ def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path):
     # And it makes rows of all three.
     store = tmp_path / "store"
     bags = [str(tmp_path / "bags" / name) for name in ("slow", "fast", "described")]
-    again = answered("ingest", *bags, "--profile", file, "--store", store, codes=(0, 3))
+    again = shell.json("ingest", *bags, "--profile", file, "--store", store, code={0, 3})
     rows = [one["transitions"] for one in again["recordings"]]
     assert all(rows)
     assert sum(rows) == said["transitions"]
@@ -128,12 +127,12 @@ def test_the_usual_names_alone_tell_of_no_kind():
     assert robot_kinds(robots) == [[0], [1], [2, 3]]
 
 
-def test_what_was_read_and_what_not_is_told(tmp_path, monkeypatch):
+def test_what_was_read_and_what_not_is_told(tmp_path, monkeypatch, shell):
     monkeypatch.setattr(drives_module, "drives_by_kind", partial(drives_by_kind, most=2))
     for name, drive in (("a", Told(9.0)), ("b", Told(4.0)), ("c", Told(8.0))):
         write_bag(drive, tmp_path / "bags" / name)
     write_bag(Told(3.0, beams=40), tmp_path / "bags" / "other")
-    said = answered("profile", "new", tmp_path / "bags")
+    said = shell.json("profile", "new", tmp_path / "bags")
     a, b, c, other = (str(tmp_path / "bags" / name) for name in ("a", "b", "c", "other"))
     assert (said["read"], said["unread"]) == ([a, c], [b])
     assert [kind["recordings"] for kind in said["kinds"]] == [[a, b, c], [other]]
@@ -151,12 +150,12 @@ class Idle(Told):
         return 1.0 + 0.0 * time_s
 
 
-def test_a_drive_that_gives_no_rows_is_no_base(tmp_path):
+def test_a_drive_that_gives_no_rows_is_no_base(tmp_path, shell):
     """The largest of three drives stood still: the proposal was refused for all of them."""
     for name, drive in (("a", Told(16.0)), ("b", Told(15.0)), ("idle", Idle(40.0))):
         write_bag(drive, tmp_path / "bags" / name)
     file, bags = tmp_path / "robot.toml", str(tmp_path / "bags")
-    said = answered("profile", "new", bags, "--out", file, "--hindsight-goals")
+    said = shell.json("profile", "new", bags, "--out", file, "--hindsight-goals")
     assert said["read"][0].endswith("bags/a")
     # Ticks are .2 s apart; the goal's radius is reached a little before its place.
     assert 79 + 74 - 4 <= said["transitions"] <= 79 + 74

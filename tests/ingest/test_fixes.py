@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.driven_robot import columns, write_topics
-from support.ingested import answered
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -145,14 +144,14 @@ def test_the_track_equals_that_of_a_full_search(seed, scatter_m):
     np.testing.assert_array_equal(track_yaw(x, y, 1.0), plain_track_yaw(x, y, 1.0))
 
 
-def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path):
+def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, shell):
     profile, store = tmp_path / "gps.toml", tmp_path / "store"
     assert main(["profile", "new", str(bag), "--out", str(profile)]) in (0, 3)
     text = profile.read_text()
     origin = degrees(*(column[:1] for column in drive(np.zeros(1))[:2]))
     assert f"origin_deg = [{origin[0][0]:.7f}, {origin[1][0]:.7f}]" in text
     assert f'type = "{FIX}"' in text
-    (row,) = answered("ingest", bag, "--profile", profile, "--store", store)["recordings"]
+    (row,) = shell.json("ingest", bag, "--profile", profile, "--store", store)["recordings"]
     dropped = {one["reason"]: one["count"] for one in row["drops"]}
     assert dropped["pose: no fix"] == 5  # a second of ticks
     assert dropped["pose: fix too uncertain"] == 1

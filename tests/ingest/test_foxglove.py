@@ -19,24 +19,25 @@ from support.foxglove_robot import (
     pose,
     write_robot,
 )
-from support.ingested import answered, steps_in
+from support.ingested import steps_in
+from support.shell import Shell
 
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.drives import robot_traits
 
 
-def proposed(path: Path) -> str:
+def proposed(shell: Shell, path: Path) -> str:
     """Return the proposal's TOML, which is usable."""
-    said = answered("profile", "new", path)
+    said = shell.json("profile", "new", path)
     assert said["problems"] == []
     return str(said["toml"])
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
-def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encoding):
+def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encoding, shell):
     path = write_robot(tmp_path / "run.mcap", encoding, drive())
-    profile = parse_profile(proposed(path), where="p")
+    profile = parse_profile(proposed(shell, path), where="p")
     steps = steps_in(path, profile)
     assert {name: source.topic for name, source in profile.inputs.items()} == {
         "command": "/cmd_vel",
@@ -62,12 +63,12 @@ def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encod
     assert str(traits.lidar) == f"lidar laser, {BEAMS} beams"
 
 
-def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path):
+def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, shell):
     messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
     for time_s in np.arange(0, 20, 0.2).tolist():
         messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
     path = write_robot(tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda one: one[0]))
-    toml = proposed(path)
+    toml = proposed(shell, path)
     assert "Fixes of 0.02 m, mostly" in toml
     assert parse_profile(toml, where="p").inputs.pose.topic == "/gps/fix"
     steps = steps_in(path, toml)
@@ -78,7 +79,7 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path):
     assert np.allclose(np.hypot(x, y - radius), radius, atol=0.02)
 
 
-def test_goals_and_plans_are_not_taken_for_poses(tmp_path):
+def test_goals_and_plans_are_not_taken_for_poses(tmp_path, shell):
     at = {"timestamp": 0.0, "frame_id": "map"}
     plan = {**at, "poses": [pose(), pose(2.0, 2.0)]}
     messages: list[Message] = [
@@ -86,14 +87,14 @@ def test_goals_and_plans_are_not_taken_for_poses(tmp_path):
         (0.0, "/plan", "foxglove.PosesInFrame", plan),
         *drive(),
     ]
-    toml = proposed(write_robot(tmp_path / "run.mcap", "json", messages))
+    toml = proposed(shell, write_robot(tmp_path / "run.mcap", "json", messages))
     inputs = parse_profile(toml, where="p").inputs
     topics = inputs.goal.topic, inputs.plan.topic, inputs.pose.topic
     assert topics == ("/goal_pose", "/plan", "/pose")
 
 
 @pytest.mark.parametrize(("encoding", "together"), [("json", True), ("protobuf", False)])
-def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, encoding, together):
+def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, encoding, together, shell):
     def between(time_s: float, parent: str, child: str, at: tuple[float, ...]) -> dict[str, Any]:
         where = pose(*at)
         return {
@@ -113,7 +114,7 @@ def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, encoding, togeth
         else:
             messages += [(time_s, "/moves", "foxglove.FrameTransform", one) for one in links]
     path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
-    profile = parse_profile(proposed(path), where="p")
+    profile = parse_profile(proposed(shell, path), where="p")
     steps = steps_in(path, profile)
     assert profile.inputs.pose is None
     assert (profile.frames.fixed, profile.frames.base) == ("map", "base_link")

@@ -8,7 +8,6 @@ from support.driven_robot import START_NS, Drive, columns
 from support.paths import ROOT, SHARED
 from support.profile_texts import framed
 
-from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import load_profile, parse_profile
@@ -293,12 +292,11 @@ def test_what_a_profile_may_not_say_of_frames(frames, said):
         ("/tff", "no message of /tff or /tff (pose, by [frames])"),
     ],
 )
-def test_what_is_no_topic_of_transforms_is_named(topic, said, tmp_path, capsys):
+def test_what_is_no_topic_of_transforms_is_named(topic, said, tmp_path, shell):
     profile = tmp_path / "p.toml"
     frames = f'[frames]\ntopic = "{topic}"\nstatic_topic = "{topic}"\n[clock]'
     profile.write_text(framed(frames=frames))
-    assert main(["profile", "check", str(profile), str(SAMPLE)]) == 2
-    assert said in capsys.readouterr().err
+    assert said in shell.err("profile", "check", profile, SAMPLE)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.driven_robot import Drive, write_bag
-from support.ingested import answered, ingested, proposed
+from support.ingested import ingested, proposed
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
@@ -61,7 +61,7 @@ def unguided(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_bag_without_goals_becomes_missions_that_say_so(unguided):
+def test_a_bag_without_goals_becomes_missions_that_say_so(unguided, shell):
     profile = load_profile(unguided / "robot0.toml")
     assert (profile.goal_source, profile.inputs.goal, profile.task.goal) == (
         *("hindsight", None),
@@ -81,7 +81,7 @@ def test_a_bag_without_goals_becomes_missions_that_say_so(unguided):
             assert furthest == pytest.approx(length, abs=0.2)
             assert sane
         assert store.sql("SELECT sum(success_share) FROM coverage").fetchall() == [(None,)]
-    said = answered("audit", unguided / "store", codes=(0, 1))["audits"]
+    said = shell.json("audit", unguided / "store", code={0, 1})["audits"]
     audits = {one["audit"]: one for one in said}
     assert audits["goals_by_hindsight"]["sample"][0]["arrived"] == 2
     assert audits["mixed_goal_sources"]["status"] == "pass"

@@ -18,7 +18,6 @@ from mcap.writer import CompressionType, Writer
 from support.bag_samples import write_bag, write_channels, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
-from support.ingested import answered
 from support.long import one_in
 
 from restock.cli import main
@@ -374,7 +373,7 @@ def test_no_control_character_reaches_the_terminal(tmp_path, capsys):
 @pytest.mark.parametrize(
     "name", one_in(3, [b"a\x1b[2J\nb\xe2\x80\xaec", b"bad\xff", b"[red]caf\xc3\xa9 [b]"])
 )
-def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, capsys):
+def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, capsys, shell):
     bag = write_drive(Drive(2.0, truth="nominal"), tmp_path / "run", storage=storage)
     (file,) = bag.glob("run.*")
     odd = tmp_path / os.fsdecode(name)
@@ -392,7 +391,7 @@ def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, cap
         (steps,) = opened.sql("SELECT DISTINCT source_file FROM transitions").fetchall()
     assert steps == (visible(given),) == (recordings[0]["source_file"],)
     assert visible(given) in printed.out
-    (row,) = answered("ingest", given, "--dry-run")["recordings"]
+    (row,) = shell.json("ingest", given, "--dry-run")["recordings"]
     assert row["path"] == given
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from deltalake import DeltaTable
 from support.driven_robot import Drive, write_bag
-from support.ingested import answered
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
@@ -46,14 +45,14 @@ def rows(path: Path, columns: str = "*") -> list[tuple]:
         return opened.sql(query).fetchall()
 
 
-def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path):
+def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, shell):
     others = "* EXCLUDE (primary_condition, conditions, labels_version, ingest_id)"
     before = rows(store, others)
     changed = tmp_path / "changed.toml"
     changed.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
     files = len(DeltaTable(str(store / "transitions")).file_uris())
     version = DeltaTable(str(store / "transitions")).version()
-    said = answered("store", "label", store, "--profile", changed)
+    said = shell.json("store", "label", store, "--profile", changed)
     assert said["version"] == version + 1  # one commit for both recordings
     assert [row["changed"] for row in said["recordings"]] == [6, 6]
     assert len(DeltaTable(str(store / "transitions")).file_uris()) == files
@@ -65,7 +64,7 @@ def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path):
     with Store(store) as opened:
         assert "1.95" in next(c.sql for c in opened.conditions() if c.name == "soon")
         assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(2,)]
-    again = answered("store", "label", store, "--profile", changed)
+    again = shell.json("store", "label", store, "--profile", changed)
     assert again["version"] is None
     assert [row["changed"] for row in again["recordings"]] == [0, 0]
 
@@ -91,9 +90,8 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
     assert {name for (name,) in rows(store, "primary_condition")} == {"nominal", "soon"}
 
 
-def test_what_cannot_be_labelled_again_is_refused(store, tmp_path, capsys):
-    assert main(["store", "label", str(tmp_path / "none")]) == 2
-    assert "there is no store, or it is empty" in capsys.readouterr().err
+def test_what_cannot_be_labelled_again_is_refused(store, tmp_path, shell):
+    assert "there is no store, or it is empty" in shell.err("store", "label", tmp_path / "none")
     writer = StoreWriter(store)
     original = writer.rows
     writer.rows = lambda *key: original(*key).replace_schema_metadata(None)

@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.cameras import file_of, picture
-from support.ingested import answered
 
 from restock.cli import main
 from restock.cli.data.watch import incomplete
@@ -138,15 +137,15 @@ def test_a_folder_is_recognised_by_its_info_alone(tmp_path):
         recordings_in(tmp_path)
 
 
-def test_ingest_and_sql_take_a_data_set(tmp_path):
+def test_ingest_and_sql_take_a_data_set(tmp_path, shell):
     folder = write_set(tmp_path / "set")
     profile, store = tmp_path / "own.toml", tmp_path / "store"
     profile.write_text(PROFILE)
     action = np.zeros((80, 4), np.float32)
     action[5, 1], action[6, 2] = np.nan, 0.1  # a command that is unknown, and one sideways
     rewrite(folder / FILES[0], action=lists(action))
-    assert answered("sql", folder, 'SELECT max(theta_vel) AS m FROM "/action"') == [{"m": 9.0}]
-    (document,) = answered("ingest", folder, "--profile", profile, "--store", store)["recordings"]
+    assert shell.json("sql", folder, 'SELECT max(theta_vel) AS m FROM "/action"') == [{"m": 9.0}]
+    (document,) = shell.json("ingest", folder, "--profile", profile, "--store", store)["recordings"]
     assert document["drops"] == [{"reason": "command: not finite", "count": 1}]
     assert any("1 of 160 messages of /action contain a sideways" in n for n in document["notes"])
     assert "dead reckoning by the speeds" in str(document["stand_ins"])

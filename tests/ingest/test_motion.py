@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.driven_robot import SPEED_MPS, Drive, write_bag
-from support.ingested import answered, ingested, proposed
+from support.ingested import ingested, proposed
 
-from restock.cli import main
 from restock.ingest.steps.frames import PoseSeries, motion_at
 
 NS = 10**9
@@ -94,7 +93,7 @@ def test_a_jump_that_no_robot_drives_is_counted_as_one(tmp_path, capsys):
     assert "wheels: a pose jump within" in capsys.readouterr().out
 
 
-def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):
+def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys, shell):
     bag, file, store = write_bag(NoOdometry(), tmp_path / "bag"), tmp_path / "p", tmp_path / "s"
     assert "wheel_slip" not in proposed(bag, file).shipped_conditions
     assert "# [inputs.wheels]  # no usable odometry; instead: speeds from poses" in file.read_text()
@@ -102,12 +101,12 @@ def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):
         query = "SELECT min(wheel_speed_mps), max(wheel_speed_mps) FROM transitions"
         assert opened.sql(query).fetchall() == [(pytest.approx(SPEED_MPS),) * 2]
     assert "no wheels: speeds from the poses of the last" in capsys.readouterr().out
-    said = answered("audit", store, codes=(0, 1, 3))["audits"]
+    said = shell.json("audit", store, code={0, 1, 3})["audits"]
     (found,) = [each for each in said if each["audit"] == "speeds_from_poses"]
     assert (found["status"], found["rows"]) == ("warn", 1)
 
 
-def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
+def test_a_profile_has_wheels_or_motion(tmp_path, shell):
     bag, file = write_bag(NoOdometry(), tmp_path / "bag"), tmp_path / "p.toml"
     proposed(bag, file)
     text = file.read_text()
@@ -117,6 +116,4 @@ def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
         (text.replace("window_s = 0.", "window_s = -0."), "motion.window_s must be in"),
     ):
         file.write_text(wrong)
-        capsys.readouterr()
-        assert main(["profile", "check", str(file), str(bag)]) == 2
-        assert what in capsys.readouterr().err
+        assert what in shell.err("profile", "check", file, bag)

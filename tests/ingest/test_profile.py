@@ -4,7 +4,6 @@ import pickle
 
 import pytest
 from support.driven_robot import Drive, typed_topics, write_bag, write_topics
-from support.ingested import answered
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
@@ -129,10 +128,9 @@ def bag(tmp_path_factory):
     return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")
 
 
-def test_a_proposed_profile_reads_its_recording(bag, tmp_path, capsys):
+def test_a_proposed_profile_reads_its_recording(bag, tmp_path, shell):
     file = tmp_path / "mine.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    assert capsys.readouterr().out == ""
+    assert shell.out("profile", "new", bag, "--out", file) == ""
     profile = load_profile(file)
     assert profile.name == "mine"
     shipped = load_profile("warehouse_amr")
@@ -144,18 +142,18 @@ def test_a_proposed_profile_reads_its_recording(bag, tmp_path, capsys):
     assert profile.task.control_period_s == 0.2
     assert profile.clock.steps == "command"
     assert (0.4, 0.0) in profile.task.actions  # what the robot was told
-    said = answered("profile", "check", file, bag)
+    said = shell.json("profile", "check", file, bag)
     assert said["problems"] == []
     assert said["outcome"]["transitions"] == 29
     assert {one["input"] for one in said["inputs"]} >= {"command", "pose", "scan", "plan"}
 
 
-def test_a_proposal_says_what_no_topic_fills(tmp_path):
+def test_a_proposal_says_what_no_topic_fills(tmp_path, shell):
     class Blind(Drive):
         drop = ("/odom", "/plan", "/imu", "/amcl_pose")
 
     bag = write_bag(Blind(), tmp_path / "bag")
-    said = answered("profile", "new", bag, codes=(3,))
+    said = shell.json("profile", "new", bag, code=3)
     assert said["missing"] == ["pose"]
     out = said["toml"]
     assert 'source = "hindsight"' in out

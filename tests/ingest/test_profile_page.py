@@ -7,7 +7,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from support.ingested import answered
 from support.pages import Block, blocks
 from support.paths import ROOT
 
@@ -38,7 +37,7 @@ def assert_prints_as_shown(block: Block, capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.slow  # two ingests of all sample logs
-def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
+def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys, shell):
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     monkeypatch.chdir(tmp_path)
     ingested, audited, labelled = [block for block in BLOCKS if block.language == "console"]
@@ -60,9 +59,9 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     assert_prints_as_shown(audited, capsys)
     assert_prints_as_shown(labelled, capsys)
 
-    audits = answered("audit", "store", codes=(0, 1, 3))["audits"]
+    audits = shell.json("audit", "store", code={0, 1, 3})["audits"]
     assert [one["rows"] for one in audits if one["audit"] == "stale_labels"] == [0]
-    again = answered("ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store")
+    again = shell.json("ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store")
     assert {one["status"] for one in again["recordings"]} == {"unchanged"}
 
 

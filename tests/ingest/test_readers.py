@@ -19,12 +19,11 @@ from support.bag_samples import (
     write_bag,
     write_mcap,
 )
-from support.ingested import answered
 from support.paths import SHARED
 
 from restock.cli import main
 from restock.cli.data.info import describe_recording, offered
-from restock.errors import ExitCode, RecordingError
+from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording, recordings_in
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
@@ -179,7 +178,7 @@ def test_finding_recordings(tmp_path: Path) -> None:
         recordings_in(tmp_path / "empty")
 
 
-def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, capsys):
+def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, shell):
     """A folder that is somebody else's, and a link to a disk that is not mounted any more."""
     locked = tmp_path / "locked"
     locked.mkdir()
@@ -194,8 +193,7 @@ def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, capsys):
         return listed(folder)
 
     monkeypatch.setattr(Path, "iterdir", refused)
-    assert main(["info", str(tmp_path), "--json"]) == ExitCode.USAGE
-    out, err = capsys.readouterr()
+    out, err = shell.printed("info", tmp_path, "--json", code=2)
     shown = [Path(one["path"]).name for one in json.loads(out)["recordings"]]
     assert shown == ["good.mcap"]
     assert f"{locked}: cannot be read: Permission denied" in err
@@ -493,10 +491,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_json_names_every_recording_and_topic(folder, capsys):
-    assert main(["info", str(folder), "--json"]) == 0
-    printed = capsys.readouterr()
-    recordings = json.loads(printed.out)["recordings"]
+def test_json_names_every_recording_and_topic(folder, shell):
+    printed = shell.out("info", folder, "--json")
+    recordings = json.loads(printed)["recordings"]
     assert [entry["path"] for entry in recordings] == [
         str(folder / "bag"),
         str(folder / "one.mcap"),
@@ -529,13 +526,13 @@ def test_offered_qos_is_named_whatever_version_wrote_it(text):
     assert offered(text) == OFFERED[text]
 
 
-def test_it_says_that_damage_is_unseen_until_messages_are_read(folder):
+def test_it_says_that_damage_is_unseen_until_messages_are_read(folder, shell):
     path = folder / "one.mcap"
     content = bytearray(path.read_bytes())
     content[len(content) // 4] ^= 0xFF  # within the messages of a chunk
     path.write_bytes(content)
-    (entry,) = answered("info", path)["recordings"]
+    (entry,) = shell.json("info", path)["recordings"]
     assert (entry["integrity"], entry["damage"]) == (None, [])
-    (entry,) = answered("info", path, "--clocks", codes=(3,))["recordings"]
+    (entry,) = shell.json("info", path, "--clocks", code=3)["recordings"]
     assert entry["integrity"] == "damaged"
     assert "is lost" in entry["damage"][0]

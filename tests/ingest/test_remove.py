@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from support.ingested import answered
 from support.long import one_in
 from support.stores import one, shown
 
@@ -164,31 +163,29 @@ def test_what_is_ingested_again_meanwhile_is_not_removed(tmp_path, before_commit
     assert shown(tmp_path / "s") == expected((1, "a"), (2, "b"), (3, "a"))
 
 
-def test_the_command_says_what_it_removed(tmp_path, capsys):
+def test_the_command_says_what_it_removed(tmp_path, shell):
     place = str(tmp_path / "s")
     three(place)
-    assert main(["store", "remove", place, "logs/2.mcap", "--dry-run"]) == 0
-    out, said = capsys.readouterr()
+    out, said = shell.printed("store", "remove", place, "logs/2.mcap", "--dry-run")
     assert name_of(2) in out
     assert "would remove 1 recording" in said
     assert len(shown(place)) == 3
-    assert main(["store", "remove", place, "2.mcap", name_of(3)]) == 0
-    out, said = capsys.readouterr()
+    out, said = shell.printed("store", "remove", place, "2.mcap", name_of(3))
     assert all(word in out for word in (name_of(2), "logs/2.mcap", str(len(one(2)[1]))))
     assert "removed 2 recordings" in said
     assert f"restock ingest logs/2.mcap logs/3.mcap --store {place}" in said
     version = StoreWriter(place).path.open_table(TRANSITIONS).version() - 1
     assert f"{place}@{version}" in said
     assert shown(place) == expected((1, "a"))
-    assert len(answered("sql", f"{place}@{version}", "FROM recordings")) == 3
-    document = answered("store", "remove", place, name_of(1))
+    assert len(shell.json("sql", f"{place}@{version}", "FROM recordings")) == 3
+    document = shell.json("store", "remove", place, name_of(1))
     assert document["recordings"][0]["source_file"] == "logs/1.mcap"
     assert (document["left"], document["dry_run"]) == (0, False)
     assert main(["store", "remove", place]) == 2  # names no recording
     assert main(["store", "remove", str(tmp_path / "none"), name_of(1)]) == 2
 
 
-def test_labels_corrected_in_a_removed_recording_go_with_it(tmp_path, capsys):
+def test_labels_corrected_in_a_removed_recording_go_with_it(tmp_path, shell):
     writer = three(tmp_path / "s")
     (first, second, _) = writer.live().sort_by("recording_id").to_pylist()
     stamps = [int(one(n)[1]["stamp_ns"][0].as_py()) for n in (1, 2)]
@@ -200,8 +197,9 @@ def test_labels_corrected_in_a_removed_recording_go_with_it(tmp_path, capsys):
         for row, at_ns in zip((first, second), stamps, strict=True)
     }
     correct_store(writer, given)
-    assert main(["store", "remove", str(tmp_path / "s"), name_of(2)]) == 0
-    assert "does not bring back 1 correction of labels" in capsys.readouterr().err
+    assert "does not bring back 1 correction of labels" in shell.err(
+        "store", "remove", tmp_path / "s", name_of(2), code=0
+    )
     with pytest.raises(StoreError, match="was ingested again or removed"):
         correct_store(writer, given)
     with Store(tmp_path / "s") as store:

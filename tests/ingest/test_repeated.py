@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from support.ingested import answered
 from support.paths import ROOT
+from support.shell import Shell
 from support.stores import manifest, recording_transitions
 
 from restock.cli import main
@@ -17,9 +17,9 @@ from restock.ingest.store.writer import StoreWriter
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
 
 
-def ingested(*arguments: str | Path) -> dict[str, Any]:
+def ingested(shell: Shell, *arguments: str | Path) -> dict[str, Any]:
     """Return what `restock ingest … --json` says of one recording."""
-    (one,) = answered("ingest", *arguments, codes=(0, 2, 3))["recordings"]
+    (one,) = shell.json("ingest", *arguments, code={0, 2, 3})["recordings"]
     return dict(one)
 
 
@@ -55,11 +55,11 @@ def test_sketches_that_share_hashes_are_found_together():
     assert sharing(mine, []) == sharing(mine[:0], sketches) == []
 
 
-def test_the_whole_after_a_part_is_said(part, third, tmp_path):
+def test_the_whole_after_a_part_is_said(part, third, tmp_path, shell):
     store = tmp_path / "store"
-    first = ingested(part, "--salvage", "--store", store)
+    first = ingested(shell, part, "--salvage", "--store", store)
     assert first["repeats"] is None
-    whole = ingested(third, "--salvage", "--store", store)
+    whole = ingested(shell, third, "--salvage", "--store", store)
     assert whole["status"] == "written"
     assert whole["repeats"] == {
         "recording_id": first["recording_id"],
@@ -74,31 +74,31 @@ def test_the_whole_after_a_part_is_said(part, third, tmp_path):
     assert f"`restock store remove {store} {first['recording_id']}` removes that one" in note
 
 
-def test_the_whole_takes_the_place_of_a_part_where_asked(part, third, tmp_path):
+def test_the_whole_takes_the_place_of_a_part_where_asked(part, third, tmp_path, shell):
     """As of a bag that was still being written the night before. The part does not come back."""
     store, replace = tmp_path / "store", ("--repeated", "replace")
-    first = ingested(part, "--salvage", "--store", store, *replace)
-    whole = ingested(third, "--salvage", "--store", store, *replace)
+    first = ingested(shell, part, "--salvage", "--store", store, *replace)
+    whole = ingested(shell, third, "--salvage", "--store", store, *replace)
     (note,) = (note for note in whole["notes"] if "which was removed" in note)
     assert note.startswith(f"in place of {part} (recording {first['recording_id']}), a part of it")
     assert [row["recording_id"] for row in StoreWriter(store).live().to_pylist()] == [
         whole["recording_id"]
     ]
-    again = ingested(part, "--salvage", "--store", store, *replace)
+    again = ingested(shell, part, "--salvage", "--store", store, *replace)
     assert again["status"] == "failed"
     assert whole["recording_id"] in again["error"]
 
 
-def test_what_people_corrected_stays(part, third, tmp_path):
+def test_what_people_corrected_stays(part, third, tmp_path, shell):
     store = tmp_path / "store"
-    first = ingested(part, "--salvage", "--store", store)
+    first = ingested(shell, part, "--salvage", "--store", store)
     review = tmp_path / "review.csv"
     review.write_text(
         "episode_id,condition,first_step,last_step,verdict\n"
         f"{first['recording_id']}/0,near_collision,0,3,yes\n"
     )
     assert main(["review", str(store), str(review)]) == 0
-    whole = ingested(third, "--salvage", "--store", store, "--repeated", "replace")
+    whole = ingested(shell, third, "--salvage", "--store", store, "--repeated", "replace")
     (note,) = (note for note in whole["notes"] if "It stays" in note)
     assert "people corrected 1 label of it" in note
     assert f"`restock store remove {store} {first['recording_id']}`" in note

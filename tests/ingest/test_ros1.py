@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from support.ingested import answered
 
-from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 
@@ -184,7 +182,7 @@ def two_types(path: Path, kinds: tuple[str, str]) -> Path:
 
 
 @pytest.mark.parametrize("kinds", [TRANSFORMS, TRANSFORMS[::-1]])
-def test_both_types_of_transforms_are_read(tmp_path, capsys, kinds):
+def test_both_types_of_transforms_are_read(tmp_path, kinds, shell):
     path = two_types(tmp_path / "run.bag", kinds)
     field = "transforms[].transform.translation.x"
     with open_recording(path) as recording:
@@ -195,19 +193,18 @@ def test_both_types_of_transforms_are_read(tmp_path, capsys, kinds):
         assert (account.expected, account.decoded, account.reasons) == (2 * EACH, 2 * EACH, {})
         assert account.log_backsteps == 0
         assert not recording.lost_messages
-    assert main(["info", str(path)]) == 0
-    said = capsys.readouterr().err
+    said = shell.err("info", path, code=0)
     assert f"/both has 2 types: 30 messages of {kinds[0]}, 30 of {kinds[1]}" in said
     assert "not read" not in said
 
 
-def test_what_another_type_makes_unreadable_is_counted_and_said(tmp_path):
+def test_what_another_type_makes_unreadable_is_counted_and_said(tmp_path, shell):
     path = two_types(tmp_path / "run.bag", ("std_msgs/msg/Int32", "std_msgs/msg/Float32"))
     with open_recording(path) as recording:
         assert len(recording.read({"/both": ["data"]})["/both"]) == EACH
         (lost,) = recording.lost_messages
         assert lost.messages == EACH
         assert "std_msgs/msg/Float32" in lost.reason
-    (entry,) = answered("info", path)["recordings"]
+    (entry,) = shell.json("info", path)["recordings"]
     (note,) = entry["notes"]
     assert note.endswith("30 of std_msgs/msg/Float32: only those of std_msgs/msg/Int32 are read")

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.driven_robot import Drive, transforms, typed_topics, write_topics
-from support.ingested import answered, ingested, proposed
+from support.ingested import ingested, proposed
 
-from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.drives import propose_profile
@@ -32,8 +31,8 @@ def write_fleet(folder: Path, own: str = "") -> Path:
         (["--robot", "/robot2/"], "/robot2", "/robot1"),
     ],
 )
-def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_path):
-    document = answered("profile", "new", write_fleet(tmp_path), *flags)
+def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_path, shell):
+    document = shell.json("profile", "new", write_fleet(tmp_path), *flags)
     profile = parse_profile(document["toml"], where="proposed")
     # Of one name, the audit stale_labels would take two robots' profiles for versions of one.
     assert profile.name == ("fleet" if not flags else f"fleet_{robot.strip('/')}")
@@ -79,10 +78,9 @@ def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_pat
 
 
 @pytest.mark.parametrize("name", ["robot3", "front"])
-def test_an_absent_robot_is_refused_with_those_present(name, tmp_path, capsys):
+def test_an_absent_robot_is_refused_with_those_present(name, tmp_path, shell):
     bag, out = write_fleet(tmp_path), tmp_path / "robot.toml"
-    assert main(["profile", "new", str(bag), "--robot", name, "--out", str(out)]) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(shell.err("profile", "new", bag, "--robot", name, "--out", out).split())
     assert f"fleet: there is no robot /{name.strip('/')} in the recording" in said
     assert "its robots are /robot1, /robot2" in said
     assert not out.exists()

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from support.bag_samples import write_bag
 
-from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 
@@ -190,13 +189,11 @@ def test_a_lost_message_is_counted_once(whole: Path, tmp_path: Path) -> None:
     assert reported[1] == reported[2] == reported[0]
 
 
-def test_exit_codes_of_a_damaged_file(whole, tmp_path, capsys):
+def test_exit_codes_of_a_damaged_file(whole, tmp_path, shell):
     file = tmp_path / "run.db3"
     file.write_bytes(DAMAGE["a leaf is zeros"](bytearray(whole.read_bytes())))
-    assert main(["info", str(file)]) == 2
-    assert "--salvage" in capsys.readouterr().err
-    assert main(["info", str(file), "--salvage"]) == 3
-    assert "missing, by their row numbers" in capsys.readouterr().err
+    assert "--salvage" in shell.err("info", file)
+    assert "missing, by their row numbers" in shell.err("info", file, "--salvage", code=3)
 
 
 def test_a_damaged_file_with_rows_in_a_wal_file(whole: Path, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 from support.driven_robot import columns, write_topics
-from support.ingested import answered
 from support.long import one_in
 from twin.test_robot_drives import CAR, OUTLINE
 
@@ -92,10 +91,10 @@ def bag(folder: Path, *, pivots: bool) -> Path:
     )
 
 
-def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path):
+def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path, shell):
     file = tmp_path / "car.toml"
     source = bag(tmp_path / "bag", pivots=False)
-    said = answered("profile", "new", source, "--out", file)["advice"]
+    said = shell.json("profile", "new", source, "--out", file)["advice"]
     advice = {one["key"]: one["text"] for one in said}
     assert "STEERS LIKE A CAR: commanded to turn on the spot, by 6.3" in advice["robot.drive"]
     assert "# CONFIRM THAT IT STEERS LIKE A CAR" in file.read_text()

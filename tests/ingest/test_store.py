@@ -18,7 +18,6 @@ from support.s3_server import files_of
 from support.stores import one, shown
 
 import restock
-from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.removal import remove_recordings
@@ -209,14 +208,13 @@ def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
     ("file", "said"),
     [("panel.json", "is a panel, not a store"), ("config.json", "is the folder of a run")],
 )
-def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, capsys, file, said):
+def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, file, said, shell):
     (tmp_path / file).write_text("{}")
     with pytest.raises(StoreError, match=said):
         StoreWriter(tmp_path).write(*one(1))
     # Said once, before a recording is read.
     recordings = [str(ROOT / "sample_logs" / name) for name in ("amr_monday.mcap", "amr_tuesday")]
-    assert main(["ingest", *recordings, "--store", str(tmp_path)]) == 2
-    reported = capsys.readouterr().err
+    reported = shell.err("ingest", *recordings, "--store", tmp_path)
     assert (reported.count(said), "was not added" in reported) == (1, False)
     assert [path.name for path in tmp_path.iterdir()] == [file]
 

@@ -10,8 +10,9 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.driven_robot import Drive, write_bag
-from support.ingested import answered, queried
+from support.ingested import queried
 from support.profile_texts import WAREHOUSE
+from support.shell import Shell
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
@@ -39,16 +40,18 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bag"
 
 
-def ingest_with(bag: Path, store: Path, *options: str) -> Any:
+def ingest_with(shell: Shell, bag: Path, store: Path, *options: str) -> Any:
     """Return what is said of the bag."""
     profile = bag.parent / "amr.toml"
-    (row,) = answered("ingest", bag, "--store", store, "--profile", profile, *options)["recordings"]
+    (row,) = shell.json("ingest", bag, "--store", store, "--profile", profile, *options)[
+        "recordings"
+    ]
     return row
 
 
-def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path):
+def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, shell):
     store = tmp_path / "store"
-    row = ingest_with(bag, store, "--tag", "robot=amr-07", "--tag", "line=b = c")
+    row = ingest_with(shell, bag, store, "--tag", "robot=amr-07", "--tag", "line=b = c")
     tags = {"robot": "amr-07", "line": "b = c"}
     assert (row["status"], row["tags"]) == ("written", tags)
     for view in ("recordings", "transitions", "episodes"):
@@ -56,9 +59,9 @@ def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path):
         assert queried(store, query) == [("amr-07", None, None, None, None, tags)]
 
 
-def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
+def test_times_are_the_nanoseconds_beside_them(bag, tmp_path, shell):
     store = tmp_path / "store"
-    ingest_with(bag, store)
+    ingest_with(shell, bag, store)
     pairs = {
         "transitions": ["stamp", "logged", "pose_stamp"],
         "recordings": ["start_stamp", "end_stamp"],
@@ -75,11 +78,11 @@ def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
         assert logged.fetchall() == episode.fetchall()
 
 
-def test_new_tags_alone_change_no_row(bag, tmp_path):
+def test_new_tags_alone_change_no_row(bag, tmp_path, shell):
     store, others = tmp_path / "store", "FROM (SELECT * EXCLUDE (ingest_id, tags, robot, site)"
-    ingest_with(bag, store, "--tag", "site=oslo")
+    ingest_with(shell, bag, store, "--tag", "site=oslo")
     rows = queried(store, f"{others} FROM transitions) ORDER BY transition_id")
-    row = ingest_with(bag, store, "--tag", "robot=amr-07")
+    row = ingest_with(shell, bag, store, "--tag", "robot=amr-07")
     assert (row["status"], row["version"]) == ("tagged", 2)
     assert row["tags"] == {"robot": "amr-07", "site": "oslo"}
     assert row["notes"] == [
@@ -87,18 +90,20 @@ def test_new_tags_alone_change_no_row(bag, tmp_path):
     ]
     assert queried(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
     assert queried(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
-    assert ingest_with(bag, store)["status"] == "unchanged"  # who says nothing changes nothing
-    ingest_with(bag, store, "--force")
+    assert (
+        ingest_with(shell, bag, store)["status"] == "unchanged"
+    )  # who says nothing changes nothing
+    ingest_with(shell, bag, store, "--force")
     assert queried(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
-    ingest_with(bag, store, "--tag", "site=")
+    ingest_with(shell, bag, store, "--tag", "site=")
     assert queried(store, "SELECT robot, site, tags FROM recordings") == [
         ("amr-07", None, {"robot": "amr-07"})
     ]
 
 
-def test_relabelling_keeps_the_tags(bag, tmp_path):
+def test_relabelling_keeps_the_tags(bag, tmp_path, shell):
     store = tmp_path / "store"
-    ingest_with(bag, store, "--tag", "robot=amr-07")
+    ingest_with(shell, bag, store, "--tag", "robot=amr-07")
     other = tmp_path / "other.toml"
     other.write_text(WAREHOUSE + '\n[[condition]]\nname = "never"\ntiming = "pre"\nsql = "false"\n')
     assert main(["store", "label", str(store), "--profile", str(other)]) == 0
@@ -121,9 +126,10 @@ def test_tags_of_another_form_are_refused(texts, says):
     assert says in refused.value.what
 
 
-def test_a_wrong_tag_writes_nothing(bag, tmp_path, capsys):
-    assert main(["ingest", str(bag), "--store", str(tmp_path / "store"), "--tag", "robot"]) == 2
-    assert "such as --tag robot=amr-07" in capsys.readouterr().err
+def test_a_wrong_tag_writes_nothing(bag, tmp_path, shell):
+    assert "such as --tag robot=amr-07" in shell.err(
+        "ingest", bag, "--store", tmp_path / "store", "--tag", "robot"
+    )
     assert not (tmp_path / "store").exists()
 
 
@@ -325,20 +331,19 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_bag(Drive(), folder / "monday")
 
 
-def test_an_ingest_by_the_path_writes_all_or_nothing(driven, tmp_path, capsys, monkeypatch):
+def test_an_ingest_by_the_path_writes_all_or_nothing(driven, tmp_path, monkeypatch, shell):
     profile = tmp_path / "amr.toml"
     profile.write_text(WAREHOUSE + '\n[tags]\nfrom_path = "{site}/amr-{robot}/*"\n')
     options = ["--store", str(tmp_path / "store"), "--profile", str(profile)]
     lost = tmp_path / "X" / "amr" / "monday"
     shutil.copytree(driven, lost)
-    assert main(["ingest", str(lost), *options]) == 2
-    assert "does not match '{site}/amr-{robot}/*'" in capsys.readouterr().err
+    assert "does not match '{site}/amr-{robot}/*'" in shell.err("ingest", lost, *options)
     assert not (tmp_path / "store").exists()
     monkeypatch.chdir(driven.parent)  # the path as it is given says nothing of the site
     assert main(["ingest", "monday", *options]) == 0
     # A copy under another path is the same recording: it does not take the tags along.
     copy = shutil.copytree(driven, tmp_path / "old" / "amr-08" / "monday")
-    kept, copied = answered("ingest", "monday", copy, *options)["recordings"]
+    kept, copied = shell.json("ingest", "monday", copy, *options)["recordings"]
     assert [kept["status"], copied["status"]] == ["unchanged", "unchanged"]
     assert copied["notes"] == [
         "the same recording as monday, whose tags it keeps: robot=07, site=oslo"

@@ -138,16 +138,14 @@ def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
     assert "nas/run.mcap: cannot be read or written: Input/output error" in str(failed)
 
 
-def test_developers_see_where_a_recording_failed(bags, monkeypatch, capsys):
+def test_developers_see_where_a_recording_failed(bags, monkeypatch, shell):
     monkeypatch.setattr("restock.ingest.pipeline.preparing", lambda path, *_, **__: path.no_such)
     arguments = ["ingest", str(bags / "drive1"), "--dry-run", "--json"]
-    assert main(arguments) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*arguments)
     assert "drive1: a bug in Restock: AttributeError" in said
     assert "Traceback" not in said
     monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
-    assert main(arguments) == 2
-    assert "Traceback (most recent call last)" in capsys.readouterr().err
+    assert "Traceback (most recent call last)" in shell.err(*arguments)
 
 
 def command(bags: Path, store: Path, *more: str) -> list[str]:

@@ -154,7 +154,7 @@ def test_wrong_places_are_refused(tmp_path, store_path, run_dir, shell):
         assert problem in shell.err("sql", place, *words, "SELECT 1")
 
 
-def test_without_a_query_there_is_a_prompt(store_path, capsys, monkeypatch):
+def test_without_a_query_there_is_a_prompt(store_path, monkeypatch, shell):
     lines = iter(["SELECT 41 + 1", "AS answer;", "FROM nope;", "SELECT 7 AS seven;"])
 
     def answer(prompt: str) -> str:
@@ -165,21 +165,19 @@ def test_without_a_query_there_is_a_prompt(store_path, capsys, monkeypatch):
 
     monkeypatch.setattr("builtins.input", answer)
     monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
-    assert cli.main(["sql", str(store_path), "--csv"]) == 0
-    captured = capsys.readouterr()
-    assert captured.out == "answer\n42\nseven\n7\n"
-    assert "nope" in captured.err
+    out, err = shell.printed("sql", store_path, "--csv")
+    assert out == "answer\n42\nseven\n7\n"
+    assert "nope" in err
 
 
-def test_the_prompt_has_help_and_lists_tables(store_path, capsys, monkeypatch):
+def test_the_prompt_has_help_and_lists_tables(store_path, monkeypatch, shell):
     lines = iter([".help", ".tables", r"SELECT 7 AS seven \G", ".quit"])
     monkeypatch.setattr("builtins.input", lambda prompt: next(lines))
     monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
-    assert cli.main(["sql", str(store_path)]) == 0
-    captured = capsys.readouterr()
-    assert ".tables" in captured.err
-    assert {"transitions", "coverage"} <= {line.split()[0] for line in captured.out.splitlines()}
-    assert captured.out.endswith("row 1\n  seven  7\n")
+    out, err = shell.printed("sql", store_path)
+    assert ".tables" in err
+    assert {"transitions", "coverage"} <= {line.split()[0] for line in out.splitlines()}
+    assert out.endswith("row 1\n  seven  7\n")
 
 
 @pytest.mark.parametrize("ending", ["parquet", "csv", "json"])

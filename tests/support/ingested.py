@@ -1,8 +1,5 @@
 """What becomes of a bag: a proposed profile, steps, and a store of its rows."""
 
-import contextlib
-import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +9,6 @@ from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.steps.episodes import Steps, steps_of
 from restock.ingest.steps.needs import read_topics
 from restock.replay.store.store import Store
-
-
-def answered(*arguments: object, codes: tuple[int, ...] = (0,)) -> Any:
-    """Return what a command prints with `--json`; it ends with one of these codes."""
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        code = main([*map(str, arguments), "--json"])
-    assert code in codes, (code, out.getvalue())
-    return json.loads(out.getvalue())
 
 
 def proposed(bag: Path, file: Path, *options: str, codes: tuple[int, ...] = (0,)) -> Profile:

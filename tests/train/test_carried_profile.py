@@ -96,10 +96,9 @@ def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
     assert run.document["config"]["profile"] == "mine"
 
 
-def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, capsys):
+def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, shell):
     drive = ["eval", str(folder / "run"), "--episodes", "nominal=1", "--perturbations", "none"]
-    assert main([*drive, "--policies", "agent", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["results"]
+    assert shell.json(*drive, "--policies", "agent")["results"]
     assert main(["report", str(folder / "run")]) == 0
     page = (folder / "run" / "report.html").read_text()
     assert "Conditions of the logs that the twin cannot show" in page
@@ -111,13 +110,12 @@ def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, capsys):
     assert again.profile == resumed.profile
 
 
-def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, capsys):
+def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, shell):
     """What the twin's own signals say is evaluated there; logs keep their stored labels."""
     line = ["train", "--panel", str(folder / "panel"), "--out", str(folder / "dry"), *FLAGS]
-    assert main([*line, "--dry-run"]) == 0
-    said = capsys.readouterr()
-    assert said.err.count("condition 'sagging' is not evaluated in the twin") == 1
-    assert json.loads(said.out)["not_evaluated"] == {"sagging": ["battery_v"]}
+    out, err = shell.printed(*line, "--dry-run")
+    assert err.count("condition 'sagging' is not evaluated in the twin") == 1
+    assert json.loads(out)["not_evaluated"] == {"sagging": ["battery_v"]}
     assert not (folder / "dry").exists()
     run = Run.open(folder / "run")
     assert run.document["not_evaluated"] == {"sagging": ["battery_v"]}

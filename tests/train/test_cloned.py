@@ -10,7 +10,6 @@ from support.kept_run import TASK, kept_run
 from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
-from restock.cli import main
 from restock.ingest.store.transitions import replaced
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.fitted_q import cloned_probabilities
@@ -100,18 +99,16 @@ def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
     assert "the quality of the clone is not known" in reported.text
 
 
-def test_eval_drives_and_compares_the_clone(panel, tmp_path, capsys):
+def test_eval_drives_and_compares_the_clone(panel, tmp_path, shell):
     run = kept_run(tmp_path / "run", panel=panel)
     line = ["eval", str(run), "--episodes", "nominal=2", "--perturbations", "none", "--json"]
-    assert main([*line, "--policies", "agent,cloned"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(shell.out(*line, "--policies", "agent,cloned"))
     assert {row["policy"] for row in document["results"]} == {"agent", "cloned"}
     (clone,) = document["clones"]
     assert clone["policy"] == "cloned"
     assert clone["text"].startswith("cloned is behaviour cloning")
     query = "SELECT rows, agreement > .8 AS good FROM eval_clones"
-    assert main(["sql", str(run), query, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == [{"rows": len(panel), "good": True}]
+    assert shell.json("sql", run, query) == [{"rows": len(panel), "good": True}]
 
 
 @pytest.mark.parametrize(
@@ -121,10 +118,8 @@ def test_eval_drives_and_compares_the_clone(panel, tmp_path, capsys):
         ("cloned:", "there is no 'cloned:'"),
     ],
 )
-def test_a_clone_of_nobody_is_refused(panel, tmp_path, capsys, policy, said):
+def test_a_clone_of_nobody_is_refused(panel, tmp_path, policy, said, shell):
     run = kept_run(tmp_path / "run", panel=panel)
-    assert main(["eval", str(run), "--policies", policy, "--dry-run"]) == 2
-    assert said in capsys.readouterr().err
+    assert said in shell.err("eval", run, "--policies", policy, "--dry-run")
     none = kept_run(tmp_path / "none")
-    assert main(["eval", str(none), "--policies", "cloned", "--dry-run"]) == 2
-    assert "did not learn from logs" in capsys.readouterr().err
+    assert "did not learn from logs" in shell.err("eval", none, "--policies", "cloned", "--dry-run")

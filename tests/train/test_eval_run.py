@@ -17,17 +17,17 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.missions import KINDS
 
 
-def test_a_policy_of_another_task_is_refused(tmp_path, capsys):
+def test_a_policy_of_another_task_is_refused(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     other = kept_run(tmp_path / "b", profile="turtlebot3")
-    assert main(["eval", str(run), "--policies", f"run:{other}", "--dry-run"]) == 2
-    assert "was trained on task" in capsys.readouterr().err
+    assert "was trained on task" in shell.err(
+        "eval", run, "--policies", f"run:{other}", "--dry-run"
+    )
     record = ["twin", "record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
-    assert main([*record, "--policy", f"run:{other}"]) == 2
-    assert "was trained on task" in capsys.readouterr().err
+    assert "was trained on task" in shell.err(*record, "--policy", f"run:{other}")
 
 
-def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(tmp_path, capsys):
+def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(tmp_path, capsys, shell):
     run = kept_run(tmp_path / "a")
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
@@ -42,32 +42,28 @@ def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(tmp_path, capsys):
     assert document["left_out"] == {"blocked_aisle": ["hall.toml"]}
     assert "as there is no room for it on the floor 'hall.toml'" in said.err
     hall.write_text("width_m = 2.0\ndepth_m = 2.0\nracks = []\n")
-    assert main(line) == 2
-    assert "has no room for episodes of nominal" in capsys.readouterr().err
+    assert "has no room for episodes of nominal" in shell.err(*line)
 
 
-def test_what_was_recorded_is_shown_again_or_its_lack_is_said(tmp_path, capsys):
+def test_what_was_recorded_is_shown_again_or_its_lack_is_said(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "0", "--json"]
-    assert main(line) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(shell.err(*line).split())
     assert "has no recorded evaluation" in said
     assert f"run `restock eval {run}`" in said
     row = {"policy": "agent", "perturbation": "none", "condition": "nominal", "episode_seed": 3}
     row |= {"block": "none", "success": True, "return": 1.0, "bumps": 0, "time_s": 9.0}
     table = pa.Table.from_pylist([row], schema=EVAL_EPISODES)
     write_table(table, run / "eval" / "episodes.parquet")
-    assert main(line) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(shell.out(*line))
     (shown,) = document["results"]
     assert (shown["policy"], shown["episodes"], shown["success"]) == ("agent", 1, 1.0)
     assert document["recorded"].startswith("1 of 1 episodes")
-    assert main(line[:-1]) == 0
-    assert "1 of 1 episodes" in capsys.readouterr().err
+    assert "1 of 1 episodes" in shell.err(*line[:-1], code=0)
 
 
 @pytest.mark.long
-def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, capsys):
+def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
@@ -88,19 +84,16 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, capsys):
         "1 of 5 episodes that `restock eval` drove: floors elsewhere, policy a@9 of step 0, seeds"
         " 1 to 1."
     )
-    capsys.readouterr()
-    assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_episodes", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == [{"n": 5}]
+    assert shell.json("sql", run, "SELECT count(*) AS n FROM eval_episodes") == [{"n": 5}]
 
 
-def test_references_drive_the_same_missions(tmp_path, capsys):
+def test_references_drive_the_same_missions(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--json"]
     line += ["--episodes", "nominal=1"]
 
     def results(policies: str) -> dict[tuple[str, str], dict[str, Any]]:
-        assert main([*line, "--policies", policies]) == 0
-        rows = json.loads(capsys.readouterr().out)["results"]
+        rows = json.loads(shell.out(*line, "--policies", policies))["results"]
         return {(row["policy"], row["condition"]): row for row in rows}
 
     planner = results("planner")["planner", "nominal"]
@@ -115,11 +108,10 @@ def test_references_drive_the_same_missions(tmp_path, capsys):
     assert alone["random", "nominal"]["time_lost_s"] is None  # it did not arrive
 
 
-def test_episodes_may_be_asked_for_by_kind(tmp_path, capsys):
+def test_episodes_may_be_asked_for_by_kind(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--policies", "agent", "--perturbations", "none", "--dry-run"]
-    assert main([*line, "--episodes", "nominal=1000, wheel_slip=300"]) == 0
-    planned = json.loads(capsys.readouterr().out)
+    planned = json.loads(shell.out(*line, "--episodes", "nominal=1000, wheel_slip=300"))
     assert (planned["episodes"], planned["kinds"]) == (1300, ["nominal", "wheel_slip"])
     for wrong, said in (
         ("nominal=ten", "is neither a number nor kind=number"),
@@ -127,8 +119,7 @@ def test_episodes_may_be_asked_for_by_kind(tmp_path, capsys):
         ("nominal=0", "must be at least 1, got 0"),
         ("nominal=2,nominal=3", "names 'nominal' twice"),
     ):
-        assert main([*line, "--episodes", wrong]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert said in " ".join(shell.err(*line, "--episodes", wrong).split())
 
 
 def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
@@ -139,13 +130,12 @@ def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
     assert "among those that selected the run's policy (90000 to 90009)" in said
 
 
-def test_limiter_interventions_are_counted(tmp_path, capsys):
+def test_limiter_interventions_are_counted(tmp_path, shell):
     run, limits = kept_run(tmp_path / "a"), tmp_path / "limits.toml"
     limits.write_text("[limiter]\nmax_speed_mps = 0.5\n", encoding="utf-8")
     line = ["eval", str(run), "--policies", "planner", "--perturbations", "none", "--json"]
     line += ["--episodes", "nominal=2", "--limiter"]
-    assert main([*line, str(limits)]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(shell.out(*line, limits))
     assert said["limiter"]["fastest"] == [0.5, 1.2]
     free, limited = said["results"]
     assert (free["policy"], free["limited_share"]) == ("planner", None)
@@ -159,5 +149,4 @@ def test_limiter_interventions_are_counted(tmp_path, capsys):
     assert all((row["limited_s"] is None) == (row["policy"] == "planner") for row in shown)
     bad = tmp_path / "bad.toml"
     bad.write_text("[limiter]\nstop_m = -1\n", encoding="utf-8")
-    assert main([*line, str(bad)]) == 2
-    assert "limiter.stop_m" in capsys.readouterr().err
+    assert "limiter.stop_m" in shell.err(*line, bad)

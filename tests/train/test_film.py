@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 from support.kept_run import kept_run
 
-from restock.cli import main
 from restock.report.run.page import films_section
 from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
 from restock.train.evaluation.film import RESCUE, WORST, differing_fields, drive_again, scenes
@@ -64,7 +63,7 @@ def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
         assert len(frames) == round(recorded["time_s"] / 0.2) + 1
 
 
-def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, capsys):
+def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, shell):
     table = read_evaluations(run)
     rows = table.to_pylist()
     for one in rows:  # as if another episode had been recorded
@@ -72,8 +71,7 @@ def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, capsys):
             one["time_s"] += 1.0
     pq.write_table(table.from_pylist(rows, schema=table.schema), run / FILE)
     argv = ["eval", str(run), "--episodes", "0", "--video", "--policies", "agent", "--json"]
-    assert main(argv) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(shell.out(*argv))
     assert [Path(path).name for path in said["films"]] == ["wheel_slip-worst.webp"]
     assert said["not_filmed"] == ["blocked_aisle-worst: driven again it has another time_s"]
     with Image.open(said["films"][0]) as film:

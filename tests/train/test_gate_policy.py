@@ -74,10 +74,9 @@ def test_equal_policies_pass_before_the_budget(run: Path, driven: Any) -> None:
     assert "was not measured" in page  # the twin's gap
 
 
-def test_a_policy_spoilt_in_one_condition_is_named(run, driven, capsys):
+def test_a_policy_spoilt_in_one_condition_is_named(run, driven, shell):
     driven(spoilt)
-    assert main(["gate", str(run), "--baseline", "planner", "--json"]) == 1
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json("gate", run, "--baseline", "planner", code=1)
     verdicts = {cell["condition"]: cell["verdict"] for cell in document["cells"]}
     assert document["verdict"] == WORSE
     assert [name for name, verdict in verdicts.items() if verdict != NOT_WORSE] == ["wheel_slip"]
@@ -123,10 +122,9 @@ def test_each_measure_that_is_asked_is_judged(run: Path, driven: Any) -> None:
         (["--baseline", "nobody"], "--policies"),
     ],
 )
-def test_what_cannot_give_a_verdict_is_refused(run, options, where, capsys):
+def test_what_cannot_give_a_verdict_is_refused(run, options, where, shell):
     base = [] if "--baseline" in options else ["--baseline", "planner"]
-    assert main(["gate", str(run), *base, *options]) == 2
-    assert capsys.readouterr().err.startswith(f"restock: {where}: ")
+    assert shell.err("gate", run, *base, *options).startswith(f"restock: {where}: ")
     assert not (run / "gate").exists()
 
 
@@ -136,14 +134,13 @@ def test_a_floor_without_room_for_a_condition_is_refused(run: Path, tmp_path: Pa
     assert main(["gate", str(run), "--baseline", "planner", "--layouts", str(hall)]) == 2
 
 
-def test_a_twin_that_is_not_trusted_gives_no_verdict(run, monkeypatch, capsys):
+def test_a_twin_that_is_not_trusted_gives_no_verdict(run, monkeypatch, shell):
     class Gap:
         untrusted = ("wheel_slip",)
         verdicts = ()
 
     monkeypatch.setattr(gate, "find_gap", lambda run: Gap())
-    assert main(["gate", str(run), "--baseline", "planner"]) == 2
-    assert "cannot be trusted in wheel_slip" in capsys.readouterr().err
+    assert "cannot be trusted in wheel_slip" in shell.err("gate", run, "--baseline", "planner")
     assert plan_gate(run, "planner", conditions=("nominal",)).gap is not None
 
 

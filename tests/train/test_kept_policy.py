@@ -1,6 +1,5 @@
 """Which policy of a run drives: the best that it evaluated, or the latest of an interrupted one."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -76,7 +75,7 @@ def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
     assert now.env_steps >= 800
 
 
-def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, capsys):
+def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, shell):
     path = tmp_path / "run"
     settings = [
         *("network.hidden=[16]", "env.num_envs=4", "replay.batch_size=16", "schedule.env_steps=80"),
@@ -92,8 +91,7 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, capsys
 
     text = "policy of step 60, the latest; not evaluated in training"
     line = ["eval", str(path), "--episodes", "nominal=1", "--perturbations", "none"]
-    assert main([*line, "--policies", "agent", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json(*line, "--policies", "agent")
     updates = live.learner.gradient_steps
     assert document["trained"]["agent"] == {
         "chosen": "latest",
@@ -102,16 +100,14 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, capsys
         "run_env_steps": 60,
         "text": text,
     }
-    assert main([*line, "--policies", "agent"]) == 0
-    assert f"agent: {text}" in capsys.readouterr().err
-    assert main([*line[:2], "--episodes", "0"]) == 0
-    assert f"policy run@{updates} of step 60," in " ".join(capsys.readouterr().err.split())
+    assert f"agent: {text}" in shell.err(*line, "--policies", "agent", code=0)
+    assert f"policy run@{updates} of step 60," in " ".join(
+        shell.err(*line[:2], "--episodes", "0", code=0).split()
+    )
     assert headline(gather(path)).endswith(f". Driven: {text}")
-    assert main(["report", str(path), "--card", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["policy"]["text"] == text
+    assert shell.json("report", path, "--card")["policy"]["text"] == text
     onnx = tmp_path / "policy.onnx"
-    assert main(["export", str(path), "--to", "onnx", "--out", str(onnx), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["trained"] == text
+    assert shell.json("export", path, "--to", "onnx", "--out", onnx)["trained"] == text
 
     resumed = prepare_resumed(path, ["schedule.env_steps=160"]).open()
     train(resumed)

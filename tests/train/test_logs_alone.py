@@ -1,6 +1,5 @@
 """`env.twin = false`: a policy from the logs alone, where no twin is worth trusting."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -33,7 +32,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 def test_nothing_drives_and_what_was_learnt_last_is_kept(
-    panel, tmp_path, monkeypatch, quick_models, capsys
+    panel, tmp_path, monkeypatch, quick_models, shell
 ):
     def refuse(*given: object, **named: object) -> None:
         raise AssertionError("a twin was made")
@@ -41,16 +40,14 @@ def test_nothing_drives_and_what_was_learnt_last_is_kept(
     monkeypatch.setattr(vector_env, "WarehouseVectorEnv", refuse)
     out = tmp_path / "run"
     argv = ["train", "--panel", str(panel), "--out", str(out)]
-    assert main([*argv, *flags("env.twin=false", "teacher.source=logs"), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = shell.json(*argv, *flags("env.twin=false", "teacher.source=logs"))
     assert (document["env_steps"], document["gradient_steps"]) == (0, 30)
     assert document["best"] is document["last"] is None
     run = Run.open(out)
     assert run.best.is_file()
     assert not run.table("evaluations").num_rows
     assert run.document["config"]["schedule"]["env_steps"] == 0
-    assert main(["train", "--resume", str(out), "--json"]) == 0  # there is nothing left to do
-    assert json.loads(capsys.readouterr().out)["gradient_steps"] == 30
+    assert shell.json("train", "--resume", out)["gradient_steps"] == 30  # nothing is left to do
 
     assert main(["eval", str(out), "--on-logs", "own"]) == 0
     assert main(["report", str(out)]) == 0
@@ -62,11 +59,9 @@ def test_nothing_drives_and_what_was_learnt_last_is_kept(
     assert main(["report", str(out), "--card"]) == 0
 
 
-def test_without_logs_there_is_nothing_to_learn_from(panel, tmp_path, capsys):
+def test_without_logs_there_is_nothing_to_learn_from(panel, tmp_path, shell):
     argv = ["train", "--out", str(tmp_path / "run")]
-    assert main([*argv, *flags("env.twin=false")]) == 2
-    assert "there is no panel" in capsys.readouterr().err
+    assert "there is no panel" in shell.err(*argv, *flags("env.twin=false"))
     requested = flags("env.twin=false", "teacher.source=operator")
-    assert main([*argv, "--panel", str(panel), *requested]) == 2
-    assert "needs the twin" in capsys.readouterr().err
+    assert "needs the twin" in shell.err(*argv, "--panel", panel, *requested)
     assert not (tmp_path / "run").exists()

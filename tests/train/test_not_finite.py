@@ -38,7 +38,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, capsys):
+def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, shell):
     out = tmp_path / "run"
     rows = panel / "rows.f32"
     whole = rows.read_bytes()
@@ -47,8 +47,7 @@ def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, capsys):
         at = 6003  # the exponent of a number between two of the blocks that every opening looks at
         rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
         for argv in (["--dry-run"], []):
-            assert main(["train", "--panel", str(panel), "--out", str(out), *TINY, *argv]) == 2
-            said = capsys.readouterr().err
+            said = shell.err("train", "--panel", panel, "--out", out, *TINY, *argv)
             assert f"{rows}: its checksum is" in said
             assert "make it again with `restock mix`" in said
             assert not out.exists()
@@ -62,17 +61,15 @@ def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, capsys):
     # Going on reads them again, so they are checked again.
     rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
     try:
-        assert main(["train", "--resume", str(out), "--env-steps", "120"]) == 2
-        assert "its checksum is" in capsys.readouterr().err
+        assert "its checksum is" in shell.err("train", "--resume", out, "--env-steps", "120")
     finally:
         rows.write_bytes(whole)
 
 
-def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(panel, tmp_path, capsys):
+def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(panel, tmp_path, shell):
     out = tmp_path / "run"
     argv = ["train", "--panel", str(panel), "--out", str(out), *TINY]
-    assert main([*argv, "--set", "optimizer.learning_rate=1e30"]) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*argv, "--set", "optimizer.learning_rate=1e30")
     assert f"{out}: the loss is " in said
     assert "panel row" in said
     assert "lower optimizer.learning_rate" in said

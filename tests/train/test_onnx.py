@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support.kept_run import kept_run
+from support.shell import Shell
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
@@ -58,10 +59,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return kept_run(tmp_path_factory.mktemp("runs") / "a")
 
 
-def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, capsys) -> None:
+def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
-    assert main(["export", str(run), "--to", "onnx", "--out", str(out), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = shell.json("export", run, "--to", "onnx", "--out", out)
     assert onnx.load(out).ir_version == 8  # the first with opset 18; ONNX Runtime 1.16 reads 9
     session = runtime.InferenceSession(str(out))
     meta = session.get_modelmeta().custom_metadata_map
@@ -72,14 +72,12 @@ def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, capsys) -> None:
     assert meta["version"] == "a@7"
 
 
-def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, capsys) -> None:
+def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
     assert main(["export", str(run), "--to", "onnx", "--out", str(out)]) == 0
-    capsys.readouterr()
     policies = f"agent,onnx:{out},run:{run}"
     argv = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--json"]
-    assert main([*argv, "--policies", policies]) == 0
-    rows = json.loads(capsys.readouterr().out)["results"]
+    rows = json.loads(shell.out(*argv, "--policies", policies))["results"]
     by = {
         policy: [
             (r["condition"], r["success"], r["bumps_per_episode"], r["return"])
@@ -92,23 +90,23 @@ def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, capsys) 
     assert [row[:3] for row in by["agent"]] == [row[:3] for row in by[f"onnx:{out}"]]
 
 
-def test_policy_is_written_into_no_store_or_other_run(run, tmp_path, capsys):
+def test_policy_is_written_into_no_store_or_other_run(run, tmp_path, shell):
     store = write_store(tmp_path / "store", [recording_transitions(1)])
     other = kept_run(tmp_path / "other")
     for place, said in ((store, "the store"), (other, "the run")):
         out = place / "p.onnx"
-        assert main(["export", str(run), "--to", "onnx", "--out", str(out)]) == 2
-        assert f"is within {said} {place}:" in " ".join(capsys.readouterr().err.split())
+        assert f"is within {said} {place}:" in " ".join(
+            shell.err("export", run, "--to", "onnx", "--out", out).split()
+        )
         assert not out.exists()
     assert main(["export", str(other), "--to", "onnx", "--out", str(other / "p.onnx")]) == 0
 
 
-def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, capsys) -> None:
+def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
     argv = ["export", str(run), "--to", "onnx", "--out", str(out)]
     assert main(argv) == 0
-    assert main(argv) == 2  # there already
-    assert "already exists" in capsys.readouterr().err
+    assert "already exists" in shell.err(*argv)  # there already
     (tmp_path / "text.onnx").write_text("hello")
     other = DQN(LossConfig()).make_network(NetworkConfig(hidden=(4,)), 3, 2)
     (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())
@@ -127,12 +125,11 @@ def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, ca
     assert not (run / "eval").exists() or not list((run / "eval").glob("*.tmp"))
 
 
-def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, capsys) -> None:
+def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, shell: Shell) -> None:
     wet = tmp_path / "wet.toml"
     wet.write_text('name = "wet"\nfriction_scale = 0.5\n')
     argv = ["eval", str(run), "--dry-run", "--json", "--perturbations"]
-    assert main([*argv, f"none,{wet}"]) == 0
-    said = json.loads(capsys.readouterr().out)["perturbations"]
+    said = json.loads(shell.out(*argv, f"none,{wet}"))["perturbations"]
     assert {name: table["friction_scale"] for name, table in said.items()} == {
         "none": 1.0,
         str(wet): 0.5,
@@ -143,6 +140,5 @@ def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, capsys
         ("grip = 1.0\n", "grip"),
     ):
         wet.write_text(text)
-        assert main([*argv, str(wet)]) == 2
-        assert why in capsys.readouterr().err.replace("\n", " ")
+        assert why in shell.err(*argv, wet).replace("\n", " ")
     assert main([*argv, str(tmp_path / "none.toml")]) == 2

@@ -146,7 +146,9 @@ def _known(steps: OpeSteps) -> OpeSteps:
     return replace(steps, probability=np.full(len(steps.rows), 0.3))
 
 
-def test_the_verb_evaluates_and_says_why_it_refuses(store, panel, tmp_path, quick_models, capsys):
+def test_the_verb_evaluates_and_says_why_it_refuses(
+    store, panel, tmp_path, quick_models, capsys, shell
+):
     run = kept_run(tmp_path / "a", NETWORK, panel)
     argv = ["eval", str(run), "--on-logs", "own"]
     assert main([*argv, "--dry-run"]) == 0  # fits nothing: it is asked what would be done
@@ -163,16 +165,14 @@ def test_the_verb_evaluates_and_says_why_it_refuses(store, panel, tmp_path, quic
     # The quick models make 2 regressions, so they see less than the task's 240 steps.
     reach = "looks 2 steps ahead, but an episode may take 240 (9 of 9 held-out episodes are longer)"
     assert reach in " ".join(said.err.split())
-    assert main([*argv, "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["results"]
+    rows = shell.json(*argv)["results"]
     table = pq.read_table(run / "eval" / "off_policy.parquet").to_pylist()
     assert [row["value"] for row in table] == [row["value"] for row in rows]
     assert {row["gradient_steps"] for row in table} == {7}
     assert {row["estimator"] for row in rows} == {"logged", "fqe", "pdwis"}
     for row in rows:
         assert (row["value"] is None) == (row["refused"] is not None)
-    assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_off_policy", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == [{"n": len(rows)}]
+    assert shell.json("sql", run, "SELECT count(*) AS n FROM eval_off_policy") == [{"n": len(rows)}]
     assert main(["eval", str(run), "--on-logs", str(tmp_path / "nowhere")]) == 2
 
 

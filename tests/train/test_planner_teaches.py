@@ -11,6 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.paths import ROOT
+from support.shell import Shell
 from torch import tensor
 
 from restock.cli import main
@@ -120,14 +121,13 @@ def kept(path, seed, **teacher):
     return load_agent(run)
 
 
-def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, capsys) -> None:
+def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, shell: Shell) -> None:
     one, other = (
         kept(tmp_path / "runs" / name, seed, source="planner", margin=0.3)
         for seed, name in enumerate("ab")
     )
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
-    assert main(words) == 0
-    assert "mean of runs of 200 steps together" in capsys.readouterr().out
+    assert "mean of runs of 200 steps together" in shell.out(*words)
     run = Run.open(tmp_path / "mean")
     assert run.document["created_ns"] > 1  # it is newer than what it is the mean of
     made = load_agent(run)
@@ -161,13 +161,12 @@ def test_a_mean_of_means_filters_by_the_mean_of_the_logits(tmp_path: Path) -> No
     ("teacher", "why"),
     [("none", "is not of the same task, network, algorithm and teacher"), (None, "holds 1 run")],
 )
-def test_runs_without_a_mean_are_refused(tmp_path: Path, capsys, teacher, why: str) -> None:
+def test_runs_without_a_mean_are_refused(tmp_path: Path, teacher, why: str, shell: Shell) -> None:
     kept(tmp_path / "runs" / "a", 0, source="planner")
     if teacher:
         kept(tmp_path / "runs" / "b", 1, source=teacher)
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
-    assert main(words) == 2
-    assert why in capsys.readouterr().err
+    assert why in shell.err(*words)
     assert not (tmp_path / "mean").exists()
 
 

@@ -7,11 +7,11 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.shell import Shell
 from support.stores import recording_transitions, write_store
 from support.toy_run import config, logs, run_to_end
 from support.toy_twin import TASK
 
-from restock import cli
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
@@ -59,14 +59,13 @@ def test_every_sampled_row_is_a_record(run: Path) -> None:
         assert (record.age_days is None) == (row["source"] == "fresh")
 
 
-def test_one_clock_says_what_was_collected_before_the_last_sync(tmp_path, capsys):
+def test_one_clock_says_what_was_collected_before_the_last_sync(tmp_path, shell):
     hard = {"rule": "hard", "every": 30}
     path = tmp_path / "hard"
     run_to_end(path, config(schedule={"env_steps": 800}, target=hard))
     before = "gradient_step - age_steps < target_sync_step"
     query = f"SELECT source, {before} AS before, count(*) AS n FROM replay_audit GROUP BY ALL"
-    assert cli.main(["sql", str(path), query, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = shell.json("sql", path, query)
     assert {(row["source"], row["before"]) for row in found} == {
         *(("logs", before) for before in (True, False)),  # until the first sync there was none
         *(("fresh", before) for before in (True, False)),
@@ -98,14 +97,12 @@ def test_fresh_rows_have_ids_of_their_own(run: Path) -> None:
     assert len(fresh) == len(set(fresh.values())) > 100
 
 
-def test_the_view_is_the_record(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_view_is_the_record(run: Path, shell: Shell) -> None:
     query = f"SELECT {', '.join(FIELDS)} FROM replay_audit LIMIT 40"
-    assert cli.main(["sql", str(run), query, "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = shell.json("sql", run, query)
     assert [ReplayAuditRecord(**row) for row in shown] == list(replay_audit(run)[:40])
     of_view = "SELECT column_name, meaning FROM columns WHERE view = 'replay_audit'"
-    assert cli.main(["sql", str(run), of_view, "--json"]) == 0
-    assert all(row["meaning"] for row in json.loads(capsys.readouterr().out))
+    assert all(row["meaning"] for row in shell.json("sql", run, of_view))
 
 
 @pytest.mark.parametrize(

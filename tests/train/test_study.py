@@ -7,6 +7,7 @@ from threading import Event, main_thread
 from time import sleep
 
 import pytest
+from support.shell import Shell
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
@@ -53,13 +54,14 @@ def no_references(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, capsys) -> None:
+def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(
+    tmp_path: Path, capsys, shell: Shell
+) -> None:
     (tmp_path / "s.toml").write_text(SMALL)
     out = tmp_path / "out"
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
     # So short a run shows too few episodes for the gate: refused, and said so.
-    assert main(argv) == 1
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(shell.out(*argv, code=1))
     (comparison,) = found["comparisons"]
     assert (comparison["arm"], comparison["baseline"]) == ("dueling", "plain")
     assert comparison["verdict"] in ("inconclusive", "incomparable")
@@ -72,25 +74,22 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     assert {path: path.stat().st_mtime_ns for path in made} == made
     # The same directory, another question.
     (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))
-    assert main(argv) == 2
-    assert "was trained with other settings" in capsys.readouterr().err
+    assert "was trained with other settings" in shell.err(*argv)
 
 
 @pytest.mark.long
-def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> None:
+def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, shell: Shell) -> None:
     text = SMALL.replace("[settings]", "[settings]\nenv.layouts = 'nowhere.toml'")
     (tmp_path / "s.toml").write_text(text)
-    assert main(["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(shell.err("train", tmp_path / "s.toml", "--out", tmp_path / "o").split())
     assert "plain-0.log: `restock train` failed with exit code 2" in said
     assert "nowhere.toml" in said
 
 
-def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> None:
+def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, shell: Shell) -> None:
     (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 7]"))
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
-    assert main(argv) == 0
-    rows = json.loads(capsys.readouterr().out)
+    rows = json.loads(shell.out(*argv))
     assert [Path(row["run"]).name for row in rows] == [
         *("plain-0", "dueling-0"),
         *("plain-7", "dueling-7"),
@@ -99,7 +98,9 @@ def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> Non
     assert not (tmp_path / "o").exists()
 
 
-def test_an_arm_may_have_a_baseline_and_a_treatment_of_its_own(tmp_path: Path, capsys) -> None:
+def test_an_arm_may_have_a_baseline_and_a_treatment_of_its_own(
+    tmp_path: Path, shell: Shell
+) -> None:
     # coverage against uniform as mixtures; the same mixture with a margin, as an algorithm.
     (tmp_path / "s.toml").write_text("""
 treatment = "mixture"
@@ -117,8 +118,7 @@ name = "method"
 treatment = "method"
 """)
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
-    assert main(argv) == 0
-    assert [row["against"] for row in json.loads(capsys.readouterr().out)] == [
+    assert [row["against"] for row in json.loads(shell.out(*argv))] == [
         *(None, "coverage (algorithm)"),
         *("uniform (mixture)", "uniform (method)"),
     ]
@@ -134,21 +134,18 @@ def trained_before(tmp_path: Path, text: str) -> Path:
     return tmp_path / "out"
 
 
-def test_a_changed_study_says_what_is_different(tmp_path: Path, capsys) -> None:
+def test_a_changed_study_says_what_is_different(tmp_path: Path, shell: Shell) -> None:
     study = tmp_path / "s.toml"
     arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
     text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
     moved = trained_before(tmp_path, text).rename(tmp_path / "moved")
     line = ["train", str(study), "--out", str(moved), "--dry-run", "--json"]
-    assert main(line) == 0
-    assert all(row["done"] for row in json.loads(capsys.readouterr().out))
+    assert all(row["done"] for row in json.loads(shell.out(*line)))
     study.write_text(text.replace("n_step = 1", "n_step = 3"))
-    assert main(line) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(shell.err(*line).split())
     assert "then loss.n_step=1, now loss.n_step=3" in said
     study.write_text(text.replace("'p'", "'q'"))
-    assert main(line) == 2
-    assert 'then panel = "p", now panel = "q"' in " ".join(capsys.readouterr().err.split())
+    assert 'then panel = "p", now panel = "q"' in " ".join(shell.err(*line).split())
 
 
 def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
@@ -175,7 +172,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     assert "Not held: the algorithm (network.layer_norm)." in page
 
 
-def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypatch) -> None:
+def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, monkeypatch, shell: Shell) -> None:
     out = trained_before(tmp_path, TWICE)
 
     def compared(first, second, *, treatment):
@@ -184,8 +181,7 @@ def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypat
         return Comparison(treatment, "comparable", [], [], [], [], "evaluation", [])
 
     monkeypatch.setattr(study_run, "compare", compared)
-    assert main(["train", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
-    first, second = json.loads(capsys.readouterr().out)["comparisons"]
+    first, second = shell.json("train", tmp_path / "s.toml", "--out", out, code=1)["comparisons"]
     assert (first["verdict"], second["verdict"]) == ("inconclusive", "comparable")
     why = "runs/dueling-0: has no record of the episodes it sampled"
     assert why in first["why"]
@@ -244,16 +240,14 @@ def test_after_a_failed_run_none_is_begun(tmp_path, capsys, monkeypatch, interru
     assert "here: ran out of disk" in said
 
 
-def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
+def test_a_dry_run_plans_the_mixtures(tmp_path: Path, shell: Shell) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\nmixture = "b.toml"\n'
     (tmp_path / "s.toml").write_text(f'store = "s"\ntreatment = "mixture"\n{arms}')
     (tmp_path / "b.toml").write_text("where = 'speed > 1'\n[each_condition]\n")
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
-    assert main(argv) == 2
-    assert f"{tmp_path / 's'}: no such store" in capsys.readouterr().err
+    assert f"{tmp_path / 's'}: no such store" in shell.err(*argv)
     write_store(tmp_path / "s", [recording_transitions(1)])
-    assert main(argv) == 2
-    assert f"{tmp_path / 'b.toml'}: mixture, `where`: its SQL" in capsys.readouterr().err
+    assert f"{tmp_path / 'b.toml'}: mixture, `where`: its SQL" in shell.err(*argv)
     (tmp_path / "b.toml").write_text("where = 'reward > -99'\n[each_condition]\n")
     assert main(argv) == 0
     assert not (tmp_path / "o").exists()

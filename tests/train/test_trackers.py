@@ -10,7 +10,6 @@ import pytest
 from support.toy_run import config as toy_config
 from support.toy_run import run_to_end
 
-from restock import cli
 from restock.process import install_command
 from restock.train.dqn.config import TrainConfig
 from restock.train.run.events import GIVE_UP_AFTER, Events, tracked, tracker_sinks
@@ -80,7 +79,7 @@ def test_training_ends_as_ever_where_a_tracker_fails(tmp_path, monkeypatch, caps
     assert "wandb failed, training continues" in capsys.readouterr().err
 
 
-def test_tracker_that_is_not_installed_is_refused_first(tmp_path, monkeypatch, capsys):
+def test_tracker_that_is_not_installed_is_refused_first(tmp_path, monkeypatch, shell):
     find = importlib.util.find_spec
 
     def absent(name: str, package: str | None = None) -> Any:
@@ -88,8 +87,7 @@ def test_tracker_that_is_not_installed_is_refused_first(tmp_path, monkeypatch, c
 
     monkeypatch.setattr(importlib.util, "find_spec", absent)
     words = ["train", "--out", str(tmp_path / "run"), "--set", 'record.trackers=["wandb"]']
-    assert cli.main(words) == 2
-    reported = capsys.readouterr().err
+    reported = shell.err(*words)
     assert "needs wandb, which is not installed" in reported
     assert install_command("track") in reported
     assert not (tmp_path / "run").exists()

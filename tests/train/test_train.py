@@ -99,7 +99,7 @@ def test_logs_of_264_days_are_264_days_old(trained: Path) -> None:
     assert all(264 < row["p50"] < 265 for row in days)
 
 
-def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys):
+def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys, shell):
     task = load_profile("warehouse_amr").task
     text = (
         "max_replays_per_row = 4\n[[strata]]\nname = 'nominal'\nshare = 0.5\n"
@@ -110,8 +110,7 @@ def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys):
     few = build_panel(rows, parse_mixture(text), tmp_path / "panel", task=task)
     words = ["train", "--panel", str(few.path), "--out", str(tmp_path / "a"), *TINY, "--dry-run"]
     words += ["--env-steps", "9000"]
-    assert main(words) == 0
-    assert "warning" not in capsys.readouterr().err  # the twin drives such missions
+    assert "warning" not in shell.err(*words, code=0)  # the twin drives such missions
     assert main([*words, "--set", "env.conditions={nominal=1.0, wheel_slip=0.0}"]) == 0
     captured = capsys.readouterr()
     assert "warning: wheel_slip will be short by" in captured.err
@@ -125,7 +124,7 @@ def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys):
 
 
 @pytest.mark.long  # test_loop shows it on the corridor
-def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, capsys):
+def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, shell):
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
     assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
@@ -139,11 +138,12 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, capsys):
     for file in kept:
         file.write_bytes(b"not of that process")
     # A run whose budget is raised goes on; only its closing evaluation at 240 is extra.
-    capsys.readouterr()
-    assert main(["train", "--resume", str(tmp_path / "parts")]) == 0
-    assert "nothing to do: its budget of 240 environment" in capsys.readouterr().err
-    assert main(["train", "--resume", str(tmp_path / "parts"), "--env-steps", "400"]) == 0
-    assert "nothing to do" not in capsys.readouterr().err
+    assert "nothing to do: its budget of 240 environment" in shell.err(
+        "train", "--resume", tmp_path / "parts", code=0
+    )
+    assert "nothing to do" not in shell.err(
+        "train", "--resume", tmp_path / "parts", "--env-steps", "400", code=0
+    )
     assert {file for file in path.rglob(".*") if file.is_file()} == set(kept)
     whole = checkpoint.load(tmp_path / "whole" / "checkpoints" / "latest.safetensors")
     parts = checkpoint.load(tmp_path / "parts" / "checkpoints" / "latest.safetensors")
@@ -153,11 +153,12 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, capsys):
     assert whole["exploration"] == parts["exploration"]
 
 
-def test_a_run_that_is_being_trained_is_not_resumed(trained, capsys):
+def test_a_run_that_is_being_trained_is_not_resumed(trained, shell):
     before = {file: file.read_bytes() for file in trained.rglob("*.safetensors")}
     lock = RunLock(trained)
-    assert main(["train", "--resume", str(trained), "--env-steps", "440"]) == 2
-    assert f"is being trained by process {os.getpid()}" in capsys.readouterr().err
+    assert f"is being trained by process {os.getpid()}" in shell.err(
+        "train", "--resume", trained, "--env-steps", "440"
+    )
     lock.release()
     assert {file: file.read_bytes() for file in trained.rglob("*.safetensors")} == before
 
@@ -245,51 +246,46 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
     ],
 )
 def test_wrong_input_gives_one_clear_message_and_writes_nothing(
-    argv, complaint, trained, panel, tmp_path, capsys
+    argv, complaint, trained, panel, tmp_path, shell
 ):
     if "cuda" in argv and torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     places = {"new": tmp_path / "new", "missing": tmp_path / "no"}
     places |= {"trained": trained, "panel": panel}
-    assert main([part.format(**places) for part in argv]) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*[part.format(**places) for part in argv])
     assert complaint in said
     assert "Traceback" not in said
     assert not (tmp_path / "new").exists()
 
 
-def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(trained, panel, tmp_path, capsys):
+def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(trained, panel, tmp_path, shell):
     run, moved = tmp_path / "run", tmp_path / "moved"
     shutil.copytree(trained, run)
     text = (run / "config.json").read_text().replace(str(panel), str(tmp_path / "panel"))
     (run / "config.json").write_text(text)
     shutil.copytree(panel, moved)
     resume = ["train", "--resume", str(run), "--dry-run"]
-    assert main(resume) == 2
-    assert "there is no panel here any more" in capsys.readouterr().err
+    assert "there is no panel here any more" in shell.err(*resume)
     (tmp_path / "panel").symlink_to(moved)
     assert main(resume) == 0
 
 
-def test_a_panel_of_a_task_that_no_profile_has_is_refused(tmp_path, capsys):
+def test_a_panel_of_a_task_that_no_profile_has_is_refused(tmp_path, shell):
     build_panel(recording_transitions(1, episodes=40), MIXTURE, tmp_path / "panel")
     argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
-    assert main(argv) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*argv)
     assert "no shipped profile has this task" in said
     assert "--set profile=my_robot.toml" in said
-    assert main([*argv, "--set", "profile=warehouse_amr"]) == 2
-    said = capsys.readouterr().err
+    said = shell.err(*argv, "--set", "profile=warehouse_amr")
     assert "observation, action or reward differ" in said
     assert "leave out `profile` in the config" in said
     assert load_profile("warehouse_amr").task.hash in said
     assert not (tmp_path / "run").exists()
 
 
-def test_a_dry_run_writes_nothing(tmp_path, panel, capsys):
+def test_a_dry_run_writes_nothing(tmp_path, panel, shell):
     argv = ["train", "--panel", str(panel), "--out", str(tmp_path / "run"), "--seed", "7"]
-    assert main([*argv, "--dry-run"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = json.loads(shell.out(*argv, "--dry-run"))
     assert shown["config"]["seed"] == 7
     assert not (tmp_path / "run").exists()
 

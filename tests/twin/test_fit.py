@@ -1,6 +1,5 @@
 """`restock twin fit`: segments of a log, their replay, and parameters recovered from recordings."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -10,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 from support.paths import SHARED
+from support.shell import Shell
 
-from restock import cli
-from restock.errors import ConfigError, ExitCode, StoreError
+from restock.errors import ConfigError, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
@@ -240,7 +239,7 @@ def test_what_is_held_out_is_never_fitted(log: LoggedSegments) -> None:
     assert stamps[before].max() <= stamps[after].min()
 
 
-def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_fitted_is_named(known: Path, shell: Shell) -> None:
     for words, error in (
         (("--parameters", "gain,grip"), "'grip' cannot be fitted"),
         (("--parameters", " ,"), "'' cannot be fitted"),
@@ -249,8 +248,7 @@ def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixtu
         (("--out", "fitted.json"), "'fitted.json'"),
         (("--per-recording", "--task", "none"), "not of none"),
     ):
-        assert cli.main(["twin", "fit", str(known), *words]) == ExitCode.USAGE
-        assert error in capsys.readouterr().err
+        assert error in shell.err("twin", "fit", known, *words)
     with Store(known) as store:
         with pytest.raises(ConfigError, match="no recording 'nobody'"):
             fit(store, FitConfig(recordings=("nobody",)))
@@ -300,11 +298,10 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
     assert found.held_out[-1].after_m < 0.25 * found.held_out[-1].before_m
 
 
-def test_the_command_prints_json(known, capsys, monkeypatch) -> None:
+def test_the_command_prints_json(known, monkeypatch, shell: Shell) -> None:
     of = "restock.train.twin.calibration.fit.FitConfig"
     monkeypatch.setattr(of, partial(FitConfig, search_points=2))
     line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2"]
-    assert cli.main([*line, "--segments", "8", "--json"]) == ExitCode.OK
-    said = json.loads(capsys.readouterr().out)
+    said = shell.json(*line, "--segments", "8")
     assert [item["name"] for item in said["fits"][0]["estimates"]] == ["gain"]
     assert said["out"] is None

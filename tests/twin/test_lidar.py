@@ -1,6 +1,5 @@
 """The twin's lidar: compiled ranges are MuJoCo's own, whatever stands and moves on the floor."""
 
-import json
 import math
 
 import mujoco
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 from support.profile_texts import WAREHOUSE
 
 from restock import native
-from restock.cli import main
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Lidar as LidarLimits
 from restock.ingest.task.robot import Robot
@@ -141,12 +139,11 @@ def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) 
     assert info["signals"]["sector_clearance_m"][0, 0] > 0.5  # straight behind
 
 
-def test_the_lidars_place_and_what_lies_outside_is_shown(tmp_path, capsys):
+def test_the_lidars_place_and_what_lies_outside_is_shown(tmp_path, shell):
     robot = "[robot]\ncasters_m = [[0.6, 0.0]]\n[robot.lidar]\nangle_max_rad = 1.5\n"
     text = WAREHOUSE.replace("lidar_x_m = 0.0", "lidar_x_m = -0.5") + robot
     (tmp_path / "amr.toml").write_text(text)
-    assert main(["twin", "robot", str(tmp_path / "amr.toml"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = shell.json("twin", "robot", tmp_path / "amr.toml")
     assert {key: said["robot"][f"body.{key}"] for key in ("length_m", "width_m", "lidar_x_m")} == {
         "length_m": 0.7,
         "width_m": 0.5,
@@ -157,5 +154,4 @@ def test_the_lidars_place_and_what_lies_outside_is_shown(tmp_path, capsys):
         "the lidar is 0.15 m outside the outline of [task.body]",
         "caster 1 is 0.25 m outside the outline of [task.body]",
     ]
-    assert main(["twin", "robot", "warehouse_amr"]) == 0
-    assert "CHECK" not in capsys.readouterr().out
+    assert "CHECK" not in shell.out("twin", "robot", "warehouse_amr")

@@ -1,6 +1,5 @@
 """A missions file in the twin: which missions it makes, and which it refuses by name."""
 
-import json
 from collections import Counter
 from pathlib import Path
 
@@ -93,43 +92,35 @@ def test_missions_of_a_robot_are_those_of_its_tag() -> None:
     assert RecordingPlan(missions=file, tags={"robot": "amr_8"}).orders() == [SLIP]
 
 
-def test_a_dry_run_or_a_wrong_file_writes_nothing(tmp_path, capsys):
+def test_a_dry_run_or_a_wrong_file_writes_nothing(tmp_path, shell):
     out, file = tmp_path / "next.mcap", tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\n')
     args = ["twin", "record", "--out", str(out), "--missions", str(file)]
-    assert main([*args, "--dry-run", "--json"]) == 0
-    plan = json.loads(capsys.readouterr().out)
+    plan = shell.json(*args, "--dry-run")
     assert plan["orders"] == [{"kind": "wheel_slip", "missions": 3}]
     assert plan["conditions"] == {"wheel_slip": 3}
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\nzone = "roof"\n')
-    assert main(args) == 2
-    assert "zone 'roof'" in capsys.readouterr().err
-    assert (
-        main(["twin", "record", "--out", str(out), "--missions", str(tmp_path / "none.toml")]) == 2
+    assert "zone 'roof'" in shell.err(*args)
+    assert "restock coverage gaps" in shell.err(
+        "twin", "record", "--out", out, "--missions", tmp_path / "none.toml"
     )
-    assert "restock coverage gaps" in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_missions_are_counted_by_what_they_met(tmp_path, capsys):
+def test_missions_are_counted_by_what_they_met(tmp_path, shell):
     file = tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "nominal"\nmissions = 1\n')
     out = tmp_path / "next.mcap"
-    assert main(["twin", "record", "--out", str(out), "--missions", str(file), "--json"]) == 0
-    done = json.loads(capsys.readouterr().out)
+    done = shell.json("twin", "record", "--out", out, "--missions", file)
     assert done["ordered"] == done["missions"] == done["met"] == {"nominal": 1}
     assert out.stat().st_size == done["size_bytes"]
 
 
 @pytest.mark.slow
-def test_a_list_that_is_driven_and_ingested_closes_its_gaps(tmp_path, capsys):
+def test_a_list_that_is_driven_and_ingested_closes_its_gaps(tmp_path, shell):
     """Drive what is missing and measure again: gaps are closed, or within their intervals."""
 
-    def run(*args: str) -> dict[str, object]:
-        assert main([*args, "--json"]) == 0
-        found: dict[str, object] = json.loads(capsys.readouterr().out)
-        return found
-
+    run = shell.json
     store, requested = str(tmp_path / "store"), tmp_path / "asked.toml"
     requested.write_text(
         'max_replays_per_row = 20\nplanned_draws = 64000\n'
@@ -140,18 +131,16 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(tmp_path, capsys):
     first = ["--missions", "24", "--conditions", "nominal=.8,wheel_slip=.2"]
     run("twin", "record", "--out", str(tmp_path / "first.mcap"), *first)
     assert main(["ingest", str(tmp_path / "first.mcap"), "--store", store]) == 0
-    capsys.readouterr()
     gaps = ["coverage", "gaps", store, "--mixture", str(requested), "--thresholds", "none"]
     before = run(*gaps, "--missions-out", str(tmp_path / "next.toml"))
-    missing = {gap["cell"]: gap for gap in before["gaps"]}  # type: ignore[attr-defined]
+    missing = {gap["cell"]: gap for gap in before["gaps"]}
     assert "wheel_slip" in missing
     run("twin", "record", "--out", str(tmp_path / "next.mcap"), "--missions",
         str(tmp_path / "next.toml"), "--start", "2026-03-03")  # fmt: skip
     assert main(["ingest", str(tmp_path / "next.mcap"), "--store", store]) == 0
-    capsys.readouterr()
-    after = {gap["cell"]: gap for gap in run(*gaps)["gaps"]}  # type: ignore[attr-defined]
+    after = {gap["cell"]: gap for gap in run(*gaps)["gaps"]}
     slip = missing["wheel_slip"]
-    driven = sum(o["missions"] for o in before["plan"]["orders"])  # type: ignore[index]
+    driven = sum(o["missions"] for o in before["plan"]["orders"])
     came = slip["missing"] - after.get("wheel_slip", {"missing": 0})["missing"]
     assert "wheel_slip" not in after or came / driven >= slip["rate_low"] * 0.8
     assert came > 0.5 * slip["missing"]

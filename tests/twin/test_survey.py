@@ -1,6 +1,5 @@
 """The floor that a recording shows: its map, the way driven, and what is refused."""
 
-import json
 import re
 from functools import cache
 from itertools import pairwise
@@ -150,15 +149,15 @@ def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
     assert shares[0] > 95 > shares[1]
 
 
-def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, capsys):
+def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, shell):
     origin = (-3.0, 2.0, 0.0)
     poses = lap(origin)[:-30]  # not the whole way round
     bag = write_bag(tmp_path / "bag", poses=poses, grid=OccupancyGrid(hall(), CELL_M, origin))
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.toml")]
-    assert main([*arguments, "--footprint", "0.6x0.5", "--out", str(tmp_path / "a.txt")]) == 2
-    assert "'a.txt' does not end in .toml or .png" in capsys.readouterr().err
-    assert main([*arguments, "--footprint", "0.6x0.5", "--out", str(tmp_path / "a.png")]) == 0
-    shown = capsys.readouterr().out
+    assert "'a.txt' does not end in .toml or .png" in shell.err(
+        *arguments, "--footprint", "0.6x0.5", "--out", tmp_path / "a.txt"
+    )
+    shown = shell.out(*arguments, "--footprint", "0.6x0.5", "--out", tmp_path / "a.png")
     assert re.search(r"map_origin +-2\.8, 2\.2, ", shown)
     assert re.search(r"one_way_rules +0$", shown, re.MULTILINE)
     floor = read_floor(tmp_path / "floor.toml")
@@ -191,7 +190,7 @@ def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path)
         survey(bag)
 
 
-def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
+def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, shell):
     """Refuse a larger, empty room: all poses are on its free floor, but its walls are elsewhere."""
     room = np.zeros((240, 200), np.int8)
     room[[0, -1]] = room[:, [0, -1]] = 100
@@ -199,8 +198,7 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, capsys):
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=elsewhere, scanned=True)
     floor = tmp_path / "floor.toml"
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(floor)]
-    assert main(arguments) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(shell.err(*arguments).split())
     assert "only 0% of the lidar's returns are on walls of the map" in said
     assert "--by scans" in said
     assert not floor.exists()
@@ -326,7 +324,7 @@ def lapped(recording: int, away_m: float) -> pa.Table:
     return along(rows, lap() + np.array([away_m, 0.0, 0.0]))
 
 
-def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path, capsys):
+def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path, shell):
     tables = [lapped(1, 0.0), lapped(2, 40.0), lapped(3, 0.0)]
     store = write_store(tmp_path / "store", tables)
     names = [table["recording_id"][0].as_py() for table in tables]
@@ -340,12 +338,9 @@ def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path, capsys):
     assert second.floor.map_origin[0] == pytest.approx(first.floor.map_origin[0] + 40.0, abs=0.2)
     assert second.floor.name != first.floor.name
     line = ["twin", "layout", "--from", str(store), "--recording"]
-    assert main([*line, names[1], "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["elsewhere"]) == 2
-    assert main([*line, "no_such"]) == 2
-    assert "no recording is 'no_such'" in capsys.readouterr().err
-    assert main(["twin", "layout", "default", "--recording", "x"]) == 2
-    assert "--recording" in capsys.readouterr().err
+    assert len(shell.json(*line, names[1])["elsewhere"]) == 2
+    assert "no recording is 'no_such'" in shell.err(*line, "no_such")
+    assert "--recording" in shell.err("twin", "layout", "default", "--recording", "x")
 
 
 class _Zones(Checked, frozen=True):
