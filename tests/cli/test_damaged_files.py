@@ -83,7 +83,7 @@ def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
         "report": ["report", path, "--out", str(out / "r.html")],
         "card": ["report", path, "--card"],
         "compare": ["compare", path, str(root / "run")],
-        "diagnose": ["diagnose", path],
+        "diagnose": ["diagnose", path, "--no-twin"],  # the twin reads no file of it
         "trace": ["trace", path],
         "sql": ["sql", path, "FROM audit LIMIT 1"],
         "train": ["train", "--resume", path, "--env-steps", "40"],
