@@ -22,6 +22,7 @@ import subprocess
 import sys
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,6 +48,7 @@ TRAP = """trap 'code=$?; case " {codes} " in *" $code "*) ;; *) exit $code ;; es
 SHORT = {
     "schedule": {"env_steps": 64, "offline_updates": 16, "warmup_env_steps": 32},
     "env": {"num_envs": 4},
+    "teacher": {"offline_updates": 16},
     "evaluation": {"every_env_steps": 64, "episodes": 1},
     "record": {"every_updates": 8, "checkpoint_every_env_steps": 32, "audit_share": 1.0},
 }
@@ -62,9 +64,7 @@ def reader(folder: Path) -> Iterator["Reader"]:
     command = [sys.executable, "-m", "support.reader", str(folder)]
     server = subprocess.Popen(command, env=environment, start_new_session=True)
     try:
-        for _ in range(1200):
-            if (folder / "restock").exists():
-                break
+        while not (folder / "restock").exists():
             assert server.poll() is None, "the server did not start"
             time.sleep(0.05)
         yield Reader(folder)
@@ -104,6 +104,7 @@ def serve(folder: Path) -> None:
     """Import everything, then run what is asked for, each in a fork."""
     import_all()
     cut_short()
+    script_once()
     gc.collect()
     gc.freeze()  # a fork's collections leave the pages that it shares alone
     listener = socket.socket(socket.AF_UNIX)
@@ -225,8 +226,10 @@ def cut_short() -> None:
 
     from restock import cli
     from restock.cli.start import demo
+    from restock.replay.fleet import forecast
     from restock.train import prepare
-    from restock.train.evaluation import eval_run, ope
+    from restock.train.evaluation import eval_run, ope, policies
+    from restock.train.judge import fed_rows
     from restock.train.study import study_run
     from restock.train.twin.calibration import fit, gap
     from restock.train.twin.env import vector_env
@@ -296,6 +299,9 @@ def cut_short() -> None:
         yield lambda: code
 
     demo._beside = before_it
+    forecast.REPLICATES = forecast.forecast.__kwdefaults__["replicates"] = 20
+    policies.UPDATES = (0, 20)
+    fed_rows.drive_twin.__kwdefaults__["steps"] = 60
     prepare.resolve_config = short_config
     vector_env.WarehouseVectorEnv = short_episodes  # what is recorded drives whole missions
     study_run.run_study = one_process
@@ -309,17 +315,35 @@ def cut_short() -> None:
     gap.measure_gap = short_gap
 
 
+def script_once() -> None:
+    """Have the script of a page's charts made by a process of its own, once for all forks.
+
+    It takes seconds, and the threads that make it do not survive a fork.
+    """
+    from restock.report.look import write
+
+    code = "from restock.report.look.write import _runtime; print(_runtime(), end='')"
+    made = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    script = made.stdout.decode()
+    write._runtime = lambda: script
+    write._packed()
+
+
 def cut_libraries_short() -> None:
-    """Cut the loop of Stable-Baselines3 short."""
+    """Cut the loop of Stable-Baselines3 short, and one of a page that calls its updates."""
     from stable_baselines3 import DQN
 
     learn, update = DQN.learn, DQN.train
+    updates = Counter[int]()
 
     def short_learn(self: DQN, total_timesteps: int, *args: Any, **options: Any) -> Any:
         return learn(self, min(total_timesteps, 32), *args, **options)
 
     def short_update(self: DQN, gradient_steps: int, batch_size: int = 100) -> None:
-        update(self, min(gradient_steps, 16), batch_size)
+        left = 64 - updates[id(self)]
+        if left > 0:
+            updates[id(self)] += min(gradient_steps, 16, left)
+            update(self, min(gradient_steps, 16, left), batch_size)
 
     DQN.learn = short_learn
     DQN.train = short_update
