@@ -102,8 +102,11 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
     if origin.frames:
         files = list(dict.fromkeys(frame["file"] for frame in origin.frames))
         output.print_table(
-            origin.frames,
-            ["camera", "topic", "frame_index", "stamp_ns", "age_s", "size_bytes"],
+            [
+                frame | {"image": f"{frame['width']} x {frame['height']} {frame['encoding']}"}
+                for frame in origin.frames
+            ],
+            ["camera", "topic", "frame_index", "stamp_ns", "age_s", "image", "size_bytes"],
             title=f"the frames of its cameras, in {', '.join(files)}",
         )
         output.print_text()
