@@ -46,15 +46,18 @@ def make_run(
     whole: dict[str, Any],
     *,
     slip_share: float = 0.3,
-    success: float = 0.5,
+    success: float | None = 0.5,
     updates: int = UPDATES,
     fresh_episodes: int = 4000,
     first_episode_seed: int = 90_000,
     episodes: int = 40,
 ) -> Path:
-    """Write a finished run: half its rows from logs by quota, half fresh, one kind an episode."""
-    seed = whole["config"]["seed"]
-    rng = np.random.default_rng([seed, abs(round(1000 * success))])
+    """Write a finished run: half its rows from logs by quota, half fresh, one kind an episode.
+
+    Success is null where none is given, as in a task without a goal.
+    """
+    seed, rate = whole["config"]["seed"], success or 0.0
+    rng = np.random.default_rng([seed, abs(round(1000 * rate))])
     run = Run.create(path, whole)
     for part in range(1, 11):
         clocks = {"env_steps": ENV_STEPS * part // 10, "gradient_steps": updates * part // 10}
@@ -90,7 +93,7 @@ def make_run(
             {**dict.fromkeys(run.table("progress").schema.names), **clocks, "phase": ["online"]},
         )
     for condition, bonus in (("nominal", 0.2), ("wheel_slip", 0.0)):
-        won = rng.random(episodes) < success + bonus
+        won = rng.random(episodes) < rate + bonus
         run.append_columns(
             "evaluations",
             {
@@ -100,7 +103,7 @@ def make_run(
                 "condition": condition,
                 "block": "none",
                 "episode_seed": first_episode_seed + np.arange(episodes),
-                "success": won,
+                "success": None if success is None else won,
                 "bumps": 0,
                 "time_s": 10.0,
                 "return": won.astype(float),

@@ -105,6 +105,20 @@ def test_a_run_of_half_the_updates_is_refused(tmp_path, capsys) -> None:
     assert (check["value"], check["verdict"]) == (2.0, "incomparable")
 
 
+def test_without_a_goal_no_success_is_compared(tmp_path, capsys) -> None:
+    first, second = (
+        arm(tmp_path, n, range(k, k + 3), success=None) for n, k in (("a", 0), ("b", 3))
+    )
+    code, found = compared(capsys, first, second)
+    assert (code, found["verdict"]) == (0, "comparable")
+    assert found["outcomes"]
+    for row in found["outcomes"]:
+        assert (row["success"], row["difference"]) == ([None, None], None)
+        assert row["no_interval"] == "the task has no goal: compare the returns"
+    assert main(["compare", *first, "--against", *second]) == 0
+    assert "no goal" in capsys.readouterr().out
+
+
 def test_few_episodes_are_inconclusive(tmp_path, capsys) -> None:
     few = {"fresh_episodes": 400}
     first, second = arm(tmp_path, "a", range(2, 3), **few), arm(tmp_path, "b", range(3, 4), **few)
