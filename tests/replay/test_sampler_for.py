@@ -19,7 +19,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.sampling.ring import FreshRing
 from restock.train.feed.batches import Batches
 from restock.train.feed.logs import Logs
-from restock.train.libraries.mixed_feed import MixedFeed
+from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed
 
 TASK = load_profile("warehouse_amr").task
 BATCH = 40
@@ -87,19 +87,8 @@ def by_batches(panel: Panel) -> Iterator[Drawn]:
 
 def by_library(reported: bool) -> Way:
     def draw(panel: Panel) -> Iterator[Drawn]:
-        feed = MixedFeed(
-            "any",
-            2,
-            panel.observation_size,
-            panel=panel,
-            run=None,
-            logs_share=None,
-            profile="warehouse_amr",
-            seed=0,
-            audit_share=0.0,
-            log_every=10,
-        )
-        feed.keep_record(np.empty(0))
+        options = FeedOptions(profile="warehouse_amr", audit_share=0.0, log_every=10)
+        feed = MixedFeed(64, 2, panel.observation_size, panel, options)
         for _ in range(10**9):
             batch = feed.draw_logs(BATCH)
             yield Drawn(batch.rows, batch.strata)
