@@ -25,7 +25,7 @@ import msgspec
 from markupsafe import Markup
 
 from restock.errors import LabelError, RestockError
-from restock.ingest.store.location import Location
+from restock.ingest.store.location import TRANSITIONS, Location
 from restock.replay.review.events import page_events
 from restock.replay.review.journal import Entry, Journal, Written, write_verdicts
 from restock.replay.review.moments import Moments
@@ -88,11 +88,13 @@ class Review:
         self.store = Store(place)
         self.data = page_data(self.store)
         self.moments = Moments(self.store)
+        self._now = self.store  # of the newest version, against which verdicts are checked
         self._lock = threading.RLock()  # neither store nor journal is for several threads
 
     def close(self) -> None:
-        """Close the store."""
-        self.store.close()
+        """Close the stores."""
+        for store in {self.store, self._now}:
+            store.close()
 
     def moment(self, place: int) -> dict[str, Any]:
         with self._lock:
@@ -123,8 +125,7 @@ class Review:
         """
         with self._lock:
             given = [one for one in entries if one.verdict]
-            with Store(self.place) as newest:
-                problems = check(enumerate(given), newest).problems
+            problems = check(enumerate(given), self._newest()).problems
             if problems:
                 raise LabelError("; ".join(problems[place] for place in sorted(problems)))
             self.journal.append([msgspec.structs.replace(one, at="") for one in entries])
@@ -133,6 +134,14 @@ class Review:
         """Write the verdicts that count into the store."""
         with self._lock:
             return write_verdicts(self.journal, self.place)
+
+    def _newest(self) -> Store:
+        """Return the store as it is now: opening it anew for each key takes most of a second."""
+        if self.place.open_table(TRANSITIONS).version() != self._now.version:
+            if self._now is not self.store:
+                self._now.close()
+            self._now = Store(self.place)
+        return self._now
 
 
 class _Asked(msgspec.Struct):
