@@ -104,9 +104,8 @@ _SIZES = ("tinyint", "smallint", "integer", "bigint", "hugeint")
 _INTEGERS = frozenset(sign + size for sign in ("", "u") for size in _SIZES)
 _NUMBERS = _INTEGERS | {"float", "double", "decimal"}
 _LISTS = ("observation", "next_observation")
-_TYPES: dict[
-    str, tuple[Collection[str], str]
-] = {  # DuckDB's, of a column or of the items of its lists; and what to call them
+# Of a column: DuckDB's types of its values, or of its lists' items, and what to call them.
+_TYPES: dict[str, tuple[Collection[str], str]] = {
     **dict.fromkeys(("action", "step_index"), (_INTEGERS, "an integer")),
     **dict.fromkeys(("reward", *COMMAND), (_NUMBERS, "a number")),
     **dict.fromkeys(("terminated", "truncated"), ({"boolean"}, "true or false")),

@@ -117,8 +117,9 @@ def read_verdicts(path: Path | str, store: Store) -> Verdicts:
         try:
             lines.append((number, msgspec.convert(said, Line, strict=False)))
         except msgspec.ValidationError as error:
-            what = f"the verdict {said['verdict']!r} is not yes, no or FIRST..LAST on its steps"
-            problems[number] = f"{what}: {error}"
+            problems[number] = str(error)
+            if problems[number].endswith("`$.verdict`"):
+                problems[number] = f"the verdict {said['verdict']!r} is not yes, no or FIRST..LAST"
     found = check(lines, store)
     problems |= found.problems
     if problems:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpePlan
 
 # Options that say what is driven, and what becomes of it.
-_DRIVES = (*("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "video"),)
+_DRIVES = ("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "video")
 
 
 @dataclass
