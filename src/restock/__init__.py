@@ -1,10 +1,10 @@
 """Robot logs to coverage-labelled transitions, replay mixtures, and a DQN in a twin.
 
-The rooms `restock.ingest`, `restock.replay`, `restock.train` and `restock.twin` hold the public
-names, docs/reference.md lists them; `restock.report` writes the pages about a run. Importing any of
-them is cheap; `torch`, `mujoco` and `duckdb` load with what needs them.
-The Gymnasium environment `restock/Warehouse-v0` is registered here, by name only, and as soon as
-Gymnasium is imported, before or after this.
+The packages `restock.ingest`, `restock.replay`, `restock.train` and `restock.twin` contain the
+public names; docs/reference.md lists them. `restock.report` writes the pages about a run. Importing
+a package is cheap: `torch`, `mujoco` and `duckdb` are imported when they are first needed.
+The Gymnasium environment `restock/Warehouse-v0` is registered by name when Gymnasium is imported,
+before or after this module.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ when_imported("gymnasium", _register)
 def open(path: str | Path, *, version: int | str | None = None) -> Store | Place:
     """Open a store, a run, a panel or recordings: `restock.open("store").sql("FROM coverage")`.
 
-    Each has `.sql(query)`, `.coverage()` and `.show()`; a folder of recordings and a glob are
-    recordings, too. `version` opens a store as it was: a version's number, or an ISO 8601 time. So
-    does `"store@12"`.
+    The result has `.sql(query)`, `.coverage()` and `.show()`. Recordings are a file, a folder or a
+    glob. `version` is a version of a store: its number, or an ISO 8601 time. `"store@12"` does the
+    same.
     """
     from glob import has_magic
 
@@ -72,7 +72,7 @@ def open(path: str | Path, *, version: int | str | None = None) -> Store | Place
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> ModuleType | str:
-        if name == "__version__":  # looked up when asked for: metadata are slow to read
+        if name == "__version__":  # read on demand, because package metadata are slow to read
             globals()[name] = _version()
             return globals()[name]
         # `import restock` is enough to write `restock.twin.EpisodeSpec`.

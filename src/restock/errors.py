@@ -1,8 +1,8 @@
-"""The one tree of errors: each says what is wrong, where, and what to do about it.
+"""All errors of Restock, in one tree, and the phrases that messages and pages share.
 
-The command line turns any of them into one message on stderr and the error's exit code; from
-Python they are ordinary exceptions, all below `RestockError`. Below them are the phrases that
-messages and pages share: counts, figures, quoted paths.
+Each error says what is wrong, where, and what to do about it. The command line prints it as one
+message on stderr and exits with the error's code. In Python they are ordinary exceptions, all
+subclasses of `RestockError`.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ TRACEBACK = "RESTOCK_TRACEBACK"  # environment variable that prints tracebacks
 
 
 def reported(text: str, keep: str = "") -> str:
-    """Mask key and secret of an address such as `s3://KEY:SECRET@…`, and escape as `visible`."""
+    """Mask credentials in addresses such as `s3://KEY:SECRET@…`, and escape as `visible` does."""
     return visible(_SECRET.sub(r"\1***:***@", text), keep)
 
 
 def visible(text: str, keep: str = "") -> str:
-    """Write out control characters of a text (but those in `keep`), as in `\\x1b[2J`.
+    """Escape the control characters in a text, except those in `keep`: `\\x1b[2J`.
 
-    A terminal obeys them: a topic's name could clear the screen, or pass for another line.
-    Characters that reorder text are written out, too.
+    A terminal would obey them: the name of a topic could clear the screen, or imitate another line.
+    Characters that change the direction of text are escaped, too.
     """
     if text.isprintable():
         return text
@@ -53,7 +53,7 @@ def spreadsheet_safe(value: object) -> object:
 
 
 def print_traceback(error: Exception) -> None:
-    """Print an error's traceback on stderr if the environment asks for it."""
+    """Print an error's traceback on stderr if RESTOCK_TRACEBACK is set."""
     if os.environ.get(TRACEBACK):
         import traceback  # slow to import
 
@@ -65,8 +65,8 @@ class ExitCode(IntEnum):
 
     OK = 0
     FAILED = 1  # an audit failed, or a comparison was refused
-    USAGE = 2  # wrong usage or bad input: nothing was written
-    LOSSY = 3  # written, but data was lost or skipped (and the output says what)
+    USAGE = 2  # wrong usage or bad input; nothing was written
+    LOSSY = 3  # written, but data was lost or skipped; the output lists it
     INTERRUPTED = 130  # Ctrl-C
 
 
@@ -79,7 +79,7 @@ class RestockError(Exception):
     exit_code = ExitCode.USAGE
 
     def __init__(self, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
-        # They quote what files and people say, and end up on a terminal.
+        # Both may quote text from files and from users, and are printed on a terminal.
         what, remedy = reported(what, keep="\n"), remedy and reported(remedy, keep="\n")
         where = where and reported(where)
         self.what, self.where, self.remedy = what, where, remedy
@@ -90,10 +90,10 @@ class RestockError(Exception):
 
 
 def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str) -> None:
-    """Refuse an argument of another kind, such as a path in place of the opened object.
+    """Check the type of an argument: it may be a path in place of the opened object.
 
     Raises:
-        ArgumentError: it is not of `kind`.
+        ArgumentError: the argument is not of type `kind`.
     """
     if not isinstance(given, kind):
         kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
@@ -103,23 +103,23 @@ def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str)
 
 
 class ConfigError(RestockError):
-    """A profile, mixture or other TOML file that says something Restock cannot use."""
+    """A profile, mixture or other TOML file with a setting that Restock cannot use."""
 
 
 class ArgumentError(ConfigError, TypeError):
-    """An argument of a Python function that is of another kind than it takes."""
+    """An argument of a Python function that has the wrong type."""
 
 
 class RecordingError(RestockError):
-    """A file that is no recording, is empty, is damaged, or lacks what a profile needs."""
+    """A file that is not a recording, is empty or damaged, or lacks what a profile needs."""
 
 
 class StoreError(RestockError):
-    """A store that is missing, is not one, or changed under a writer."""
+    """A store that is missing, is something else, or changed while it was written to."""
 
 
 class LabelError(RestockError):
-    """Verdicts on labels that cannot be taken: rows that are not there, or contradictions."""
+    """Verdicts on labels that contradict each other, or are about rows that do not exist."""
 
 
 class QueryError(RestockError):
@@ -127,7 +127,7 @@ class QueryError(RestockError):
 
 
 class MixtureError(RestockError):
-    """A mixture that the store cannot fill, if the mixture asks to be refused then."""
+    """A mixture that the store cannot fill, and that is set to fail in this case."""
 
 
 class PanelError(RestockError):
@@ -138,7 +138,8 @@ class RunError(RestockError):
     """A run directory that is missing, incomplete, or already there."""
 
 
-_POLICIES = ("agent", "planner", "operator", "random", "cloned")  # a run's folder is none of them
+# Names of policies. A run in a folder with one of these names is shown with the prefix `run:`.
+_POLICIES = ("agent", "planner", "operator", "random", "cloned")
 
 
 def plural(number: int, noun: str) -> str:
@@ -152,7 +153,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def uncertain_labels(conditions: Iterable[str], recordings: int) -> str:
-    """Say which labels rest on an outline that nobody measured, and how to settle it."""
+    """Return a note on labels that depend on a guessed outline of the robot, and what to do."""
     return (
         f"uncertain: {', '.join(conditions)}, as the robot's outline is a guess in"
         f" {counted(recordings, 'recording')}: measure it, give --footprint LENGTHxWIDTH to"
@@ -161,7 +162,7 @@ def uncertain_labels(conditions: Iterable[str], recordings: int) -> str:
 
 
 def by_priority(conditions: Iterable[str]) -> str:
-    """Say how rows that hold several conditions are counted once, in the given order."""
+    """Return a note on how a row with several conditions is counted, by their order."""
     return (
         "By priority, a row that holds several conditions counts once, for the first of "
         + ", ".join(conditions)
@@ -179,17 +180,11 @@ def quoted(path: object) -> str:
     return shlex.quote(str(path))
 
 
-def verdict_said(verdict: str, *, decides: bool) -> str:
-    """Say what a check of two runs' feeds means: differences may be allowed."""
-    allowed = {"incomparable": "differs: allowed", "inconclusive": "may differ: allowed"}
-    return verdict if decides else allowed.get(verdict, verdict)
-
-
 def policy_words(policies: Iterable[str]) -> dict[str, str]:
-    """Return policies as people read them, by the names that `--policies` takes.
+    """Return display names of policies, keyed by the names that `--policies` takes.
 
-    `run:demo/logs-alone` is `logs alone`. Folders and files of one name are told apart by those
-    that they are in.
+    `run:demo/logs-alone` is shown as `logs alone`. If two folders or files have the same name,
+    their parent folders are shown as well.
     """
     names = list(dict.fromkeys(policies))
     most = max((len(PurePath(name).parts) for name in names), default=0)
@@ -201,7 +196,7 @@ def policy_words(policies: Iterable[str]) -> dict[str, str]:
 
 
 def _policy_in_words(name: str, parts: int) -> str:
-    """Shorten a policy's name to so many parts of its path."""
+    """Shorten a policy's name to the last `parts` parts of its path."""
     kind, _, path = name.partition(":")
     if kind == "limited":
         return f"{_policy_in_words(path, parts)}, limited"

@@ -1,8 +1,8 @@
-"""Files that are replaced in one step, and read with an error that names them.
+"""Atomic replacement of files, and reading with errors that name the file.
 
-A reader sees the old file or the new one, never a part. A file that cannot be read (missing,
-truncated, damaged) is a `RestockError` of the caller's kind that names the file and says what to
-do.
+A reader sees the old file or the new one, never a part of it. If a file cannot be read (missing,
+truncated, damaged), the error is the `RestockError` subclass that the caller asked for. It names
+the file and says what to do.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ def read_table(
 ) -> pa.Table:
     """Read a Parquet file, and verify the checksums of its pages if it has them.
 
-    Columns of `schema` that it lacks are null. One that `schema` lacks is refused: its name may be
-    damaged, which no checksum covers.
+    A column of `schema` that is missing in the file is null in the table. A column that is not in
+    `schema` is refused: its name may be damaged, because checksums do not cover names.
 
     Raises:
-        RestockError: (of the kind `error`) there is no such file, or it is damaged.
+        RestockError: (of type `error`) the file does not exist or is damaged.
     """
     try:
         if schema is not None:
@@ -59,10 +59,10 @@ def read_table(
 def read_json(
     path: Path, *, error: type[RestockError] = RestockError, remedy: str | None = None
 ) -> dict[str, Any]:
-    """Read the JSON object in a file.
+    """Read a JSON object from a file.
 
     Raises:
-        RestockError: (of the kind `error`) there is no such file, or it holds no JSON object.
+        RestockError: (of type `error`) the file does not exist, or is not a JSON object.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -91,7 +91,7 @@ def first_line(error: BaseException | str) -> str:
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Replace a Parquet file in one step, with a checksum a page."""
+    """Replace a Parquet file atomically; each page has a checksum."""
     temporary = _temporary(path)
     try:
         pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
@@ -101,15 +101,15 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 
 def write_text(path: Path, text: str, *, exclusive: bool = False) -> None:
-    """Replace a text file in one step; as `write_bytes`."""
+    """Replace a text file atomically, as `write_bytes` does."""
     write_bytes(path, text.encode("utf-8"), exclusive=exclusive)
 
 
 def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
-    """Replace a file in one step; what goes to a pipe or a device is written into it.
+    """Replace a file atomically; a pipe or a device is written to instead.
 
     Raises:
-        FileExistsError: `exclusive`, and there is something at `path` already.
+        FileExistsError: `exclusive` is set, and `path` exists.
     """
     if _takes_a_stream(path) and not exclusive:
         path.write_bytes(content)
@@ -126,13 +126,13 @@ def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
 
 
 def _takes_a_stream(path: Path) -> bool:
-    """Return whether the path cannot be replaced: /dev/stdout, /dev/null, a named pipe."""
+    """Return whether a path is written to, not replaced: /dev/stdout, /dev/null, a named pipe."""
     if path.is_symlink() and str(path.readlink()).startswith("/proc/self/fd"):
         return True
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-# The file that marks a folder of Restock's -> what people call that folder.
+# A file that only one kind of Restock's folders has -> the name of that kind, for messages.
 _MARKS = {
     "panel.json": "the panel",
     "transitions/_delta_log": "the store",
@@ -141,13 +141,13 @@ _MARKS = {
 
 
 def expect_file_place(path: Path | None, option: str, *, run: Path | None = None) -> None:
-    """Refuse, before the work, a place where an option's file cannot be or would be lost.
+    """Check, before any work, that an option's output file can be written and kept at `path`.
 
     Args:
-        run: the run that the file is about; the file may lie in its folder.
+        run: the run that the file describes; the file may be in its folder.
 
     Raises:
-        ConfigError: it is a folder, or lies within a panel, a store or another run.
+        ConfigError: `path` is a folder, or is inside a panel, a store or another run.
     """
     if path is None:
         return
@@ -162,11 +162,11 @@ def expect_file_place(path: Path | None, option: str, *, run: Path | None = None
 
 
 def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
-    """Refuse a place where no new folder can be made, or where it would be lost with another.
+    """Check that a new folder can be made at `path`, and would not be removed with another one.
 
     Raises:
-        RestockError: (of the kind `error`) a file or a folder without permission is in the way; or
-            it lies within a panel, a store or a run, and would be lost with it.
+        RestockError: (of type `error`) a file or missing permissions prevent it, or the path is
+            inside a panel, a store or a run, and would be removed with it.
     """
     absolute = path.absolute()
     parent = next(folder for folder in absolute.parents if folder.exists())
@@ -182,7 +182,7 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
 
 
 def _within(path: Path, run: Path | None = None) -> str | None:
-    """Say why nothing is written there: it lies within a panel, a store or another run."""
+    """Return why `path` must not be used: it is inside a panel, store or other run; else None."""
     for folder in path.absolute().parents:
         for mark, kind in _MARKS.items():
             own = kind == "the run" and run is not None and run.resolve() == folder.resolve()
@@ -192,26 +192,27 @@ def _within(path: Path, run: Path | None = None) -> str | None:
 
 
 def is_undecoded(letter: str) -> bool:
-    """Return whether a character stands for a byte of a path that Python could not decode."""
+    """Return whether a character of a path is a surrogate for a byte that is not UTF-8."""
     return "\udc80" <= letter <= "\udcff"
 
 
 def _temporary(path: Path, *, replaces: bool = True) -> Path:
-    if replaces and path.is_dir():  # reported for the path itself, not later for the file beside it
+    if replaces and path.is_dir():  # else the error would name the temporary file
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     return temporary_name(path)
 
 
 def temporary_name(path: Path) -> Path:
-    """Return where a file is written first: beside its place, under this process's name."""
+    """Return the path of the temporary file for `path`: beside it, with this process's id."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
-    """Remove what killed processes left of files in `folder` whose names match; returns them.
+    """Remove temporary files that killed processes left in `folder`; return the removed ones.
 
-    Only names that `temporary_name` gives, and not those of another process that still runs.
+    `pattern` is a glob for the final names. Only names made by `temporary_name` are removed, and
+    none of another process that is still running.
     """
     removed = []
     for path in folder.glob(f".{pattern}.*.tmp"):
@@ -225,9 +226,9 @@ def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
 
 @contextmanager
 def building(out: Path) -> Iterator[Path]:
-    """Yield a folder beside `out` for one builder, and remove what is left of it at the end.
+    """Yield a temporary folder beside `out` in which to build it; remove the folder at the end.
 
-    Folders of builders that were killed are removed first.
+    Folders left by processes that were killed are removed first.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     prefix = f".{out.name}.building~"
@@ -246,7 +247,7 @@ def building(out: Path) -> Iterator[Path]:
 
 
 def is_running(process: int) -> bool:
-    """Return whether this machine has a process of that id."""
+    """Return whether a process with this id runs on this machine."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

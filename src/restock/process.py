@@ -1,7 +1,7 @@
-"""This process: interrupts, child processes, works in step, its cores, and late imports.
+"""Process control: interrupts, child processes, coroutines in step, CPU cores, lazy imports.
 
-A kill does what Ctrl-C does, and child processes end with it. Libraries that are optional or slow
-are imported when they are used.
+A kill (SIGTERM) does the same as Ctrl-C, and also ends the child processes. Libraries that are
+optional or slow to import are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ if TYPE_CHECKING:  # slow to import, and every command imports this
 
 P = ParamSpec("P")
 T = TypeVar("T")
-# A work that asks for answers on its way: yields a function of several arguments and its own one.
+# A coroutine whose requests can be batched with those of others. It yields (function, argument);
+# `in_step` calls the function once with the arguments of all, and sends each its own answer.
 Work = Generator[tuple[Callable[[list[Any]], Sequence[Any]], Any], Any, T]
 
 _running: set[subprocess.Popen[bytes]] = set()
@@ -35,11 +36,11 @@ _interrupted = False
 
 @contextmanager
 def kill_as_interrupt() -> Iterator[None]:
-    """Let a kill (SIGTERM) and the end of the terminal (SIGHUP) do what Ctrl-C does.
+    """Handle a kill (SIGTERM) and a closed terminal (SIGHUP) as Ctrl-C in this block.
 
-    By default that is a KeyboardInterrupt, in a training a checkpoint. Ignored signals (`nohup`)
-    stay ignored. Each interrupt is noted, because a library that calls into Python may turn it into
-    an error of its own (see `was_interrupted`).
+    By default, Ctrl-C raises KeyboardInterrupt; training writes a checkpoint. Ignored signals
+    (`nohup`) stay ignored. Interrupts are recorded, because a library that calls into Python may
+    turn one into an error of its own (see `was_interrupted`).
     """
     handlers = {"SIGTERM": _interrupt, "SIGHUP": _interrupt, "SIGINT": _note_interrupt}
     usual = {
@@ -51,7 +52,7 @@ def kill_as_interrupt() -> Iterator[None]:
         for number, handler in usual.items()
         if handler in (signal.SIG_DFL, signal.default_int_handler)
     ]
-    if threading.current_thread() is not threading.main_thread():  # no other may set handlers
+    if threading.current_thread() is not threading.main_thread():  # only it may set handlers
         ours = []
     if signal.SIGINT in ours:
         went_on_after_interrupt()
@@ -65,16 +66,16 @@ def kill_as_interrupt() -> Iterator[None]:
 
 
 def was_interrupted() -> bool:
-    """Return whether an interrupt came that nobody has dealt with.
+    """Return whether there was an interrupt that has not been handled.
 
-    DuckDB and Arrow report a KeyboardInterrupt in a Python function that they call as an error of
-    theirs. Ask here before taking such an error for a damaged file.
+    If DuckDB or Arrow call a Python function, and that raises KeyboardInterrupt, they report an
+    error of their own. Check this before such an error is reported as a damaged file.
     """
     return _interrupted
 
 
 def interrupts_raised(function: Callable[P, T]) -> Callable[P, T]:
-    """Make a function raise KeyboardInterrupt whatever DuckDB made of it."""
+    """Make a function raise KeyboardInterrupt if DuckDB turned one into another error."""
 
     @wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -90,7 +91,7 @@ def interrupts_raised(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _by_interrupt(error: BaseException | None, before: BaseException | None) -> bool:
-    """Return whether an error, or its cause, is an interrupt or what DuckDB makes of one."""
+    """Return whether an error or its cause is an interrupt, or DuckDB's error for one."""
     while error is not None and error is not before:
         said = str(error)
         if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in said:
@@ -102,16 +103,16 @@ def _by_interrupt(error: BaseException | None, before: BaseException | None) -> 
 
 
 def went_on_after_interrupt() -> None:
-    """Note that an interrupt was dealt with, and did not cause later errors."""
+    """Record that the interrupt was handled: it does not explain later errors."""
     global _interrupted
     _interrupted = False
 
 
 def in_step(works: Sequence[Work[T]]) -> Iterator[tuple[int, T | Exception]]:
-    """Run works side by side, and answer together what several ask for.
+    """Run coroutines side by side, and answer their requests for one function in one call.
 
-    Yields the place of each work that ends, and what it returned or raised. An error of the answers
-    to several is raised: it says not whose it is.
+    Yields the index of each coroutine that ends, with what it returned or raised. An error in a
+    shared call is raised here, because it cannot be attributed to one coroutine.
     """
     answers: dict[int, Any] = dict.fromkeys(range(len(works)))
     try:
@@ -123,7 +124,7 @@ def in_step(works: Sequence[Work[T]]) -> Iterator[tuple[int, T | Exception]]:
                     wanted.setdefault(function, {})[place] = argument
                 except StopIteration as done:
                     yield place, done.value
-                except Exception as error:  # noqa: BLE001  (of that work alone)
+                except Exception as error:  # noqa: BLE001  (the other works go on)
                     yield place, error
             answers = {}
             for function, of_each in wanted.items():
@@ -134,7 +135,7 @@ def in_step(works: Sequence[Work[T]]) -> Iterator[tuple[int, T | Exception]]:
 
 
 def alone(work: Work[T]) -> T:
-    """Return what a work returns; raise what it raises."""
+    """Run one coroutine by itself; return what it returns, raise what it raises."""
     ((_, outcome),) = in_step([work])
     if isinstance(outcome, Exception):
         raise outcome
@@ -143,11 +144,11 @@ def alone(work: Work[T]) -> T:
 
 @contextmanager
 def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """Interrupt a process, once, and wait for it, if the block fails.
+    """Terminate a child process and wait for it if the block fails.
 
-    The process needs a session of its own, or Ctrl-C in the terminal reaches it too. It is
-    interrupted by a kill (see `kill_as_interrupt`), because Ctrl-C is ignored in the background of
-    a script and in what is started there.
+    The process needs a session of its own, or it would get the terminal's Ctrl-C as well. SIGTERM
+    is sent (see `kill_as_interrupt`), because processes in the background of a script, and their
+    children, ignore SIGINT.
     """
     _running.add(process)
     try:
@@ -161,7 +162,7 @@ def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
 
 def interrupt_running() -> None:
-    """Interrupt processes that other threads wait for, since no interrupt reaches a thread."""
+    """Terminate the processes that other threads wait for: a thread gets no interrupt."""
     for process in list(_running):
         process.send_signal(signal.SIGTERM)
 
@@ -179,7 +180,7 @@ def _note_interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-# optional package -> the extra that has it
+# Optional package -> the extra that installs it.
 EXTRAS = {
     **dict.fromkeys(("altair", "scipy", "vl_convert"), "pages"),
     **dict.fromkeys(("gymnasium", "mujoco", "safetensors", "tensorboard", "torch"), "train"),
@@ -191,10 +192,10 @@ EXTRAS = {
 
 
 def import_extra(name: str, use: str) -> Any:
-    """Import an optional package; `use` says what needs it.
+    """Import an optional package; `use` is what needs it, for the message.
 
     Raises:
-        ConfigError: it is not installed; says which command installs it.
+        ConfigError: it is not installed. The remedy is the command that installs it.
     """
     try:
         return import_module(name)
@@ -203,10 +204,10 @@ def import_extra(name: str, use: str) -> Any:
 
 
 def expect_installed(use: str, *names: str) -> None:
-    """Refuse a use of optional packages before anything is written.
+    """Check that optional packages are installed, before anything is written.
 
     Raises:
-        ConfigError: the first that is not installed, and the command that installs it.
+        ConfigError: one is not installed. The remedy is the command that installs it.
     """
     for name in names:
         if not installed(name):
@@ -214,13 +215,13 @@ def expect_installed(use: str, *names: str) -> None:
 
 
 def not_installed(name: str, use: str, extra: str = "") -> ConfigError:
-    """Return the error about an optional package; `extra` is another than its own that has it."""
+    """Return the error for a missing optional package; `extra` replaces the one in `EXTRAS`."""
     remedy = install_command(extra or EXTRAS[name])
     return ConfigError(f"{use} needs {name}, which is not installed", remedy=remedy)
 
 
 def install_command(extra: str = "") -> str:
-    """Return the pip command that adds an extra, or a missing requirement, to this Restock."""
+    """Return the pip command that installs an extra, or missing requirements, of this Restock."""
     import json
     from importlib.metadata import PackageNotFoundError, distribution
 
@@ -238,12 +239,12 @@ def installed(name: str) -> bool:
     """Return whether the module `name` can be imported, without importing it."""
     try:
         return importlib.util.find_spec(name) is not None
-    except ValueError:  # the entry in its place has no spec: it was blocked
+    except ValueError:  # sys.modules[name] has no spec: its import was blocked
         return False
 
 
 def when_imported(name: str, action: Callable[[], None]) -> None:
-    """Call `action` once the module `name` is imported: now, or right after its import."""
+    """Call `action` now if the module `name` is imported, else right after its import."""
     if name in sys.modules:
         action()
     else:
@@ -251,7 +252,7 @@ def when_imported(name: str, action: Callable[[], None]) -> None:
 
 
 class _After:
-    """A finder that finds one module as the others do, and has its loader do something more."""
+    """An import finder that calls `action` after the module `name` was executed."""
 
     def __init__(self, name: str, action: Callable[[], None]) -> None:
         self.name, self.action = name, action
@@ -277,7 +278,7 @@ class _After:
 
 @contextmanager
 def hidden(name: str) -> Iterator[None]:
-    """Hide the module `name` from imports in this block, unless it is imported already."""
+    """Make imports of the module `name` fail in this block, unless it is already imported."""
     finder = _Hides(name)
     sys.meta_path.insert(0, finder)
     try:
@@ -286,7 +287,7 @@ def hidden(name: str) -> Iterator[None]:
         sys.meta_path.remove(finder)
 
 
-class _Hides:
+class _Hides:  # an import finder
     def __init__(self, name: str) -> None:
         self.name = name
 
@@ -299,7 +300,7 @@ class _Hides:
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,6 +1,6 @@
-"""Public names: each is imported from where it is defined when it is first used.
+"""Lazy public names: each is imported from its module when it is first used.
 
-Each room's `__init__.py` (and `restock.twin`) names what users may rely on; everything deeper is
+The `__init__.py` of each room (and `restock.twin`) lists the public names. All other modules are
 private.
 """
 
@@ -24,9 +24,9 @@ FACES = (
 
 
 def lazy(face: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return a face's `__getattr__`, `__dir__` and `__all__` (PEP 562).
+    """Return `__getattr__`, `__dir__` and `__all__` (PEP 562) for a module with public names.
 
-    The names are those that its `if TYPE_CHECKING:` block imports as themselves.
+    The names are the `X as X` imports in the module's `if TYPE_CHECKING:` block.
     """
     homes = {name: module for module, names in imported(face).items() for name in names}
 
@@ -41,7 +41,7 @@ def lazy(face: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list
 
 
 def imported(face: str) -> dict[str, list[str]]:
-    """Return the names that a face imports as themselves, by module; nothing is imported for it."""
+    """Return the `X as X` imports of a module by the module they come from, without importing."""
     source = Path(str(sys.modules[face].__file__)).read_text(encoding="utf-8")
     names_by_module: dict[str, list[str]] = {}
     for node in ast.walk(ast.parse(source)):

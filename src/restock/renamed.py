@@ -1,6 +1,6 @@
-"""Say what the names of earlier versions became: the only place that knows them. Goes at 1.0.
+"""Names of earlier versions -> what to write or type now. This module will be removed at 1.0.
 
-What was removed without anything in its place is not here: it is an unknown key or option.
+A name that was removed without a replacement is not listed: it is an unknown key or option.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MIXTURES = {
     ' `unit = "episode"` into a file',
     "steps": 'it was removed: write `[each_condition]` with `share = "equal"` into a file',
 }
-AUDITS = {  # and their thresholds
+AUDITS = {  # audits and their thresholds
     "flattering_evaluation": _now("'evaluation_bias'"),
     "flattering_panel": _now("'panel_bias'"),
     "flattering_policy": _now("'policy_bias'"),
@@ -53,7 +53,7 @@ AUDITS = {  # and their thresholds
     "max_flattery": _now("'max_bias'"),
 }
 
-VERBS = {  # what to type instead
+VERBS = {
     **{verb: f"it is `restock store {verb}` now" for verb in ("label", "compact", "remove")},
     **{verb: f"it is `restock coverage {verb}` now" for verb in ("gaps", "drift", "diff")},
     "record": "it is `restock twin record` now",
@@ -64,7 +64,7 @@ VERBS = {  # what to type instead
     "schema": "it is `restock profile schema` now",
 }
 
-OPTIONS = {  # of one command, or of all; what to type instead
+OPTIONS = {  # "COMMAND --option", or "--option" for every command
     "coverage drift --out": "the page of `restock coverage STORE --out FILE` has drift, too",
     "--memory-limit": "set RESTOCK_MEMORY_LIMIT=4GB in the environment: every command keeps it",
     "audit --panel": "give the panel after the store: restock audit STORE PANEL",

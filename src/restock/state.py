@@ -1,8 +1,8 @@
-"""State that a checkpoint keeps, declared by name, so that exactly what is saved is restored.
+"""State in checkpoints: a class names the attributes that are saved and restored, no others.
 
-A class names its attributes in `STATE`; each is an array, a number, a string, None, a list or dict
-of those, a generator, a tensor, a torch module, a dataclass or msgspec struct, or another object
-with `state_dict` and `load_state_dict`.
+A class lists its attributes in `STATE`. Each is an array, a number, a string, None, a list or dict
+of those, a random generator, a tensor, a torch module, a dataclass or msgspec struct, or another
+object with `state_dict` and `load_state_dict`.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from restock.errors import RunError
 
 
 class Stateful:
-    """Saves and restores what `STATE` names.
+    """A class whose attributes in `STATE` are saved and restored.
 
-    `restored` recomputes what follows from the state. Attributes in `SAME` are saved, too, and a
-    state in which they differ is refused.
+    Attributes in `SAME` are saved as well; a state with other values of them is refused. Subclasses
+    override `restored` to recompute what depends on the state.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()
     SAME: ClassVar[tuple[str, ...]] = ()
-    # Types of values that the restored object does not show: `list[EpisodeSpec]`.
+    # Types of attributes whose current value does not show the type: `list[EpisodeSpec]`.
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return arrays and JSON values, by the names in `STATE` (without a leading underscore)."""
+        """Return arrays and JSON values, keyed by the names (without a leading underscore)."""
         return {_key(name): saved(getattr(self, name)) for name in (*self.SAME, *self.STATE)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore everything that `state_dict` saved; raise `mismatch` for another's state.
+        """Restore what `state_dict` saved; raise `mismatch` if an attribute in `SAME` differs.
 
         Raises:
-            RunError: it lacks one of these names: another version saved it.
+            RunError: an attribute is missing, because another version of Restock saved the state.
         """
         for name in self.SAME:
             if not _alike(saved(getattr(self, name)), state.get(_key(name))):
@@ -52,7 +52,7 @@ class Stateful:
         self.restored()
 
     def expect_state(self, state: Mapping[str, Any], names: Sequence[str]) -> None:
-        """Raise RunError if a state lacks one of these names."""
+        """Raise RunError if one of these names is missing in a state."""
         own = type(self).__name__
         if lacking := next((_key(name) for name in names if _key(name) not in state), None):
             raise RunError(
@@ -64,12 +64,12 @@ class Stateful:
         """Finish after `load_state_dict`; subclasses override it."""
 
     def mismatch(self, name: str, value: Any) -> Exception:
-        """Return the error for a saved state with another `value` of a name in `SAME`."""
+        """Return the error for a state in which an attribute in `SAME` has another `value`."""
         return ValueError(f"the saved state is of another {type(self).__name__}: {name} {value}")
 
 
 def saved(value: Any) -> Any:
-    """Return a value as arrays and JSON values that share no memory with it."""
+    """Convert a value to arrays and JSON values; nothing shares memory with it."""
     if isinstance(value, np.random.Generator):
         return value.bit_generator.state
     if isinstance(value, Stateful):
@@ -96,13 +96,13 @@ def saved(value: Any) -> Any:
 
 
 def first_mismatch(error: RuntimeError) -> str:
-    """Return the first line of PyTorch's complaint about weights of another network."""
+    """Return the first mismatch that PyTorch reports about the weights of another network."""
     lines = str(error).splitlines()
     return lines[min(1, len(lines) - 1)].strip()
 
 
 def restored(current: Any, state: Any) -> Any:
-    """Return the saved `state` as the kind that `current` is; objects are changed in place."""
+    """Convert a saved state to the type of `current`; objects with a state are changed in place."""
     if isinstance(current, np.random.Generator):
         current.bit_generator.state = state
         return current

@@ -1,9 +1,9 @@
-"""Statistics of evaluations and logs: intervals that say how much a number can be trusted.
+"""Statistics of evaluations and logs, with confidence intervals.
 
-Over episodes, of which there are many, they are percentile bootstraps (Efron and Tibshirani 1993)
-of independent units: values within a stratum, or whole clusters, because segments of one episode
-are not independent. All draws come from the generator that is given. Over training seeds, of which
-there are few, they are Student's t.
+Intervals over episodes, of which there are many, are percentile bootstraps (Efron and Tibshirani
+1993). They resample independent units: values within a stratum, or whole clusters, because segments
+of one episode are not independent. Every draw uses the generator that the caller passes. Intervals
+over training seeds, of which there are few, are Student's t.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from restock.arrays import F64
 
 CONFIDENCE = 0.95  # of every interval
 TAILS = [(1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2]  # the quantiles at its ends
-MIN_PAIRS = 3  # from which on `paired_t` says more than the mean
-_WEIGHTS_AT_ONCE = 4_000_000  # in memory
+MIN_PAIRS = 3  # with fewer pairs, `paired_t` returns only the mean
+_WEIGHTS_AT_ONCE = 4_000_000  # bootstrap weights that are held in memory at a time
 
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A statistic and its interval, in the unit of the values; NaN is unknown."""
+    """A statistic and its interval, in the unit of the values; NaN means unknown."""
 
     value: float
     low: float
     high: float
 
     def within(self, least: float, most: float = math.inf) -> ConfidenceInterval:
-        """Return the interval with its ends cut at the range of the quantity."""
+        """Return the interval, clipped to the range that the quantity can have."""
         low, high = np.clip([self.low, self.high], least, most).tolist()
         return ConfidenceInterval(self.value, low, high)
 
@@ -43,7 +43,7 @@ NOT_KNOWN = ConfidenceInterval(float("nan"), float("nan"), float("nan"))
 
 
 def interval_text(value: float, low: float | None, high: float | None, form: str = ".2f") -> str:
-    """Format a value with the ends of its interval, if it has one: `.52 [.41, .63]`."""
+    """Format a value, and its interval if there is one: `.52 [.41, .63]`."""
     return f"{value:{form}}" + ("" if low is None else f" [{low:{form}}, {high:{form}}]")
 
 
@@ -53,9 +53,9 @@ def no_interval_text(why: str | None) -> str:
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Return the Wilson score interval of a proportion; (0, 1) without trials.
+    """Return the Wilson score interval of a proportion; (0, 1) if there are no trials.
 
-    Unlike the normal interval it stays inside [0, 1] and has a width at 0 and n successes.
+    Unlike the normal interval it stays inside [0, 1], and is not empty at 0 or n successes.
     """
     if not 0 <= successes <= trials:
         raise ValueError(f"successes must be in [0, trials], got {successes} of {trials}")
@@ -67,14 +67,14 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     half = (z / (1 + z * z / trials)) * math.sqrt(
         share * (1 - share) / trials + z * z / (4 * trials * trials)
     )
-    # At the ends the formula is exact; rounding must not push the interval past them.
+    # At 0 and n successes an end is exactly 0 or 1; rounding must not move it.
     low = 0.0 if successes == 0 else max(0.0, centre - half)
     high = 1.0 if successes == trials else min(1.0, centre + half)
     return low, high
 
 
 def iqm(values: NDArray[Any]) -> float:
-    """Return the interquartile mean: that of the middle half (arXiv:2108.13264)."""
+    """Return the interquartile mean, the mean of the middle half (arXiv:2108.13264)."""
     from scipy.stats import trim_mean
 
     return float(trim_mean(np.asarray(values, np.float64), 0.25, axis=None))
@@ -95,11 +95,11 @@ def improvement_of_arms(
     rng: np.random.Generator,
     resamples: int = 2000,
 ) -> ConfidenceInterval:
-    """Return P(a run of `better` beats one of `worse` on an episode), ties counting half.
+    """Return P(a run of `better` beats a run of `worse` on an episode); a tie counts as half.
 
-    The mean over episodes and all pairs of runs (arXiv:2108.13264), with a percentile bootstrap in
-    which the runs of each arm and the episodes, common to both, are drawn whole: it covers what
-    other seeds and other episodes would have changed. The ends are NaN from one run of an arm.
+    It is the mean over episodes and all pairs of runs (arXiv:2108.13264). The bootstrap resamples
+    the runs of each arm, and the episodes common to both, so the interval covers the variation
+    over seeds and over episodes. The ends are NaN if an arm has only one run.
 
     Args:
         better, worse: (runs, episodes), the same episodes in the same order.
@@ -115,7 +115,7 @@ def improvement_of_arms(
 
 
 def percentiles(draws: NDArray[Any]) -> tuple[float, float]:
-    """Return the percentile interval of a statistic's bootstrap draws (R,)."""
+    """Return the percentile interval of the bootstrap draws (R,) of a statistic."""
     low, high = np.quantile(draws, TAILS)
     return float(low), float(high)
 
@@ -129,8 +129,8 @@ def bootstrap(
 ) -> tuple[float, float]:
     """Return a stratified bootstrap interval of `statistic` over all values together.
 
-    Each stratum (a condition, say) is resampled within itself, so that every resample holds the
-    same number of values of each: what varies is the episodes, not the mix.
+    Each stratum (such as a condition) is resampled by itself, so every resample has the same number
+    of values of each stratum: the episodes vary, the mix does not.
     """
     groups = [np.asarray(group, np.float64) for group in strata if len(group)]
     if not groups:
@@ -148,9 +148,9 @@ def mean_over_strata(
     rng: np.random.Generator,
     resamples: int = 2000,
 ) -> ConfidenceInterval:
-    """Return the mean of the strata's means, each (n,) weighted alike whatever its size.
+    """Return the mean of the means of strata (n,): each stratum has the same weight.
 
-    Given paired differences it is a paired bootstrap: pairs are drawn whole.
+    If the values are differences of pairs, the interval is that of a paired bootstrap.
     """
     means = [
         values[rng.integers(len(values), size=(resamples, len(values)))].mean(axis=1)
@@ -166,10 +166,10 @@ def difference_of_arms(
 ) -> ConfidenceInterval:
     """Return mean(second) - mean(first) of two arms that drove the same episodes.
 
-    Runs and episodes are crossed random effects, runs of each arm, episodes common to both (the
-    pairing), so the interval holds both what another seed and what other episodes would have
-    changed. Student's t, with Satterthwaite's degrees of freedom: with five runs an arm a
-    percentile bootstrap is too narrow. The ends are NaN for an arm of one run, or one episode.
+    Runs (of each arm) and episodes (common to both arms) are crossed random effects, so the
+    interval covers the variation over seeds and over episodes. It is Student's t with
+    Satterthwaite's degrees of freedom, because a percentile bootstrap is too narrow for five runs
+    an arm. The ends are NaN if an arm has only one run, or if there is only one episode.
 
     Args:
         first, second: (runs, episodes), the same episodes in the same order.
@@ -187,7 +187,7 @@ def difference_of_arms(
             for arm in (first, second)
         ),
     ]
-    # What runs and episodes share is in both, and counts once.
+    # The interaction of runs and episodes is part of each variance, and must count once.
     both = sum(_interaction(arm) / arm.size for arm in (first, second))
     variance = max(sum(part for part, _ in parts) - both, max(part for part, _ in parts))
     if variance == 0:
@@ -198,16 +198,16 @@ def difference_of_arms(
 
 
 def _interaction(arm: F64) -> float:
-    """Return the variance of (runs, episodes) that neither the run nor the episode explains."""
+    """Return the variance of values (runs, episodes) that neither run nor episode explains."""
     left = arm - arm.mean(axis=1, keepdims=True) - arm.mean(axis=0, keepdims=True) + arm.mean()
     return float((left**2).sum() / ((arm.shape[0] - 1) * (arm.shape[1] - 1)))
 
 
 def paired_t(differences: NDArray[Any]) -> tuple[ConfidenceInterval, float]:
-    """Return the mean of paired differences (n,), its Student's t interval, and p of no difference.
+    """Return the mean of paired differences (n,) with its Student's t interval, and the p value.
 
-    With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below
-    `MIN_PAIRS`, and where all are the same, the spread is not known: ends and p are NaN.
+    With n = 5 the interval has its nominal coverage of .95; a percentile bootstrap has .84 to .91.
+    The ends and p are NaN for fewer than `MIN_PAIRS` values, or if all values are the same.
     """
     from scipy.stats import ttest_1samp
 
@@ -221,14 +221,14 @@ def paired_t(differences: NDArray[Any]) -> tuple[ConfidenceInterval, float]:
 
 
 def nothing_varies(values: NDArray[Any]) -> bool:
-    """Return whether all values (n,) are the same, but for rounding."""
+    """Return whether all values (n,) are the same up to rounding."""
     return bool(np.allclose(values, values[0], rtol=1e-9, atol=1e-12))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p values for their number, in their order (Holm 1979).
+    """Return p values adjusted for multiple tests, in the given order (Holm 1979).
 
-    The probability that any of those below alpha is by chance is at most alpha.
+    If those below alpha are rejected, the probability of any false rejection is at most alpha.
     """
     p = np.asarray(p_values, np.float64)
     order = np.argsort(p, kind="stable")
@@ -239,7 +239,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def which_adjusted(primary: bool) -> str:
-    """Say which contrasts' p values `holm` adjusted."""
+    """Return a note on which p values `holm` adjusted."""
     if primary:
         return (
             "The primary contrast was named before the runs; p of the others is adjusted for their"
@@ -252,16 +252,17 @@ def which_adjusted(primary: bool) -> str:
 
 
 def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F64:
-    """Draw how often a bootstrap over whole clusters takes each of them, (R, C)."""
+    """Draw how often each cluster is in each resample of a cluster bootstrap, (R, C)."""
     return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(np.float64)
 
 
 def for_few_clusters(interval: ConfidenceInterval, clusters: int) -> ConfidenceInterval:
     """Return the percentile interval of a bootstrap over C clusters, widened for small C.
 
-    That interval is too narrow for small C: a draw's variance is (C - 1) / C of the true one,
-    and the spread is itself estimated. So its ends are moved away from the value, by Student's t
-    with C - 1 degrees of freedom over the normal's quantile, times sqrt(C / (C - 1)).
+    The percentile interval is too narrow for small C: the variance of a draw is (C - 1) / C of the
+    true one, and the spread is itself an estimate. The distance of each end from the value is
+    multiplied by t / z * sqrt(C / (C - 1)), with the quantiles of Student's t (C - 1 degrees of
+    freedom) and of the normal distribution.
     """
     from scipy.stats import t
 
@@ -284,10 +285,10 @@ def clustered_quantiles(
     rng: np.random.Generator,
     resamples: int = 1000,
 ) -> list[ConfidenceInterval]:
-    """Return quantiles of values (N,) with clusters (N,), each value counting once.
+    """Return quantiles of values (N,) in clusters (N,); each value has the same weight.
 
-    A quantile is the smallest value that has at least that share of the values at or below it.
-    With one cluster there is nothing to resample: the ends are NaN.
+    A quantile is the smallest value with at least that share of the values at or below it. The ends
+    are NaN if there is only one cluster, because there is nothing to resample.
     """
     values = np.asarray(values, np.float64)
     if not len(values):
@@ -313,9 +314,9 @@ def clustered_ratio(
     rng: np.random.Generator,
     resamples: int = 1000,
 ) -> ConfidenceInterval:
-    """Return sum(above) / sum(below) of (N,) each; a mean if `below` is all ones.
+    """Return sum(above) / sum(below) of arrays (N,); this is a mean if `below` is all ones.
 
-    With one cluster there is nothing to resample: the ends are NaN.
+    The ends are NaN if there is only one cluster, because there is nothing to resample.
     """
     if not len(above) or not np.sum(below):
         return NOT_KNOWN
@@ -344,7 +345,7 @@ def _quantile_rows(values: F64, weights: F64, shares: Sequence[float]) -> F64:
 
 
 def _intervals(at: F64, draws: F64) -> list[ConfidenceInterval]:
-    """Return the intervals of statistics (Q,) with their draws (R, Q)."""
+    """Return the intervals of statistics (Q,) from their bootstrap draws (R, Q)."""
     low, high = np.quantile(draws, TAILS, axis=0)
     return [
         ConfidenceInterval(float(value), float(least), float(most))

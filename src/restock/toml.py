@@ -1,9 +1,9 @@
-"""TOML in and out: typed structs with ranges, and errors that name the key and its value.
+"""Read and write TOML as typed structs with ranges, with errors that name the key and its value.
 
-A range is part of the type (`Annotated[float, Meta(ge=0, lt=1)]`): it is checked when a file is
-read, when a `Checked` struct is made in Python, and it goes into a JSON Schema. Rules about several
-fields are in a struct's own `check`. Every number must be finite, with a range or without:
-comparisons with `nan` are silently false, and JSON has neither `nan` nor `inf`.
+The range of a field is part of its type (`Annotated[float, Meta(ge=0, lt=1)]`). It is checked when
+a file is read and when a `Checked` struct is made in Python, and it is in the JSON Schema. A rule
+about several fields is in the `check` method of the struct. Every number must be finite, with or
+without a range: comparisons with `nan` are silently false, and JSON has neither `nan` nor `inf`.
 """
 
 from __future__ import annotations
@@ -24,27 +24,25 @@ from msgspec import inspect as kinds
 from restock.errors import ConfigError
 
 T = TypeVar("T")
-_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # a step of a message's path, and the rest
-
-
-MAX_NAMED = 12  # keys of a table that a message lists
-MAX_DEPTH = 64  # nested tables and arrays
+_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # first step of a path in msgspec's messages, rest
+MAX_NAMED = 12  # an error lists the known keys of a table if there are at most this many
+MAX_DEPTH = 64  # of nested tables and arrays
 _DEEP_KEY = re.compile(rf"""(?<![\w"'.-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_DEPTH},}}""")
 
 
 class ValueRefused(ConfigError, ValueError):
-    """A value that a struct refuses. A ValueError too, which msgspec gives the key in a file."""
+    """A value that a struct refuses; as a ValueError, so that msgspec adds the key to it."""
 
 
 class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A struct whose ranges also hold for values given in Python; NumPy's numbers become Python's.
+    """A struct that also checks ranges when it is made in Python, and converts NumPy's numbers.
 
     Raises:
-        ValueRefused: a value outside the range of its type, or refused by `check`.
+        ValueRefused: a value is outside the range of its type, or `check` refuses it.
     """
 
     def check(self) -> None:
-        """Raise ValueError if values cannot be combined."""
+        """Raise ValueError if the values of several fields do not fit together."""
 
     def __post_init__(self) -> None:
         try:
@@ -59,7 +57,7 @@ class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str, Any]:
-    """Read the values of a TOML file.
+    """Read a TOML file.
 
     Raises:
         ConfigError: the file cannot be read, or is not TOML in UTF-8.
@@ -75,16 +73,16 @@ def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str,
 
 
 def parse_toml(text: str, *, where: str) -> dict[str, Any]:
-    """Parse the values of a TOML text; `where` names it in errors.
+    """Parse a TOML document; `where` names it in errors.
 
     Raises:
-        ConfigError: it is not TOML, or nested too deep for what reads its values.
+        ConfigError: it is not TOML, or is nested more than MAX_DEPTH levels deep.
     """
     too_deep = ConfigError(f"is nested more than {MAX_DEPTH} levels deep", where=where)
-    if _DEEP_KEY.search(text):  # which takes tomllib the square of its length
+    if _DEEP_KEY.search(text):  # tomllib's time for such a key grows with the square of its length
         raise too_deep
     try:
-        values = tomllib.loads(text.removeprefix("\ufeff"))  # which some editors put before UTF-8
+        values = tomllib.loads(text.removeprefix("\ufeff"))  # the BOM that some editors write
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", where=where) from error
     except RecursionError as error:
@@ -110,11 +108,11 @@ def typed(
     """Convert plain values to a typed struct.
 
     Args:
-        renamed: keys of earlier versions, dotted, each with what became of it (restock.renamed).
-        prefix: what stands before each key in errors, dotted.
+        renamed: dotted keys of earlier versions -> what to write instead (see restock.renamed).
+        prefix: dotted path that precedes each key in errors.
 
     Raises:
-        ConfigError: an unknown, missing or renamed key, or a value that does not fit; names it.
+        ConfigError: a key is unknown, missing or renamed, or a value does not fit its type.
     """
     for old, instead in (renamed or {}).items():
         if _has(document, old.split(".")):
@@ -129,7 +127,7 @@ def typed(
 
 
 def toml_value(value: Any) -> str:
-    """Return a string, number, boolean, list or mapping as TOML on one line."""
+    """Format a string, number, boolean, list or mapping as TOML on one line."""
     if isinstance(value, Mapping):
         items = (f"{_key(key)} = {toml_value(item)}" for key, item in value.items())
         return "{" + ", ".join(items) + "}"
@@ -137,7 +135,7 @@ def toml_value(value: Any) -> str:
         return "[" + ", ".join(map(toml_value, value)) + "]"
     if isinstance(value, float):
         return repr(float(value))  # JSON has no inf and nan
-    # JSON would escape what is beyond 16 bits in two halves, and leave DEL as it is.
+    # ASCII JSON would have surrogate pairs, which TOML forbids; DEL must be escaped in TOML only.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -175,7 +173,7 @@ def _item(kind: kinds.Type) -> kinds.Type | None:
 
 
 def _plain(value: Any) -> Any:
-    """Turn NumPy's numbers and arrays into Python's, which JSON and TOML can hold."""
+    """Convert NumPy's numbers and arrays to Python's, for JSON and TOML."""
     if type(value).__module__ == "numpy":
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -246,7 +244,7 @@ def _range_in_words(bounds: Mapping[str, float]) -> str:
 
 
 def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
-    """Return msgspec's message with the key as TOML writes it, and with a range in words."""
+    """Reword a message of msgspec: the key as in TOML, and the range in words."""
     what, path = _parted(message)
     for pattern, word in (("contains unknown", "unknown"), ("missing required", "missing")):
         if field := re.fullmatch(rf"Object {pattern} field `(.*)`", what):
@@ -262,18 +260,18 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
         if choices and choices[0].startswith('"'):  # names stand before other kinds
             what += f"; choose from {', '.join(choices)}"
         return f"`{key}`: {what}" if key else what
-    # A check of a struct's own names its fields: `loss.margin …` where the struct is at `loss`.
+    # The message of a struct's `check` begins with a field: `margin …` becomes `loss.margin …`.
     return what if what.startswith((key, "`")) or " " not in what else f"{key}.{what}"
 
 
 def _parted(message: str) -> tuple[str, str]:
-    """Split a message of msgspec into what is wrong, and the path of the value."""
+    """Split a message of msgspec into the complaint and the path of the value."""
     what, _, path = message.partition(" - at `$")
     return what, path.rstrip("`")
 
 
 def _keys_meant(message: str, document: Any, kind: Any, prefix: str) -> str | None:
-    """Name the key that is nearest to an unknown one, or all that there are; None if many."""
+    """Suggest the key nearest to an unknown one, or list all keys; None if there are too many."""
     what, path = _parted(message)
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.S)
     if unknown is None:
@@ -291,7 +289,7 @@ def _keys_meant(message: str, document: Any, kind: Any, prefix: str) -> str | No
 
 
 def _choices(kind: Any, document: Any, path: str) -> Iterator[str]:
-    """Yield what may stand at a message's path: names in quotes, or a number or table."""
+    """Yield the values allowed at the path in a message: quoted names, `a number`, `a table`."""
     for place, _, _ in _places(kinds.type_info(kind), document, path):
         if isinstance(place, kinds.LiteralType):
             yield from (f'"{value}"' for value in place.values)
@@ -304,9 +302,9 @@ def _choices(kind: Any, document: Any, path: str) -> Iterator[str]:
 def _places(
     kind: kinds.Type, value: Any, path: str, key: str = ""
 ) -> Iterator[tuple[kinds.Type, Any, str]]:
-    """Yield each type, value and key that a message's path leads to.
+    """Yield the type, value and key at the path in a message of msgspec.
 
-    There are several where a type is a union, and where `[...]` stands for any key of a table.
+    There are several if a type is a union, or if the path contains `[...]`, any key of a table.
     """
     if isinstance(kind, kinds.UnionType):
         for option in kind.types:
@@ -336,7 +334,7 @@ def _places(
 
 
 def _has(document: Any, keys: list[str]) -> bool:
-    """Return whether a document has a key, by its path; in an array of tables, whether one has."""
+    """Return whether a document has the key at a path; in an array of tables, if any table has."""
     if not keys:
         return True
     if isinstance(document, list):
@@ -346,7 +344,7 @@ def _has(document: Any, keys: list[str]) -> bool:
 
 
 def _join(*parts: str) -> str:
-    """Join keys with dots; an index stands by itself: `a.b[0].c`."""
+    """Join keys with dots, and indices without: `a.b[0].c`."""
     text = ""
     for part in parts:
         part = part.lstrip(".")
@@ -355,7 +353,7 @@ def _join(*parts: str) -> str:
 
 
 def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each nested setting by its path, as `--set` names it."""
+    """Yield each nested setting with its dotted path, as `--set` takes it."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
             yield from by_path(value, f"{prefix}{key}.")
@@ -364,9 +362,9 @@ def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any) -> list[str]:
-    """Return the settings (all, or those of these names) that are not at their defaults.
+    """Return the names of settings (of all, or of `names`) that differ from their defaults.
 
-    `default`: those that are not the struct's own.
+    `default` overrides the struct's own defaults.
     """
     usual = type(settings)(**default)
     named = names or settings.__struct_fields__
@@ -374,10 +372,10 @@ def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any)
 
 
 def json_schema(kind: type, title: str) -> str:
-    """Return the JSON Schema of a struct's TOML, for editors: `#:schema FILE` names it.
+    """Return the JSON Schema of a struct's TOML, for editors (`#:schema FILE` in the TOML).
 
-    Types, ranges and defaults are those of the struct. Rules about several keys at once are not in
-    it: they are checked when the file is read.
+    It contains the types, ranges and defaults of the struct, but no rules about several keys.
+    Those are checked when the file is read.
     """
     schema = msgspec.json.schema(kind)
     for definition in schema.get("$defs", {}).values():
@@ -391,7 +389,7 @@ def json_schema(kind: type, title: str) -> str:
 
 
 def _without_null(value: dict[str, Any]) -> dict[str, Any]:
-    """Remove null from a field's type, since TOML has none: the key is left out instead."""
+    """Remove null from the type of a field: TOML has no null, and leaves the key out instead."""
     choices = [choice for choice in value.get("anyOf", ()) if choice != {"type": "null"}]
     if len(choices) == len(value.get("anyOf", ())):
         return value

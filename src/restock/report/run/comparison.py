@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from restock.errors import verdict_said
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Figure,
@@ -23,6 +22,7 @@ from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 
 MAX_SETTINGS = 4  # differing settings that are named in a line
 FREE_KINDS = ("free", "software")
+_ALLOWED = {"incomparable": "differs: allowed", "inconclusive": "may differ: allowed"}
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
 _INTERVALS = (
     "Intervals are 95 %, over seeds and episodes; with fewer than three seeds or ten episodes, "
@@ -168,7 +168,9 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
             "value": _setting(row["value"]),
             "95 %": _ends(row["low"], row["high"]),
             "limit": f"{row['limit']:g}",
-            "verdict": verdict_said(row["verdict"], decides=row["decides"]),
+            "verdict": row["verdict"]
+            if row["decides"]
+            else _ALLOWED.get(row["verdict"], row["verdict"]),
         }
         for row in sorted(
             found["checks"], key=lambda row: (not row["decides"], order[row["verdict"]])
