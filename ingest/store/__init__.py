@@ -1,1 +1,1 @@
-"""Transitions and manifest, written to a Delta table in one commit."""
+"""Writer of a store's Delta tables, and everything else that reads or changes their files."""

@@ -1,9 +1,9 @@
-"""Commits to a store's two Delta tables, and the Parquet files that they add.
+"""Commit to a store's two Delta tables, and write the Parquet files that commits add.
 
-A commit takes files that are already written, and what they replace, from a fresh look at the
-table. It is all or nothing, is tried again if another writer was faster, and is not done twice if
-its answer was lost. Tables are created, and get the columns of a profile's own signals, when rows
-with them are first written.
+A commit adds files that are already written, and removes files that they replace in the newest
+version of the table, all or nothing. It is tried again if another writer was faster, and not made
+twice if its answer was lost. Tables are created with the first rows, and get the columns of a
+profile's own signals with the first rows that have them.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ from restock.ingest.store.summary import SUMMARY_SCHEMA
 from restock.ingest.store.version import FORMAT, expect_writable
 from restock.ingest.task.schema import recording_schema
 
-GROUP_ROWS = 65_536  # of a compacted file's row groups
-GROUP_BYTES = 64 << 20  # or where rows are large, as manifests are
+GROUP_ROWS = 65_536  # rows per row group of a joined file
+GROUP_BYTES = 64 << 20  # bytes that end a row group earlier if rows are large, as manifests are
 READ_ROWS = 2048
 
 
@@ -58,19 +58,19 @@ class AddedFile:
     """A file to be committed."""
 
     recording_id: str
-    path: str  # in its table
+    path: str  # relative to its table
     rows: int
     size: int = 0  # bytes, once it is written
 
 
 def add_action(file: AddedFile, now_ms: int) -> AddAction:
-    """Return what a commit says about a file."""
+    """Return the Delta action that adds a file."""
     stats = json.dumps({"numRecords": file.rows})
     return AddAction(file.path, file.size, {}, now_ms, True, stats)
 
 
 def parquet_options(schema: pa.Schema) -> dict[str, Any]:
-    """Return how the tables' columns are encoded. Each page has a checksum: see `open_parquet`."""
+    """Return Parquet options for a table's files. Each page has a checksum: see `open_parquet`."""
     return {
         "compression": "zstd",
         "write_page_checksum": True,
@@ -80,7 +80,7 @@ def parquet_options(schema: pa.Schema) -> dict[str, Any]:
 
 
 def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
-    """Write a compacted file of transitions without the ingests that are not kept."""
+    """Write a new file with only the `kept` ingests of a joined file of transitions."""
     path = f"{TRANSITIONS}/{file.path}"
     with damage_named(place, path):
         schema = place.read_schema(path)
@@ -97,14 +97,15 @@ def merge(
     extra: Sequence[pa.Table] = (),
     summarised: bool = False,
 ) -> AddedFile:
-    """Write one file of some ingests in these files, in their order, and of `extra` manifests.
+    """Write one file with the `kept` ingests of these files, in order, after `extra` manifests.
 
-    What it holds is listed in it if the manifests describe these rows: Restock wrote the files, or
-    all that others changed in them is `summarised` again. A row group at a time is in memory.
-    Columns of `schema` that a file lacks are null. What is written is deleted where that fails.
+    The new file's metadata lists its ingests if manifests describe its rows: Restock wrote all the
+    files, or new summaries were made of all rows that others changed (`summarised`). Columns of
+    `schema` that a file lacks are null. One row group at a time is in memory. If writing fails, the
+    new file is deleted.
 
     Raises:
-        StoreError: a file is missing or damaged, or it cannot be written.
+        StoreError: a file is missing or damaged, or the new file cannot be written.
     """
     wanted = pa.array([one.ingest_id for one in kept], pa.string())
     rows = [(one["recording_id"][0].as_py(), one["ingest_id"][0].as_py()) for one in extra]
@@ -133,12 +134,12 @@ def merge(
 
 @contextmanager
 def written_whole(place: Location, path: str) -> Iterator[None]:
-    """Delete a file that the block writes if it fails or is interrupted.
+    """Delete the file that the block writes if the block fails or is interrupted.
 
-    On a full disk its part would keep the disk full.
+    On a full disk, the incomplete file would keep the disk full.
 
     Raises:
-        StoreError: it cannot be written.
+        StoreError: the file cannot be written.
     """
     try:
         yield
@@ -151,7 +152,7 @@ def written_whole(place: Location, path: str) -> Iterator[None]:
 
 
 def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
-    """Return the error of a store that cannot be written, with what to do."""
+    """Return the error for a store that cannot be written, with what to do."""
     said = str(error)
     if re.search(r"No space left|Disk quota exceeded|os error (28|122)\b", said):
         return StoreError(
@@ -159,7 +160,7 @@ def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
             where=str(place),
             remedy="free some space, then run the same command again: what the store has is kept",
         )
-    # Delta's library has the cause in its last line, behind an arrow.
+    # Delta's library puts the cause on the last line, after an arrow.
     causes = [line.rsplit("↳\x1b[0m ")[-1].strip() for line in said.splitlines() if "↳" in line]
     return StoreError(
         "cannot be written: " + ": ".join([first_line(error), *causes[-1:]]), where=str(place)
@@ -167,7 +168,7 @@ def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
 
 
 def conformed(rows: pa.Table, schema: pa.Schema) -> pa.Table:
-    """Return a table with the columns of a schema, in its order; null if it has none."""
+    """Return a table with the columns of a schema, in its order; missing columns become null."""
     columns = [
         rows[field.name].cast(field.type)
         if field.name in rows.column_names
@@ -201,7 +202,7 @@ def _flush(writer: pq.ParquetWriter, waiting: list[pa.Table]) -> int:
 
 
 def _float_columns(schema: pa.Schema) -> list[str]:
-    """Return Parquet's paths of the float columns, those in lists of floats included."""
+    """Return the Parquet paths of columns of floats and of lists of floats."""
     paths = []
     for field in schema:
         if pa.types.is_floating(field.type):
@@ -211,17 +212,17 @@ def _float_columns(schema: pa.Schema) -> list[str]:
     return paths
 
 
-ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
-CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
+ATTEMPTS = 12  # at a commit if other writers are faster; in each, Delta's library tries 15 times
+CHECKPOINT_COMMITS = 20  # commits per checkpoint, so that readers of the log open few files
 _JITTER = random.SystemRandom()
 T = TypeVar("T")
 
 
 class TableCommits(StoreReader):
-    """A store whose tables can be made and committed to."""
+    """Reader of a store that can also create its tables and commit to them."""
 
     def create(self, name: str, schema: pa.Schema) -> None:
-        """Make the table, or add the columns that it lacks: rows from before hold null in them."""
+        """Create the table, or add the columns that it lacks, which are null in older rows."""
         self.expect_folder()
         from restock.ingest.profile.tables import refuse_other_signals
 
@@ -253,10 +254,7 @@ class TableCommits(StoreReader):
             raise self.path.absent()
 
     def expect_store(self) -> None:
-        """Raise StoreError if there is no whole store, or if rows cannot be taken out of it.
-
-        Other tools' features can protect it from that.
-        """
+        """Raise StoreError if there is no complete store, or a table's features forbid removals."""
         self.expect_folder()
         self.path.expect_both_tables()
         if not self.path.has_table(TRANSITIONS):
@@ -267,9 +265,10 @@ class TableCommits(StoreReader):
     def commit(
         self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]
     ) -> tuple[int, list[str]]:
-        """Add files, all or nothing; to `transitions`, remove the same recordings' others with it.
+        """Add files, all or nothing; in `transitions`, also remove older rows of their recordings.
 
-        Returns the table's version and the files removed from it.
+        `instead_of` maps recordings to ingests that must still be the newest in the store. Returns
+        the table's version, and the own paths of the ingests that were removed.
         """
         recordings = sorted({file.recording_id for file in added})
         replaced: list[str] = []
@@ -279,18 +278,18 @@ class TableCommits(StoreReader):
             listing = self._listing(name)
             table, active = listing.table, listing.files
             if {file.path for file in added} <= {file.path for file in active}:
-                return table.version()  # by the attempt before, whose answer was lost
+                return table.version()  # an earlier attempt was committed, but its answer was lost
             self._still(instead_of)
             now_ms = time.time_ns() // 1_000_000
             actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
             turns = []
             if name == TRANSITIONS:
-                self.discard_uncommitted(name, rewritten)  # of an attempt before
+                self.discard_uncommitted(name, rewritten)  # of an earlier attempt
                 replaced[:] = _held(active, recordings)
                 rewritten.clear()
                 actions += self._without(active, recordings, rewritten, now_ms)
-                # Two first ingests of one recording add without removing, which is no conflict by
-                # itself: the transaction id makes it one.
+                # Two concurrent first ingests of one recording remove nothing, so Delta would not
+                # see a conflict: the transaction id makes it one.
                 turns = _turns(table, recordings)
             self.transact(table, actions, turns)
             return self._read_on(name, table)
@@ -299,11 +298,11 @@ class TableCommits(StoreReader):
             return self.again_on_conflict(attempt), replaced
 
     def take_out(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
-        """Take recordings out of `transitions` by their ingests, all or none of them.
+        """Remove recordings from `transitions`, all or none; `ingests` maps recording to ingest.
 
-        Their manifests are left to the caller.
+        The caller removes their manifests.
 
-        Returns the table's version that they were read from, and the newest, without them.
+        Returns the last version of the table that has them, and the new version without them.
 
         Raises:
             StoreError: one was ingested again or removed in the meantime, or other writers were
@@ -315,10 +314,10 @@ class TableCommits(StoreReader):
         def attempt() -> int:
             listing = self._listing(TRANSITIONS)
             table, active = listing.table, listing.files
-            self.discard_uncommitted(TRANSITIONS, rewritten)  # of an attempt before
+            self.discard_uncommitted(TRANSITIONS, rewritten)  # of an earlier attempt
             rewritten.clear()
             if before and not _held(active, ingests):
-                return table.version()  # by the attempt before, whose answer was lost
+                return table.version()  # an earlier attempt was committed, but its answer was lost
             self._still(ingests)
             before[:] = [table.version()]
             now_ms = time.time_ns() // 1_000_000
@@ -337,9 +336,9 @@ class TableCommits(StoreReader):
         rewritten: list[AddedFile],
         now_ms: int,
     ) -> list[AddAction | RemoveAction]:
-        """Return what takes the rows of recordings out of `transitions`: their files.
+        """Return actions that remove all files with rows of these recordings from `transitions`.
 
-        Of files that hold others too, new ones without them are added to `rewritten`.
+        Files that also have other recordings are replaced by new ones, listed in `rewritten`.
         """
         actions: list[AddAction | RemoveAction] = []
         for file in active:
@@ -355,17 +354,17 @@ class TableCommits(StoreReader):
     def replace_files(
         self, name: str, gone: Collection[str], made: Sequence[AddedFile], operation: str
     ) -> int | None:
-        """Put files in the place of others of a table, all or nothing.
+        """Replace the files `gone` of a table by the files `made`, all or nothing.
 
-        Returns the table's version; None, and `made` are deleted, where another writer has taken
-        one of the others out meanwhile.
+        Returns the table's version. If another writer has removed one of `gone` meanwhile, deletes
+        `made` and returns None.
         """
 
         def attempt() -> int | None:
             table = self.path.open_table(name)
             active = {path for path, *_ in active_files(table)}
             if made and {file.path for file in made} <= active:
-                return table.version()  # by the attempt before, whose answer was lost
+                return table.version()  # an earlier attempt was committed, but its answer was lost
             if not set(gone) <= active:
                 return None
             now_ms = time.time_ns() // 1_000_000
@@ -385,7 +384,7 @@ class TableCommits(StoreReader):
 
     @contextmanager
     def discarded_on_failure(self, name: str, files: Sequence[AddedFile]) -> Iterator[None]:
-        """Delete files that the block was to commit where it fails or is interrupted."""
+        """Delete files that the block did not commit because it failed or was interrupted."""
         try:
             yield
         except BaseException:
@@ -393,9 +392,9 @@ class TableCommits(StoreReader):
             raise
 
     def discard_uncommitted(self, name: str, files: Sequence[AddedFile]) -> None:
-        """Delete those of the files that are not in the table, as far as that is possible.
+        """Delete the files that are not in the table, if possible.
 
-        An error or an interrupt may come when they are in it already.
+        They may be in it: an error or an interrupt can come right after a successful commit.
         """
         with suppress(OSError, StoreError, DeltaError):
             if files:
@@ -404,7 +403,7 @@ class TableCommits(StoreReader):
                 self.path.delete(f"{name}/{path}" for path in paths)
 
     def remove(self, name: str, paths: Collection[str]) -> None:
-        """Take files out of a table, those that are still in it."""
+        """Remove those of the files from a table that are still in it."""
 
         def attempt() -> None:
             listing = self._listing(name)
@@ -450,11 +449,11 @@ class TableCommits(StoreReader):
             raise
         except (DeltaError, OSError) as error:
             if self.path.folder is None:
-                raise  # `translate_errors` knows what S3 says
+                raise  # `translate_errors` explains errors of S3
             raise unwritten(self.path, error) from error
 
     def _still(self, instead_of: Mapping[str, str]) -> None:
-        """Check that these ingests are the ones in the store."""
+        """Check that the store still has these ingests (recording -> ingest)."""
         if not instead_of:
             return
         shown = {one.recording_id: one.ingest_id for one in self.shown()}
@@ -467,14 +466,14 @@ class TableCommits(StoreReader):
                 )
 
     def again_on_conflict(self, work: Callable[[], T]) -> T:
-        """Do it again, from a fresh look at the table, while other writers are faster."""
+        """Run `work`, which reads the table anew, up to ATTEMPTS times while others are faster."""
         for attempt in range(ATTEMPTS):
             try:
                 with self.path.translate_errors():
                     return work()
             except CommitFailedError as error:
                 conflict = error
-                # Writers that collided wait for different times, and longer each time.
+                # Random, growing waits, so that writers that collided do not collide again.
                 time.sleep(0.02 * 2 ** min(attempt, 6) * (1 + _JITTER.random()))
             except (DeltaError, OSError) as error:
                 raise unwritten(self.path, error) from error
@@ -486,7 +485,7 @@ class TableCommits(StoreReader):
 
 
 def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str]:
-    """Return where the ingests of these recordings that the files hold have written their own."""
+    """Return the own paths of these recordings' ingests in the files."""
     return [
         own_path(one.recording_id, one.ingest_id)
         for file in active
@@ -496,7 +495,7 @@ def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str
 
 
 def _turns(table: DeltaTable, recordings: Sequence[str]) -> list[Transaction]:
-    """Return transaction ids that let one writer at a time change each of these recordings."""
+    """Return transaction ids that make concurrent changes of one of these recordings conflict."""
     return [
         Transaction(app, (table.transaction_version(app) or 0) + 1)
         for app in (f"restock/{recording}" for recording in recordings)
@@ -509,7 +508,7 @@ def recording_columns() -> pa.Schema:
 
 
 def delta_columns(schema: pa.Schema) -> pa.Schema:
-    """Replace lists of fixed size, which Delta does not know, by plain lists."""
+    """Replace fixed-size lists, which Delta does not support, by plain lists."""
     return pa.schema(
         [
             field.with_type(pa.list_(field.type.value_type))
@@ -521,7 +520,7 @@ def delta_columns(schema: pa.Schema) -> pa.Schema:
 
 
 def plain_lists(rows: pa.Table) -> pa.Table:
-    """Return the rows with `delta_columns`; the lists' values stay in their memory."""
+    """Return the rows with `delta_columns`, without copying the values of lists."""
     schema = delta_columns(rows.schema).with_metadata(rows.schema.metadata)
     columns = []
     for field, column in zip(schema, rows.columns, strict=True):

@@ -1,5 +1,5 @@
--- Steps of each episode and zone at which a condition holds, and at how many of them it began. Over
--- `transitions`. Part of two statements, as zone_steps.sql is.
+-- Steps per episode, zone and condition at which the condition holds, and at how many of them it began.
+-- From `transitions`. Included in the same two statements as zone_steps.sql.
 SELECT
     recording_id,
     episode_id,

@@ -1,11 +1,11 @@
-"""Damaged files: how they are found, and how a store goes on without them and says what it lost.
+"""Find damaged files of a store, repair or remove them, and report the recordings that are lost.
 
-Every page of a store's Parquet files has a checksum, which DuckDB does not verify. So files are
-read whole once before rows are taken from them, and the store remembers which were. A damaged
-joined file is joined again from its source files while they are kept. If they are gone, it is
-removed from its table, and the recordings whose rows or manifests were in it are named: no view
-shows them until they are ingested again. A file that can be read is never removed. Other writers
-may continue meanwhile.
+Every page of a store's Parquet files has a checksum, which DuckDB does not verify. So each file is
+read whole once before its rows are used, and the store keeps a list of the files that passed. A
+damaged joined file (see `restock store compact`) is joined again from its source files while they
+are kept. If they are gone, the file is removed from its table, and the recordings whose rows or
+manifests were in it are reported: no view shows them until they are ingested again. A readable file
+is never removed. Other writers may continue meanwhile.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Locat
 from restock.ingest.store.writer import StoreWriter
 
 OPERATION = "restock store compact --drop-damaged"
-READ_AT_ONCE = 4  # files, of each of which a row group may be in memory
-VERIFIED = "verified.json"  # in a store: path -> [bytes, time written in ns] of files found whole
-Files = Mapping[str, list[StoredFile]]  # by table
+READ_AT_ONCE = 4  # files that are read in parallel; each has one row group in memory
+VERIFIED = "verified.json"  # in a store: path of an undamaged file -> [bytes, write time in ns]
+Files = Mapping[str, list[StoredFile]]  # table name -> its readable files
 _TOLD = (
     *("recording_id", "ingest_id", "ingested_at"),
     *("source_file", "transitions", "corrections"),
@@ -51,12 +51,12 @@ _TOLD = (
 
 @dataclass(frozen=True)
 class LostRecording:
-    """A recording that no view shows without the damaged files."""
+    """A recording that views no longer show because its rows or its manifest were lost."""
 
     recording_id: str
     source_file: str
     transitions: int
-    corrections: int | None  # of its labels, by people; None where its manifest was damaged
+    corrections: int | None  # label corrections by people; None if its manifest was damaged
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class DamagedFile:
 
 @dataclass(frozen=True)
 class Verified:
-    """What was found of a store's files: how many it has, and those that are damaged."""
+    """The number of files in a store, and the damaged ones."""
 
     files: int
     damaged: list[DamagedFile]
@@ -77,26 +77,26 @@ class Verified:
 
 @dataclass
 class Dropped:
-    """What became of the damaged files, or would. Files are named by their paths in the store."""
+    """What was done with damaged files, or would be. Paths of files are relative to the store."""
 
     joined_again: list[str] = field(default_factory=list)
     dropped: list[str] = field(default_factory=list)
     lost: list[LostRecording] = field(default_factory=list)
-    unnamed_transitions: int = 0  # lost ones, of recordings whose manifests are lost as well
+    unnamed_transitions: int = 0  # lost rows of recordings whose manifests are lost as well
 
 
 def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
-    """Take the files that cannot be read out of a store's tables. Every file is read whole.
+    """Repair or remove the damaged files of a store's tables. Every file is read whole.
 
     Raises:
         StoreError: there is no store, it cannot be reached or written, or a file cannot be read
-            for another reason than damage.
+            for a reason other than damage.
     """
     store.expect_store()
     done = Dropped()
-    lost_rows = 0  # by Delta's log
+    lost_rows = 0  # as counted in Delta's log
     readable: dict[str, list[StoredFile]] = {}
-    for name in (TRANSITIONS, RECORDINGS):  # of manifests, those of the rows that stay are needed
+    for name in (TRANSITIONS, RECORDINGS):  # rows first: only manifests of remaining rows are kept
         table = store.path.open_table(name)
         rows = {path: count or 0 for path, count, *_ in active_files(table)}
         broken = _damaged(store.path, _below(name, rows))
@@ -123,8 +123,8 @@ def verify_store(path: str | Path | Location) -> Verified:
     """Read every file of a store whole: rows, manifests, and the frames that manifests name.
 
     Raises:
-        StoreError: there is no store, it cannot be reached, or a file cannot be read for another
-            reason than damage.
+        StoreError: there is no store, it cannot be reached, or a file cannot be read for a reason
+            other than damage.
     """
     store = StoreReader(path)
     store.path.expect_newest()
@@ -144,13 +144,13 @@ def verify_store(path: str | Path | Location) -> Verified:
 
 
 def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) -> list[str]:
-    """Read files of a store whole and return those that are damaged; paths are within the store.
+    """Read files of a store whole and return the damaged ones; paths are relative to the store.
 
-    A file that was found whole before is skipped while its size and time are the same, unless
+    Files that passed earlier and still have the same size and write time are skipped, unless
     `again`.
 
     Raises:
-        StoreError: a file cannot be read for another reason than damage.
+        StoreError: a file cannot be read for a reason other than damage.
     """
     stamps = _stamps(place)
     known = _remembered(place, stamps)
@@ -166,13 +166,13 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
 
 
 def unverified_files(place: Location, paths: Iterable[str]) -> int:
-    """Return how many of these files of a store `verify_files` would read."""
+    """Count the files among these that `verify_files` would read."""
     known = _remembered(place, _stamps(place))
     return sum(path not in known for path in paths)
 
 
 def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
-    """Return the error of files that `verify_files` found damaged, with what to do."""
+    """Return the error for files that `verify_files` found damaged, with what to do."""
     more = ""
     if len(damaged) > 1:
         count = counted(len(damaged) - 1, "more file")
@@ -188,7 +188,7 @@ def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
 
 
 def _stamps(place: Location) -> dict[str, list[int]]:
-    """Return size (bytes) and write time (ns) of each Parquet file of a store, by its path."""
+    """Return the size (bytes) and write time (ns) of each Parquet file in a store, by path."""
     with place.translate_errors():
         infos = place.files.get_file_info(pa.fs.FileSelector("", recursive=True))
     return {
@@ -197,7 +197,7 @@ def _stamps(place: Location) -> dict[str, list[int]]:
 
 
 def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, list[int]]:
-    """Return the files that were found whole and have not changed since."""
+    """Return the stamps of files that passed an earlier check and have not changed since."""
     try:
         with place.reading(VERIFIED) as source:
             reported = json.loads(source.read())
@@ -208,14 +208,14 @@ def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, l
 
 
 def _damaged(place: Location, paths: Sequence[str]) -> list[str]:
-    """Return those of these files that are damaged."""
+    """Return the damaged files among these."""
     with ThreadPoolExecutor(READ_AT_ONCE) as pool:
         broken = pool.map(lambda path: is_damaged(place, path), paths)
         return [path for path, one in zip(paths, broken, strict=True) if one]
 
 
 def is_damaged(place: Location, path: str) -> bool:
-    """Return whether a file is missing, is no whole Parquet file, or fails its checksums.
+    """Return whether a file is missing, is not a complete Parquet file, or fails its checksums.
 
     Raises:
         StoreError: it cannot be read for another reason: permissions, the disk, the network.
@@ -224,7 +224,7 @@ def is_damaged(place: Location, path: str) -> bool:
         try:
             with place.reading(path) as source:
                 file = open_parquet(source)
-                # A column whose page says that it is empty ends the batches without an error.
+                # A damaged page header may claim 0 values: reading ends early without an error.
                 read = sum(batch.num_rows for batch in file.iter_batches(READ_ROWS))
                 return bool(read != file.metadata.num_rows)
         except (FileNotFoundError, pa.ArrowInvalid):
@@ -236,9 +236,9 @@ def is_damaged(place: Location, path: str) -> bool:
 
 
 def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:
-    """Return the files that a damaged one was joined from, with those ingests that are missing now.
+    """Return the files that a damaged file was joined from, reduced to the ingests to restore.
 
-    An empty list where they are gone, or do not have all that is missing.
+    The list is empty if one of them is gone or damaged, or if they lack some of the file's rows.
     """
     paths = _joined_from(place, name, path)
     if any(is_damaged(place, one) for one in _below(name, paths)):
@@ -261,9 +261,9 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
 
 
 def _joined_from(place: Location, name: str, path: str) -> list[str]:
-    """Return the files that the commit which added a file took out, by Delta's log.
+    """Return the files that were removed by the commit that added this file, from Delta's log.
 
-    There are none if the log does not go back to it.
+    The list is empty if the log no longer has that commit.
     """
     log = f"{name}/_delta_log"
     commits = [one for one in place.times(log) if one.endswith(".json")]
@@ -276,7 +276,7 @@ def _joined_from(place: Location, name: str, path: str) -> list[str]:
 
 
 def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredFile]) -> bool:
-    """Put what its sources have in the place of a damaged file; False where it is gone by then."""
+    """Replace a damaged file by its sources' rows; return False if it is gone from the table."""
     made = []
     if sources:
         schema = pa.schema(store.path.open_table(name).schema().to_arrow())
@@ -284,15 +284,15 @@ def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredF
         made.append(merge(store.path, name, sources, kept, schema))
     replaced = store.replace_files(name, {path}, made, OPERATION) is not None
     if replaced and name == RECORDINGS and OWN_PATH.fullmatch(path):
-        store.path.delete([f"{name}/{path}"])  # a reader would find it by its name
+        store.path.delete([f"{name}/{path}"])  # readers look up manifests by this path, too
     return replaced
 
 
 def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
-    """Return the recordings that have rows and no manifest, or a manifest and no rows.
+    """Return the recordings that have rows but no manifest, or a manifest but no rows.
 
-    Of the latter, some may be those of a writer between its two commits: it does no harm to ingest
-    them again.
+    A manifest without rows may also be from a writer between its two commits: ingesting its
+    recording again does no harm.
     """
     manifests: dict[str, dict[str, Any]] = {}
     for file in readable[RECORDINGS] if dropped else ():
@@ -320,7 +320,7 @@ def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[Lost
 
 
 def _source_files(place: Location, file: StoredFile) -> dict[str, str]:
-    """Return the recordings that rows are of, as the rows name them, by ingest."""
+    """Return the `source_file` of each ingest in a file of rows, by ingest id."""
     names = ["ingest_id", "source_file"]
     rows = place.read(f"{TRANSITIONS}/{file.path}", columns=names)
     return dict(zip(*(rows[name].to_pylist() for name in names), strict=True))

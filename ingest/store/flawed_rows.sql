@@ -1,5 +1,5 @@
--- Rows that no network survives, or that lack a value no row may lack. Over `transitions`. Part of two
--- statements: the view that scans, and the summary that a recording's manifest keeps.
+-- Rows with NaN or infinite values, which would break a network, or without a required value. From
+-- `transitions`. Included in two statements: the view that scans rows, and the summary in a manifest.
 SELECT transition_id, recording_id, episode_id, step_index, is_null, is_not_finite
 FROM (
     SELECT

@@ -1,9 +1,9 @@
-"""What a store holds: which ingests its files are of, their manifests, and rows of one recording.
+"""Read a store: the ingests in each of its files, their manifests, and rows of one recording.
 
-A file that `restock ingest` wrote is named by its one ingest: `<recording_id>/<ingest_id>.parquet`.
-One that was compacted holds several: `restock store compact` keeps their list in the file's
-metadata. For files that other tools compacted, it is read from the columns `recording_id` and
-`ingest_id`. Questions in SQL are for `restock.replay.store`.
+The path of a file that `restock ingest` wrote names its one ingest:
+`<recording_id>/<ingest_id>.parquet`. A joined file has several: `restock store compact` writes
+their list into the file's metadata. If another tool joined the file, they are read from its columns
+`recording_id` and `ingest_id`. For SQL queries see `restock.replay.store`.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from restock.ingest.store.version import Version
 from restock.ingest.task.schema import DOCUMENTS, recording_schema
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/([^/]+)\.parquet")
-INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
-READERS = 16  # of small files at once, which on S3 are a wait each
+INGESTS = b"restock.ingests"  # key in the metadata of a joined file
+READERS = 16  # small files read in parallel, as each is a wait on S3
 _COLUMNS = ("recording_id", "ingest_id")
 
 
 class Ingest(NamedTuple):
-    """The rows of one ingest of a recording, in a file."""
+    """An ingest of a recording, and its number of rows in a file."""
 
     recording_id: str
     ingest_id: str
@@ -47,21 +47,21 @@ class Ingest(NamedTuple):
 class StoredFile(NamedTuple):
     """An active file of a table."""
 
-    path: str  # in the table
+    path: str  # relative to the table
     rows: int
     bytes: int
     added_ms: int
     ingests: tuple[Ingest, ...]
-    listed: bool = True  # whether Restock wrote it, and says in it or by its name what it holds
+    listed: bool = True  # whether Restock wrote it: its name or its metadata give the ingests
 
     @property
     def own(self) -> bool:
-        """Return whether one ingest wrote it and it is unchanged."""
+        """Return whether it is the unchanged file of one ingest, named after that ingest."""
         return OWN_PATH.fullmatch(self.path) is not None
 
 
 def own_path(recording_id: str, ingest_id: str) -> str:
-    """Return the path that an ingest writes to."""
+    """Return the path of the file that an ingest writes, relative to the table."""
     return f"{recording_id}/{ingest_id}.parquet"
 
 
@@ -73,12 +73,12 @@ def stored_files(
     without: Collection[str] = (),
     known: Iterable[StoredFile] = (),
 ) -> list[StoredFile]:
-    """Return the active files of table `name`, with what each holds; `without` those paths.
+    """Return the active files of table `name` with their ingests, except paths in `without`.
 
-    What is `known` of an earlier version is taken from there.
+    Files in `known` (from an earlier version) are not read again.
 
     Raises:
-        StoreError: one is of another kind, or it cannot be read.
+        StoreError: a file has rows without ids of recording and ingest, or cannot be read.
     """
     adds = [one for one in active_files(table) if one[0] not in without]
     found = {(one.path, one.bytes, one.added_ms): one for one in known}
@@ -100,11 +100,10 @@ def stored_files(
 
 
 def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -> dict[str, int]:
-    """Count the rows of each ingest that need not be those that its manifest describes.
+    """Count the rows of each ingest whose manifest may no longer describe them.
 
-    Another tool wrote their file, or their number is another.
-
-    `written` is the number of rows by ingest, as the manifests say.
+    This is so if another tool wrote one of their files, or if their number differs from `written`,
+    the manifests' numbers of rows by ingest.
     """
     rows: Counter[str] = Counter()
     others: set[str] = set()
@@ -121,7 +120,7 @@ def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -
 
 
 def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, int | None]]:
-    """Return path, rows, bytes and time of addition (ms) of the active files, by Delta's log."""
+    """Return path, rows, bytes and time of addition (ms) of the active files, from Delta's log."""
     actions = table.get_add_actions(flatten=True)
     columns = [
         actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
@@ -138,7 +137,7 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
 
 
 def held_by(place: Location, name: str, path: str) -> StoredFile:
-    """Return a file of a table, active or not, with what it holds. Raises as `stored_files`."""
+    """Read which ingests a file of a table has, active or not. Raises as `stored_files`."""
     with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
         rows = open_parquet(source).metadata.num_rows
     if own := _named(path, rows):
@@ -148,10 +147,10 @@ def held_by(place: Location, name: str, path: str) -> StoredFile:
 
 @contextmanager
 def damage_named(place: Location, path: str) -> Iterator[None]:
-    """Turn what goes wrong while a file of the store is read into a StoreError that names it."""
+    """Turn errors of reading a file of the store into a StoreError that names the file."""
     try:
         yield
-    except MemoryError:  # which one of Arrow's errors is, too
+    except MemoryError:  # raised first, as Arrow's out-of-memory error is an ArrowException, too
         raise
     except (OSError, pa.ArrowException) as error:
         missing = isinstance(error, FileNotFoundError)
@@ -168,7 +167,7 @@ def damage_named(place: Location, path: str) -> Iterator[None]:
 def by_system(error: BaseException) -> bool:
     """Return whether a file could not be read because of its permissions or the disk.
 
-    Parquet's reader sets no errno. What goes wrong on the way to S3 is a StoreError before.
+    Errors of Parquet's reader have no errno. Errors of S3 have become a StoreError before.
     """
     return (
         isinstance(error, OSError)
@@ -189,12 +188,12 @@ def damage_remedy(place: Location, path: str) -> str:
 
 
 def packed_ingests(ingests: Sequence[Ingest]) -> bytes:
-    """Pack the list of what a compacted file holds, for its metadata."""
+    """Pack the list of a joined file's ingests for its metadata."""
     return json.dumps(ingests, separators=(",", ":")).encode()
 
 
 def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
-    """Return a row per ingest: recording_id, ingest_id, rows, and the file that has them."""
+    """Return a row per file and ingest: recording_id, ingest_id, rows, file."""
     every = [(*one, file.path) for file in files for one in file.ingests]
     names = ("recording_id", "ingest_id", "rows", "file")
     types = (pa.string(), pa.string(), pa.int64(), pa.string())
@@ -204,14 +203,14 @@ def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
 
 
 def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
-    """Return what a file holds by its name, if that says it."""
+    """Return the ingest that a file's name gives; None if it gives none or `rows` is unknown."""
     ids = OWN_PATH.fullmatch(path)
     return (Ingest(ids[1], ids[2], rows),) if ids and rows is not None else None
 
 
 @lru_cache(maxsize=4096)  # files never change
 def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bool]:
-    """Read what a file holds, and whether Restock listed it there."""
+    """Read which ingests a file has, and whether they are from a list by Restock."""
     where = f"{name}/{path}"
     with damage_named(place, where), place.reading(where) as source:
         file = open_parquet(source)
@@ -239,21 +238,21 @@ def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bo
     return tuple(held), False
 
 
-# Of each store by ingest, which never changes; 2 kB each.
+# Store -> ingest id -> sketch. An ingest never changes; a sketch takes 2 kB.
 _SKETCHES: defaultdict[Location, dict[str, Sketch]] = defaultdict(dict)
 
 
 @dataclass(frozen=True)
 class _Listing:
-    """The active files of a table, as they were read last."""
+    """The active files of a table when it was last read."""
 
     table: DeltaTable
-    at: tuple[str, int]  # which table it is, and its version
+    at: tuple[str, int]  # id of the table, and its version
     files: list[StoredFile]
 
     @cached_property
     def paths(self) -> dict[str, list[str]]:
-        """Return the files that hold rows of each ingest."""
+        """Return the paths of the files that have rows of an ingest, by ingest id."""
         paths: dict[str, list[str]] = {}
         for file in self.files:
             for one in file.ingests:
@@ -262,14 +261,15 @@ class _Listing:
 
     @cached_property
     def by_recording(self) -> dict[str, Ingest]:
-        """Return an ingest of each recording."""
+        """Return the ingest of each recording, by recording id."""
         return {one.recording_id: one for file in self.files for one in file.ingests}
 
 
 class StoreReader:
-    """What is in a store, at its newest version or at an older one.
+    """Reader of a store's files and manifests, at the newest version or an older one.
 
-    What it has read of the log and of joined manifests it keeps, and reads on from there.
+    The reader caches what it has read of the logs and of joined manifests, and later reads only
+    what was added.
     """
 
     def __init__(self, path: str | Path | Location) -> None:
@@ -278,16 +278,13 @@ class StoreReader:
         self._joined: dict[str, tuple[pa.Table, dict[str, int]]] = {}
 
     def reach(self) -> None:
-        """Check that the place can be reached, and what is there is no part of a store.
-
-        Raises StoreError where it is not so.
-        """
+        """Raise StoreError if the place cannot be reached or only one of the tables exists."""
         self.path.expect_both_tables()
 
     def live(self, recording_id: str | None = None, version: Version | None = None) -> pa.Table:
-        """Return the manifest rows whose transitions are in the store, of one recording or all.
+        """Return the manifest rows of recordings (or of one) whose transitions are in the store.
 
-        Of a version, or as it is now.
+        `version` None is the newest.
         """
         schema = recording_schema()
         shown = [one for one in self.shown(version) if recording_id in (None, one.recording_id)]
@@ -303,7 +300,7 @@ class StoreReader:
     def manifest(self, recording_id: str) -> dict[str, Any] | None:
         """Return the manifest row of a recording whose transitions are in the store, or None.
 
-        A joined file is read once, for all that are looked up in it.
+        A joined file is read once and cached for later calls.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -327,9 +324,9 @@ class StoreReader:
         return next(iter(rows.slice(row, 1).to_pylist(maps_as_pydicts="strict")), None)
 
     def manifests(self, ingests: Sequence[Ingest], schema: pa.Schema) -> pa.Table:
-        """Return these columns of the manifests of ingests.
+        """Return the manifests of ingests with these columns.
 
-        An ingest whose manifest the store does not have any more is left out.
+        An ingest whose manifest is no longer in the store is left out.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -350,9 +347,9 @@ class StoreReader:
         *,
         skip: tuple[type[Exception], ...] = (),
     ) -> Iterator[pa.Table]:
-        """Yield these columns of each file that has manifests of these ingests, or of others too.
+        """Yield each file that has manifests of these ingests, with these columns and all its rows.
 
-        A file at which one of `skip` is raised is left out.
+        A file whose reading raises one of `skip` yields no rows.
         """
         if not ingests:
             return
@@ -383,7 +380,7 @@ class StoreReader:
 
         own = own_path(recording_id, ingest_id)
         files = self._listing(TRANSITIONS).paths.get(ingest_id, []) if self._made() else []
-        if files in ([], [own]):  # replaced rows, and those in no commit yet, lie there as well
+        if files in ([], [own]):  # replaced and uncommitted rows are at the own path, too
             with damage_named(self.path, f"{TRANSITIONS}/{own}"), suppress(FileNotFoundError):
                 return self.path.read(f"{TRANSITIONS}/{own}")
         parts = []
@@ -398,13 +395,13 @@ class StoreReader:
         return with_ends(rows, reported.get(ingest_id))
 
     def _made(self) -> bool:
-        """Return whether there is a table of transitions; raise as `has_table`."""
+        """Return whether there is a table of transitions. Raises as `has_table` does."""
         return TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
 
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
-        """Yield the recording of each of these ingests and the ends of its episodes.
+        """Yield the recording id of each of these ingests and its `episode_ends`.
 
-        They are as `episode_ends` gives them; ingests that have none are left out.
+        Ingests without episode ends are left out.
         """
         from restock.ingest.store.transitions import episode_ends
 
@@ -415,28 +412,28 @@ class StoreReader:
                 yield one.recording_id, ends
 
     def _packed_ends(self, ingests: Sequence[Ingest]) -> dict[str, str | None]:
-        """Return what manifests keep of the ends of episodes, by ingest."""
+        """Return the packed episode ends from the manifests, by ingest id."""
         schema = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
         reported = self.manifests(ingests, schema)
         return dict(zip(*(reported[name].to_pylist() for name in schema.names), strict=True))
 
     def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
-        """Return the active files of one of its tables, and which ingests they hold."""
+        """Return the active files of a table, with their ingests."""
         if version is not None:
             return stored_files(self.path, name, self.path.open_table(name, version))
         return self._listing(name).files
 
     def _listing(self, name: str) -> _Listing:
-        """Return what the newest version of a table has; it is opened again if its log went on."""
+        """Return the listing of a table's newest version; reopen the table after new commits."""
         known = self._listings.get(name)
         if known is None or self.path.goes_on(name, known.table):
             return self._listed(name, self.path.open_table(name))
-        if known.at[1] != known.table.version():  # after a commit of its own
+        if known.at[1] != known.table.version():  # after a commit by this store itself
             return self._listed(name, known.table)
         return known
 
     def _listed(self, name: str, table: DeltaTable) -> _Listing:
-        """Return what a table has that was just opened, or read on."""
+        """Return the listing of a table that was just opened or updated, and cache it."""
         known, at = self._listings.get(name), (str(table.metadata().id), table.version())
         if known is None or known.at != at:
             same = known.files if known is not None and known.at[0] == at[0] else ()
@@ -445,10 +442,10 @@ class StoreReader:
         return known
 
     def _read_on(self, name: str, table: DeltaTable) -> int:
-        """Return the version of a table that this store has just made by a commit to it."""
+        """Update a table after a commit by this store, and return its new version."""
         before = table.version()
         table.update_incremental()
-        if table.version() != before + 1:  # others' commits are checked when it is opened again
+        if table.version() != before + 1:  # reopen the table, which checks commits of others
             self._listings.pop(name, None)
         return table.version()
 
@@ -460,12 +457,12 @@ class StoreReader:
         return list({one.ingest_id: one for one in held}.values())
 
     def sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
-        """Read their sketches, each once, however many recordings ask for them."""
+        """Return the sketches of ingests, each read once and cached; leave out unreadable ones."""
         names = ("recording_id", "ingest_id", "sketch")
         schema = pa.schema([(name, pa.string()) for name in names])
         kept = _SKETCHES[self.path]
         new = {one.ingest_id: one for one in ingests if one.ingest_id not in kept}
-        # What cannot be read is another recording's, which `restock sql` reports.
+        # Skip unreadable manifests: `restock sql` reports them, and this ingest need not fail.
         for part in self._manifest_files(list(new.values()), schema, skip=UNREADABLE):
             columns = (part[name].to_pylist() for name in names)
             for recording_id, ingest_id, text in zip(*columns, strict=True):
@@ -474,11 +471,11 @@ class StoreReader:
         return [kept[one.ingest_id] for one in ingests if one.ingest_id in kept]
 
     def remember(self, recording_id: str, ingest_id: str, contents: Hashes) -> None:
-        """Keep the sketch of an ingest that was just written: it need not be read."""
+        """Cache the sketch of an ingest that was just written, so that it need not be read."""
         _SKETCHES[self.path][ingest_id] = Sketch.of(recording_id, ingest_id, contents)
 
 
 def frame_files(manifests: pa.Table) -> list[str]:
-    """Return the files of `frames` that manifests name."""
+    """Return the files in `frames` that these manifests name."""
     rows = manifests["cameras"].to_pylist() if "cameras" in manifests.column_names else []
     return sorted({camera["file"] for cameras in rows for camera in cameras or ()} - {""})

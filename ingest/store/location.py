@@ -1,9 +1,9 @@
-"""Where a store lies: a folder of this machine, or `s3://bucket/prefix`.
+"""The location of a store: a folder on this machine, or `s3://bucket/prefix`.
 
-What S3 needs comes from the environment, by the names that AWS's own tools use: `AWS_REGION`,
+Settings for S3 come from the same environment variables as for AWS's own tools: `AWS_REGION`,
 `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, and `AWS_ENDPOINT_URL` for a
-server that is not Amazon's. Tables are opened and committed by Delta's library, with conditional
-puts against other writers; Parquet is read and written by Arrow's S3 client, which is faster.
+server that is not Amazon's. Delta's library opens tables and commits to them, with conditional puts
+to detect other writers. Arrow's S3 client, which is faster, reads and writes Parquet files.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ from restock.ingest.store.version import (
 if TYPE_CHECKING:
     import pyarrow.compute as pc
 
-# What else of Restock's a folder may be, by the file that tells it.
+# File that marks another kind of folder of Restock -> what that folder is.
 _OTHERS = {"panel.json": "a panel", "config.json": "the folder of a run"}
 TRANSITIONS, RECORDINGS, FRAMES = "transitions", "recordings", "frames"  # folders of a store
-# An endpoint that is down or silent is given up after a minute at most.
+# With these, a call to an endpoint that is down or silent fails within a minute.
 CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30
-DEFAULT_REGION = "us-east-1"  # servers that are not Amazon's have none, and are signed for anyway
-# pathlib folds the two slashes of an address into one.
+DEFAULT_REGION = "us-east-1"  # signatures need a region, even for servers that have none
+# One slash suffices: pathlib folds the two slashes of an address into one.
 _S3 = re.compile(r"s3a?:/{1,2}(?P<bucket>[^/]+)/?(?P<prefix>.*)")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
 _SECRET = re.compile(r"(?s)[A-Za-z][A-Za-z0-9+.-]+:/{1,2}[^/@]*:.*@")
 _ENCODED = re.compile(r"%[0-9A-Fa-f]{2}")
 _DENIED = re.compile(r"(?s)(?:operation on (?P<file>/[^\n\x1b]*).*)?Permission denied")  # delta-rs
-# What a server or a client says -> what it means, and what to do.
+# Pattern in the error text of a server or client, what the error means, and what to do.
 _MEANINGS = (
     ("NoSuchBucket|Bucket .* not found", "this bucket does not exist",
      "create it first, or correct the address"),
@@ -79,19 +79,19 @@ _MEANINGS = (
 
 @dataclass(frozen=True)
 class Location:
-    """A store's place. `str()` gives it as a user writes it, without a version."""
+    """A store's location. `str()` gives it as a user writes it, without a version."""
 
     text: str
-    folder: Path | None  # None on S3
-    version: Version | None = None  # after an @; None: the newest
+    folder: Path | None  # None: on S3
+    version: Version | None = None  # given after an @; None: the newest
 
     @classmethod
     def of(cls, place: str | Path | Location) -> Location:
-        """Return the place that a path or an address names, with the version after its `@`.
+        """Parse a path or an address, with an optional version after `@`.
 
         Raises:
-            StoreError: an address of another kind or with a secret in it, or a path where Delta
-                cannot have a table.
+            StoreError: the address is of another kind or contains a secret, or Delta's library
+                cannot handle the path.
         """
         if isinstance(place, Location):
             return place
@@ -116,7 +116,7 @@ class Location:
                 remedy="give a folder, or s3://bucket/prefix",
             )
         if _ENCODED.search(text if on_s3 else str(Path(text).absolute())):
-            # Delta's library takes it for an encoded character, and reads somewhere else.
+            # Delta's library would decode it as a character, and read another path.
             raise StoreError(
                 "the path of a store cannot contain a percent sign followed by two hex digits",
                 where=text,
@@ -132,7 +132,7 @@ class Location:
 
     @property
     def options(self) -> dict[str, str] | None:
-        """Return options for Delta's library, besides those of the environment."""
+        """Return options for Delta's library, besides those from the environment."""
         if self.folder is not None:
             return None
         return {
@@ -140,18 +140,18 @@ class Location:
             "timeout": f"{REQUEST_S}s",
             "max_retries": f"{RETRIES}",
             "retry_timeout": f"{RETRY_S}s",
-            "aws_conditional_put": "etag",  # only one writer makes a version of the log
+            "aws_conditional_put": "etag",  # so that only one writer can make a version of the log
             **({"aws_region": region} if (region := _region()) else {}),
             **({"aws_endpoint_url": endpoint} if (endpoint := _endpoint(self.text)) else {}),
             "allow_http": str(endpoint.startswith("http://")).lower(),
         }
 
     def table(self, name: str) -> str:
-        """Return the address of one of its tables."""
+        """Return the address of a table."""
         return str(self.folder / name) if self.folder is not None else f"{self.text}/{name}"
 
     def expect_newest(self) -> None:
-        """Raise StoreError if a version is named where only the newest can be meant."""
+        """Raise StoreError if a version is given: the caller needs the newest."""
         if self.version is not None:
             raise StoreError(
                 "only the newest version can be changed or verified",
@@ -160,9 +160,9 @@ class Location:
             )
 
     def has_table(self, name: str) -> bool:
-        """Return whether there is such a table; raise StoreError if the place cannot be reached.
+        """Return whether a table exists; raise StoreError if the place cannot be reached.
 
-        A folder of a log is not yet one: another writer may be making its first version.
+        A log folder without a commit does not count: a writer may be making the first version.
         """
         with self.translate_errors():
             return bool(DeltaTable.is_deltatable(self.table(name), self.options))
@@ -170,11 +170,11 @@ class Location:
     def expect_both_tables(self) -> None:
         """Check that neither of the two tables is missing while the other exists.
 
-        A writer makes `recordings` first, and adds manifests when it has made both: a first ingest
-        that was killed leaves at most a `recordings` without files.
+        A first ingest that was killed may leave `recordings` alone, without files. That is allowed:
+        a writer makes `recordings` first, and adds manifests when it has made both tables.
 
         Raises:
-            StoreError: one is gone, or the place cannot be reached.
+            StoreError: a table is missing, or the place cannot be reached.
         """
         if self.has_table(TRANSITIONS):
             gone, other = RECORDINGS, TRANSITIONS
@@ -182,7 +182,7 @@ class Location:
             gone, other = TRANSITIONS, RECORDINGS
         else:
             return
-        if not self.has_table(gone):  # looked for last: another writer may be making it
+        if not self.has_table(gone):  # checked last, as another writer may be making it
             raise StoreError(
                 f"its table `{gone}` is missing, while `{other}` is there",
                 where=self.text,
@@ -191,14 +191,14 @@ class Location:
             )
 
     def other(self) -> str | None:
-        """Return what else of Restock's the folder is: a panel, or a run's."""
+        """Return "a panel" or "the folder of a run" if the folder is one, else None."""
         for file, kind in _OTHERS.items():
             if self.folder is not None and (self.folder / file).is_file():
                 return kind
         return None
 
     def absent(self) -> StoreError:
-        """Return the error of a store that is absent. Raises StoreError as `has_table` does."""
+        """Return the error for a place without a store."""
         what, remedy = "no such store", self.remedy_if_absent()
         if self.folder is not None and self.folder.exists():
             what = "not a store"
@@ -210,15 +210,15 @@ class Location:
         return StoreError(what, where=self.text, remedy=remedy)
 
     def remedy_if_absent(self) -> str:
-        """Return what to do if there is nothing."""
+        """Return what to do if there is no store."""
         return f"`restock ingest RECORDINGS --store {quoted(self.text)}` makes a store"
 
     def open_table(self, name: str, version: Version | None = None) -> DeltaTable:
-        """Open one of its tables, at a version, at the newest of a moment, or at the newest.
+        """Open a table at a version (None: the newest), or as it was at a moment.
 
         Raises:
-            StoreError: no such table or version, one of another format or with a feature that
-                Restock cannot read, or the place cannot be reached.
+            StoreError: there is no such table or version, its format is another, it has a feature
+                that Restock cannot read, its log is damaged, or the place cannot be reached.
         """
         try:
             with self.translate_errors():
@@ -232,7 +232,7 @@ class Location:
                             f"has no version {version}: its newest is {newest}", where=self.text
                         )
                     table.load_as_version(version)
-                if self.folder is not None:  # S3 keeps all of a commit or nothing; a disk may not
+                if self.folder is not None:  # a disk may keep part of a commit; S3 does not
                     expect_whole(self.folder / name / LOG, table.version(), where=self.text)
                 expect_format(table, where=self.text)
                 expect_readable(table, where=self.text)
@@ -250,9 +250,9 @@ class Location:
             ) from error
 
     def goes_on(self, name: str, table: DeltaTable) -> bool:
-        """Return whether a table has commits after those that were read of it, or others."""
+        """Return whether a table that was read has newer commits, or was replaced meanwhile."""
         version = table.version()
-        if self.folder is not None:  # looked for by their names, commits cost a hundredth
+        if self.folder is not None:  # looking for the next commit's file takes a hundredth
             here, after = (f"{name}/{LOG}/{one:020}.json" for one in (version, version + 1))
             return (self.folder / after).exists() or not (self.folder / here).exists()
         with self.translate_errors():
@@ -274,14 +274,14 @@ class Location:
         return pa.fs.SubTreeFileSystem(self.text.removeprefix("s3://"), s3)
 
     def write(self, rows: pa.Table, path: str, **options: Any) -> int:
-        """Write a Parquet file, whole and on disks flushed; returns its size in bytes."""
+        """Write a Parquet file, flushed if it is on a disk; return its size in bytes."""
         with self.writing(path) as out:
             pq.write_table(rows, out, **options)
             return int(out.tell())
 
     @contextmanager
     def writing(self, path: str) -> Iterator[Any]:
-        """Open a new file for writing; it is whole and flushed to disk when the block ends."""
+        """Open a new file for writing; it is complete, and flushed to disk, when the block ends."""
         if self.folder is None:
             with self.translate_errors(), self.files.open_output_stream(path) as out:
                 yield out
@@ -307,18 +307,19 @@ class Location:
         where: pc.Expression | None = None,
         repeated: Sequence[str] = (),
     ) -> pa.Table:
-        """Read a Parquet file's rows, of the named columns that it has.
+        """Read a Parquet file's rows.
 
-        Text that other tools wrote as views comes as plain text.
+        String views, which other tools write, are cast to strings.
 
-        Text of `repeated` columns comes as Arrow's dictionaries, once for all rows that have it.
+        `columns` the file lacks are left out. With a filter `where`, all columns are read. Text of
+        `repeated` columns is read as Arrow dictionaries, with each text in memory once.
 
         Raises:
-            FileNotFoundError: it is not there.
+            FileNotFoundError: it does not exist.
             StoreError: the place cannot be reached.
         """
         with self.reading(path) as file:
-            whole = open_parquet(file)  # `read_table` imports Arrow's data sets
+            whole = open_parquet(file)  # not `read_table`, which imports Arrow's slow data sets
             if where is not None:
                 if plain_text(whole.schema_arrow) == whole.schema_arrow:
                     return pq.read_table(
@@ -333,13 +334,13 @@ class Location:
             return with_plain_text(whole.read(read))
 
     def row_groups(self, path: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Yield a Parquet file's rows, one row group at a time, of the columns it has.
+        """Yield a Parquet file's rows, one row group at a time, with those columns that it has.
 
-        One named `list.field` has structs of that field alone. Raises as `read` does.
+        `list.field` reads only that field of a list of structs. Raises as `read` does.
         """
 
         def is_asked(leaf: str) -> bool:
-            # Between a list and its field lies what each writer names otherwise.
+            # The path parts between a list and its field have other names with each writer.
             names = leaf.split(".")
             return names[0] in columns or f"{names[0]}.{names[-1]}" in columns
 
@@ -356,9 +357,9 @@ class Location:
             return plain_text(pq.read_schema(file))
 
     def times(self, folder: str) -> dict[str, float]:
-        """Return the files below a folder by their paths in it, and when each was written.
+        """Return the write times of all files below a folder, by path relative to it.
 
-        Times are seconds since 1970; infinity if unknown.
+        Times are in seconds since 1970; infinity if unknown.
         """
         with self.translate_errors():
             infos = self.files.get_file_info(
@@ -371,12 +372,12 @@ class Location:
         }
 
     def delete(self, paths: Iterable[str]) -> None:
-        """Delete files; one that does not exist is not an error."""
+        """Delete files; missing ones are not an error."""
         if self.folder is not None:
             for path in paths:
                 (self.folder / path).unlink(missing_ok=True)
             return
-        # Not by Arrow's client: it puts an empty object where a folder's last file was.
+        # Not with Arrow's client, which puts an empty object in place of a folder's last file.
         with self.translate_errors():
             s3 = DeltaStorageHandler(self.text, self.options)
             for path in paths:
@@ -384,11 +385,9 @@ class Location:
 
     @contextmanager
     def translate_errors(self) -> Iterator[None]:
-        """Turn what goes wrong on the way to S3, or in a folder, into a StoreError with a remedy.
+        """Turn errors of S3, and of folders that Delta's library may not read, into a StoreError.
 
-        A folder may be one that delta-rs may not read.
-
-        What Delta says of its tables passes, and so do conflicts of writers and missing files.
+        Other errors of Delta, conflicts of writers and errors for missing files pass unchanged.
         """
         try:
             yield
@@ -397,7 +396,7 @@ class Location:
         except (OSError, DeltaError) as error:
             text = str(error)
             denied = _DENIED.search(text) if self.folder is not None else None
-            if denied and not getattr(error, "errno", None):  # or Python's own, which says it well
+            if denied and not getattr(error, "errno", None):  # Python's own error is clear enough
                 raise StoreError(
                     f"permission denied: {denied['file'] or 'its files'} cannot be read",
                     where=self.text,
@@ -414,21 +413,21 @@ class Location:
 
 
 def open_parquet(source: pa.NativeFile, **options: Any) -> pq.ParquetFile:
-    """Open a Parquet file so that the checksums of its pages are verified.
+    """Open a Parquet file so that reading verifies the checksums of its pages.
 
-    Bytes that changed are an OSError. Files of other tools may have none, and are read as they are.
+    Changed bytes raise an OSError. Files of other tools may have no checksums, and are not checked.
     """
     return pq.ParquetFile(source, page_checksum_verification=True, **options)
 
 
 def with_plain_text(rows: pa.Table) -> pa.Table:
-    """Cast the columns of `plain_text`: Arrow cannot compare or look up text in views."""
+    """Cast string views to strings: Arrow cannot compare or look up string views."""
     schema = plain_text(rows.schema)
     return rows if schema == rows.schema else rows.cast(schema)
 
 
 def plain_text(schema: pa.Schema) -> pa.Schema:
-    """Return the columns with text as strings if another tool wrote it as views."""
+    """Replace string views, which other tools write, by strings, also inside nested types."""
     fields = [field.with_type(_plain(field.type)) for field in schema]
     return pa.schema(fields, metadata=schema.metadata)
 
@@ -446,7 +445,7 @@ def _plain(kind: pa.DataType) -> pa.DataType:
 
 
 def _region() -> str | None:
-    """Return the region of the environment; None if a profile of AWS says it."""
+    """Return the AWS region from the environment; None if an AWS profile may set it."""
     named = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
     return named or (None if os.environ.get("AWS_PROFILE") else DEFAULT_REGION)
 

@@ -1,16 +1,16 @@
-"""The manifest row of an ingest: what was read, by which definitions, and what became of it.
+"""The manifest row of an ingest: what was read, with which definitions, and what came out.
 
-It also has the corrections: what people said about the recording's labels, laid over what the rules
-say. A correction says of one condition that it holds, or does not, on a stretch of an episode. The
-stretch is kept as an interval of log time, so that it is found again after the recording was
-ingested again or labelled by other rules. Corrections change with the labels in one commit; the
-labels' version then names both: `RULES+CORRECTIONS`.
+The manifest also has the corrections: labels by people, which override those by rules. A correction
+states that one condition holds, or does not hold, on a stretch of an episode. The stretch is stored
+as an interval of log time, so that it still fits after the recording was ingested again or labelled
+by other rules. Corrections and labels change in one commit. The labels' version then names both:
+`RULES+CORRECTIONS`.
 
-Where a simulator says the true conditions, labels are scored against them, by step and by event. An
-**event** is a maximal run of an episode's consecutive steps that hold a condition. A true event
-is found where a step within `TOLERANCE_S` of it has the label; an event of the label is right where
-a step within `TOLERANCE_S` of it is true. Steps whose truth is unknown count for neither. Scores
-are counts, so that those of several recordings add up: `pooled`.
+If a simulator recorded the true conditions, labels are scored against them, by step and by event.
+An **event** is a maximal run of an episode's consecutive steps at which a condition holds. A true
+event is found if a step within `TOLERANCE_S` of it has the label. An event of the label is right if
+a step within `TOLERANCE_S` of it is true. Steps with unknown truth do not count. Scores are kept as
+counts, so that `pooled` can add up several recordings.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def software_version() -> str:
 
 
 def definitions(profile: Profile) -> dict[str, str]:
-    """Return what rows depend on beside the recording."""
+    """Return the versions of all that rows depend on, besides the recording itself."""
     return {
         "profile_hash": profile.hash,
         "task_hash": profile.task.hash,
@@ -75,10 +75,10 @@ def manifest_row(
     dropped: Mapping[str, int],
     **recorded: Any,
 ) -> dict[str, Any]:
-    """Build the row of `recordings` for these transitions, by `restock.ingest.task.schema`.
+    """Build the row of `recordings` for these transitions, with the columns of `recording_schema`.
 
-    `dropped` are ticks in no episode by reason; `recorded` is what only who made the steps knows:
-    format, clock, counts and tags.
+    `dropped` are the numbers of ticks outside episodes, by reason. `recorded` are columns that only
+    the source of the steps can fill, such as format, clock, counts and tags.
     """
     drops = sorted(dropped.items(), key=lambda item: (-item[1], item[0]))
     return {
@@ -112,14 +112,14 @@ def manifest_row(
 
 
 def uncertain_conditions(profile: Profile) -> list[str]:
-    """Return the conditions and exposures whose labels rest on an outline that nobody measured."""
+    """Return the conditions and exposures whose labels depend on a guessed robot outline."""
     if profile.robot is None or not profile.robot.outline_guessed:
         return []
     return sorted(unseen(profile.shown_by_logs(profile.definitions), OUTLINE_SIGNALS))
 
 
 def driven_plan(rows: pa.Table) -> bool:
-    """Return whether a recording's rows have goals in hindsight, with the driven path as plan."""
+    """Return whether a recording's goals were set in hindsight, with the driven path as plan."""
     return (
         "goal_source" in rows.column_names
         and "hindsight" in rows["goal_source"].unique().to_pylist()
@@ -134,7 +134,7 @@ def recorded_facts(
     episodes: Split,
     rows: EpisodeRows,
 ) -> dict[str, Any]:
-    """Return what `manifest_row` needs to know of a recording."""
+    """Return the columns that `manifest_row` cannot fill without the recording."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
     fallbacks = fallbacks_used(profile, columns) | steps.stand_ins
     return {
@@ -159,7 +159,7 @@ def recorded_facts(
 
 
 def topic_rows(recording: Recording) -> list[dict[str, Any]]:
-    """Return, per topic, the messages counted by the container, those decoded, and why not all."""
+    """Return, per topic, the messages in the container, those decoded, and why some were not."""
     rows = []
     for name, info in recording.topics.items():
         account = recording.accounts.get(name)
@@ -181,7 +181,7 @@ def topic_rows(recording: Recording) -> list[dict[str, Any]]:
 
 
 def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
-    """Return every topic's clocks, and how aligning treated its messages."""
+    """Return, per topic, its clocks and how the alignment treated its messages."""
     report = steps.clock
     return [
         {
@@ -195,63 +195,63 @@ def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
 
 
 def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
-    """Return precision and recall per step, in the manifest's form."""
+    """Return precision and recall by step, in the manifest's form."""
     names = ("condition", "precision", "recall", "labelled", "support")
     return [{name: getattr(score, name) for name in names} for score in scores]
 
 
 def score_columns(scores: Sequence[LabelScore]) -> dict[str, Any]:
-    """Return a manifest's columns of scores, and of their counts, which add up over recordings."""
+    """Return a manifest's columns of scores, and of the counts, which can be added up."""
     return {"label_scores": score_rows(scores), "label_counts": [asdict(one) for one in scores]}
 
 
 def conditions_json(conditions: Sequence[Condition]) -> str:
-    """Return conditions of one kind in the manifest's form, without kind and doc."""
+    """Return conditions of one kind as the manifest's JSON, without kind and doc."""
     names = ("name", "timing", "priority", "sql", "let", "probability", "uncertain", "constants")
     return msgspec.json.encode(
         [{name: getattr(condition, name) for name in names} for condition in conditions]
     ).decode()
 
 
-COLUMN = "corrections"  # of `recordings`
+COLUMN = "corrections"  # in `recordings`
 
 
 @dataclass(frozen=True)
 class Correction:
-    """One condition on one stretch of an episode, as a person sees it."""
+    """A person's verdict that a condition holds, or not, on a stretch of an episode."""
 
     condition: str
     value: bool  # whether it holds there
-    episode_index: int  # when it was given: decides where a clock that was set back repeats times
-    first_ns: int  # of its first step, by log time
-    last_ns: int  # of its last step
+    episode_index: int  # when it was given; tells times apart that a clock set back repeats
+    first_ns: int  # log time of its first step
+    last_ns: int  # log time of its last step
     given_at: dt.datetime
-    rows: int = 0  # that it changes or confirms now
+    rows: int = 0  # rows that it changes or confirms now
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Which episode and log time each row (N,) of a recording is of."""
+    """The episode and log time of each row (N,) of a recording."""
 
     episode_index: Ints
     logged_ns: Ints
 
     @classmethod
     def of(cls, rows: pa.Table, clock_offset_ns: int | None) -> Moments:
-        """Make it of rows; `clock_offset_ns` is the manifest's: log time less alignment clock."""
+        """Read them from rows; `clock_offset_ns` (manifest) is log time minus alignment clock."""
         logged = rows["stamp_ns"].to_numpy() + (clock_offset_ns or 0)
         if not rows["logged_ns"].null_count:
             logged = rows["logged_ns"].to_numpy()
         return cls(rows["episode_index"].to_numpy(), logged)
 
     def covered(self, correction: Correction) -> Bools:
-        """Return the rows (N,) that a correction is about."""
+        """Return rows (N,) in a correction's interval: those of its episode, or if none, of any."""
         inside = (self.logged_ns >= correction.first_ns) & (self.logged_ns <= correction.last_ns)
         same = inside & (self.episode_index == correction.episode_index)
         return np.asarray(same if same.any() else inside, np.bool_)
 
     def stretch(self, rows: Ints) -> tuple[int, int, int]:
-        """Return episode, first and last log time of some rows of one episode."""
+        """Return the episode, first and last log time of consecutive rows of one episode."""
         first, last = int(rows[0]), int(rows[-1])
         stamps = self.logged_ns
         return int(self.episode_index[first]), int(stamps[first]), int(stamps[last])
@@ -263,7 +263,7 @@ def corrections_in(manifest: Mapping[str, Any]) -> list[Correction]:
 
 
 def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
-    """Return the version of labels of these rules after these corrections."""
+    """Return the labels' version for these rules and corrections."""
     if not corrections:
         return rules
     said = sorted(
@@ -274,14 +274,14 @@ def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
 
 
 def rules_of(version: str) -> str:
-    """Return the rules' part of the version of labels."""
+    """Return the rules' part of a labels' version."""
     return version.partition("+")[0]
 
 
 def merged(
     before: Sequence[Correction], given: Sequence[Correction], moments: Moments
 ) -> list[Correction]:
-    """Merge what was said before with what is said now; now counts if both speak of a row."""
+    """Merge earlier corrections with new ones, which win on rows that both cover."""
     kept: list[Correction] = []
     for old in before:
         covered = moments.covered(old)
@@ -308,13 +308,13 @@ def lay_over(
 ) -> tuple[pa.Table, list[Correction]]:
     """Apply corrections to the labels of a recording's rows.
 
-    Return the rows, and the corrections with the number of rows that each is about now.
+    Return the rows, and the corrections with the number of rows that each covers now.
 
-    A correction of a condition that is not among `conditions`, or whose stretch has no row any
-    more, is about none: it changes nothing, and is kept.
+    A correction covers no rows if its condition is not among `conditions`, or if its stretch has no
+    rows any more. It then changes nothing, and is kept.
     """
     moments, known = Moments.of(rows, clock_offset_ns), [c.name for c in conditions]
-    said: dict[str, Ints] = {}  # condition -> (N,) 1 it holds, 0 it does not, -1 nobody said
+    said: dict[str, Ints] = {}  # condition -> (N,) 1: it holds, 0: it does not, -1: no verdict
     counted = []
     for correction in corrections:
         covered = np.zeros(len(rows), np.bool_)
@@ -349,7 +349,7 @@ def _with_labels(
 
 
 def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArray:
-    """Set the probabilities of corrected conditions that have one to 1 or 0."""
+    """Set probabilities of corrected conditions to 1 or 0, in rows that have a probability."""
     ends = np.asarray(probabilities.offsets)
     first, count = int(ends[0]), int(ends[-1] - ends[0])
     row = np.repeat(np.arange(len(probabilities)), np.diff(ends))
@@ -364,8 +364,8 @@ def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArra
     return made.cast(probabilities.type)
 
 
-GOOD = 0.8  # precision and recall, for a label to be trusted
-TOLERANCE_S = 0.4  # between an event and what finds it
+GOOD = 0.8  # precision and recall from which a label is trusted
+TOLERANCE_S = 0.4  # distance in time up to which an event and a step match
 
 
 @dataclass(frozen=True)
@@ -374,37 +374,37 @@ class LabelScore:
 
     condition: str
     known: int  # transitions whose truth is known
-    labelled: int  # transitions that got the label
-    support: int  # transitions where it is true
-    agreed: int  # transitions where it is true and that got the label
+    labelled: int  # transitions with the label
+    support: int  # transitions where the condition is true
+    agreed: int  # transitions where it is true, with the label
     event_labelled: int  # events of the label
-    event_right: int  # those of them that are near a true step
+    event_right: int  # events of the label near a true step
     event_support: int  # true events
-    event_found: int  # those of them that are near a labelled step
+    event_found: int  # true events near a labelled step
 
     @property
     def precision(self) -> float | None:
-        """Return the share of labelled transitions that truly were; None without a label."""
+        """Return the share of labelled transitions where it is true; None if none is labelled."""
         return _share(self.agreed, self.labelled)
 
     @property
     def recall(self) -> float | None:
-        """Return the share of true transitions that were labelled; None if it was never true."""
+        """Return the share of true transitions that are labelled; None if it is never true."""
         return _share(self.agreed, self.support)
 
     @property
     def event_precision(self) -> float | None:
-        """Return the share of the label's events that are right; None if there is none."""
+        """Return the share of the label's events that are right; None without such events."""
         return _share(self.event_right, self.event_labelled)
 
     @property
     def event_recall(self) -> float | None:
-        """Return the share of true events that are found; None if there is none."""
+        """Return the share of true events that are found; None without true events."""
         return _share(self.event_found, self.event_support)
 
     @property
     def shortfall(self) -> str:
-        """Say by how much it falls short of .8, and from how many rows; "" if it does not."""
+        """Describe how far precision or recall are below GOOD, and how often it is true, or ""."""
         short = [
             f"{name} {GOOD - value:.2f} short of {GOOD}"
             for name, value in (("precision", self.precision), ("recall", self.recall))
@@ -429,9 +429,9 @@ def score(
 ) -> list[LabelScore]:
     """Score labels (N,) by name against the true conditions of each transition (N,).
 
-    A text may name several conditions, separated by commas; None is unknown. Transitions are in
-    order of their episode (N,) and step (N,), `period_s` apart. A label that no truth ever names
-    and that was never given is left out; nothing is scored where no truth is known.
+    A text of `truth` may name several conditions, separated by commas; None is unknown. Transitions
+    are in order of their episode (N,) and step (N,), `period_s` apart. A label that is never given
+    and never true is left out. If no truth is known, there are no scores.
     """
     known = np.array([text is not None for text in truth], np.bool_)
     if not known.any():
@@ -439,7 +439,7 @@ def score(
     whole = np.array(["" if text is None else text for text in truth])
     texts, which = np.unique(whole, return_inverse=True)
     named = [true_names(text) for text in texts.tolist()]
-    joined = np.zeros(len(known), np.bool_)  # to the step before
+    joined = np.zeros(len(known), np.bool_)  # whether a step follows the one before it
     joined[1:] = (episode[1:] == episode[:-1]) & (step[1:] == step[:-1] + 1)
     reach = int(TOLERANCE_S / period_s + 1e-6)  # steps
     scores = []
@@ -466,9 +466,9 @@ def score(
 
 
 def events(holds: Bools, joined: Bools) -> Ints:
-    """Find maximal runs of consecutive steps that hold, (E, 2): first step and one after last.
+    """Find maximal runs of consecutive steps that hold, (E, 2): first step and one past the last.
 
-    `joined` (N,) says which steps follow the one before in the same episode.
+    `joined` (N,) marks the steps that follow the one before in the same episode.
     """
     begins = holds & ~np.concatenate([[False], holds[:-1] & joined[1:]])
     goes_on = np.concatenate([holds[1:] & joined[1:], [False]])
@@ -476,7 +476,7 @@ def events(holds: Bools, joined: Bools) -> Ints:
 
 
 def widened(holds: Bools, joined: Bools, reach: int) -> Bools:
-    """Return whether it holds within `reach` steps of each step, in the same stretch, (N,)."""
+    """Return whether `holds` is true within `reach` consecutive steps of each step, (N,)."""
     wide = holds.copy()
     for _ in range(reach):
         ahead, behind = np.zeros_like(wide), np.zeros_like(wide)
@@ -487,15 +487,15 @@ def widened(holds: Bools, joined: Bools, reach: int) -> Bools:
 
 
 def touched(runs: Ints, holds: Bools) -> Bools:
-    """Return which runs (E, 2) have a step that holds, (E,)."""
+    """Return which runs (E, 2) have a step at which `holds` is true, (E,)."""
     total = np.concatenate([[0], np.cumsum(holds)])
     return np.asarray(total[runs[:, 1]] > total[runs[:, 0]], np.bool_)
 
 
 def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[LabelScore]:
-    """Score how well each transition's conditions agree with the true ones, for these labels.
+    """Score the labels of transitions against the truth.
 
-    `names` are of outcomes; the exposures that a row or the truth names are scored too.
+    `names` are the outcomes to score. Exposures are scored if any row has them as label or truth.
     """
     episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
     scores = []
@@ -510,7 +510,7 @@ def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[
 
 
 def exposures_named(rows: pa.Table) -> list[str]:
-    """Return the exposures that labels or truth of rows name, sorted."""
+    """Return the exposures that any row has as label or truth, sorted."""
     labelled = set(rows["exposures"].combine_chunks().flatten().unique().to_pylist())
     true = rows["true_exposure"].unique().to_pylist()
     return sorted(labelled.union(*(true_names(text) for text in true if text is not None)))

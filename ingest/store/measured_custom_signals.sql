@@ -1,5 +1,5 @@
--- One value an episode of each of a profile's own signals, as measured_signals.sql has it of the others.
--- Its text takes as long to plan as theirs: a summary goes without where a profile has none.
+-- One value per episode for each of a profile's own signals, like measured_signals.sql for the others.
+-- Planning takes as long as for measured_signals.sql, so summaries skip it if no profile has own signals.
 WITH own_signals AS (
     -- include: custom_signals.sql
 ), told AS (
@@ -22,7 +22,7 @@ WITH own_signals AS (
             recording_id,
             episode_id,
             signal,
-            -- A flag is 0 or 1; texts are no numbers.
+            -- A flag becomes 0 or 1; other text becomes null.
             coalesce(
                 TRY_CAST(told AS DOUBLE), CASE told WHEN 'true' THEN 1 WHEN 'false' THEN 0 END
             ) AS value

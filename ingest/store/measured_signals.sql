@@ -1,7 +1,7 @@
--- What drift is looked for in: one value an episode of each signal, and the steps that it is from: none
--- where the robot has no such sensor. What tells of the robot leaves slipping steps out. Over
--- `transitions` and `recordings`. Part of two statements: the view that scans, and the summary that a
--- recording's manifest keeps. A profile's own signals are in measured_custom_signals.sql.
+-- The values in which drift is searched: one per episode and signal, with the number of steps that it is
+-- computed from. A signal has no row if the robot lacks its sensor. Values that describe the robot leave
+-- out slipping steps. From `transitions` and `recordings`. Included in two statements: the view that scans
+-- rows, and the summary in a manifest. A profile's own signals are in measured_custom_signals.sql.
 WITH tasks AS (
     SELECT
         task_hash,
@@ -21,7 +21,7 @@ WITH tasks AS (
         FROM recordings
     )
 ), cleared AS (
-    -- By name, and clearance as it is observed, in half the bytes: windows keep all of it in memory.
+    -- Windows keep all this in memory: only needed columns, and sectors as observed, in half the bytes.
     SELECT
         recording_id,
         episode_id,
@@ -62,7 +62,7 @@ WITH tasks AS (
         lag(command_speed_mps) OVER episode AS command_mps, -- in force until this step
         lag(command_speed_mps, 2) OVER episode AS command_before_mps,
         lag(command_speed_mps, 3) OVER episode AS command_long_before_mps,
-        -- Where there is no new pose, or no gyroscope, the wheels stand in for it.
+        -- Without a new pose, or without a gyroscope, the column has a copy of the wheels' value.
         localised_speed_mps <> wheel_speed_mps AS has_pose,
         gyro_yaw_rate_radps <> wheel_yaw_rate_radps AS has_gyro
     FROM cleared
@@ -85,7 +85,7 @@ WITH tasks AS (
         straight AND moving AND has_pose AS tracked,
         straight AND has_gyro AS gyro_straight,
         straight AND moving AND abs(wheel_change_mps) < 0.05 * top_mps AND accel_x_mps2 <> 0 AS steady,
-        -- A straight wall's range changes evenly: what is left of the change is noise.
+        -- The range to a straight wall changes evenly: the second difference is noise.
         CASE WHEN straight THEN list_median(list_transform(
             list_transform(
                 list_zip(nearness, nearness_before, nearness_long_before),
@@ -95,7 +95,7 @@ WITH tasks AS (
                 THEN abs(m[1] - 2 * m[2] + m[3]) END
         )) END AS unevenness_m
     FROM kinds
-), silent AS ( -- dead, covered, or open space: they look the same
+), silent AS ( -- sectors without change: dead, covered, or facing open space, which look the same
     SELECT episode_id, count(*) FILTER (spread_m < 0.005) AS silent_sectors
     FROM (
         SELECT episode_id, sector, max(m) - min(m) AS spread_m
@@ -153,7 +153,7 @@ WITH tasks AS (
                 steps: count(*) FILTER (steady)
             },
             {
-                signal: 'vibration_mps2', -- normal noise has a median of .6745 standard deviations
+                signal: 'vibration_mps2', -- normal noise: the median deviation is .6745 standard deviations
                 value: mad(accel_x_mps2) FILTER (steady) / 0.6745,
                 steps: count(*) FILTER (steady)
             },

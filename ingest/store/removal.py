@@ -1,7 +1,7 @@
-"""Recordings taken out of a store, named by their ids or paths, in one commit.
+"""Remove recordings, named by their ids or paths, from a store in one commit.
 
-Neither their files nor their manifests are deleted then: earlier versions need them until the
-retention is over, as they need replaced ones.
+Their files and manifests are not deleted yet: as with replaced recordings, earlier versions need
+them until the retention window is over.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from restock.ingest.store.writer import StoreWriter
 
 OPERATION = "restock store remove"
 ID_DIGITS = 16
-PREFIX_DIGITS = 6  # of an id, at least
+PREFIX_DIGITS = 6  # digits of an id that a name needs at least
 _MAX_NAMED = 5
 _HEX = re.compile(rf"[0-9a-f]{{1,{ID_DIGITS}}}")
 
 
 @dataclass(frozen=True)
 class RemovedRecording:
-    """A recording that was taken out of a store, or would be."""
+    """A recording that was removed from a store, or would be."""
 
     recording_id: str
     source_file: str  # as it was ingested
     transitions: int
     episodes: int
-    corrections: int  # of its labels, by people: what ingesting it again does not bring back
+    corrections: int  # label corrections by people, which another ingest does not bring back
     tags: Mapping[str, str]
 
 
@@ -42,21 +42,21 @@ class Removed:
 
     recordings: list[RemovedRecording] = field(default_factory=list)
     left: int = 0  # recordings that stay
-    version_before: int | None = None  # of the store: it has what was removed
-    version: int | None = None  # without it; None where nothing was written
+    version_before: int | None = None  # last version of the store with these recordings
+    version: int | None = None  # version of the store without them; None if nothing was written
 
 
 def remove_recordings(
     store: StoreWriter, names: Sequence[str], *, dry_run: bool = False
 ) -> Removed:
-    """Take recordings out of a store, all or none of them.
+    """Remove recordings from a store, all or none of them.
 
-    A recording is named by its id, by the first digits of it (PREFIX_DIGITS at least), or by the
-    path that it was ingested by, of which the last parts are enough.
+    A name is a recording's id, at least PREFIX_DIGITS first digits of it, or the path that the
+    recording was ingested from, or the last parts of that path.
 
     Raises:
-        StoreError: a name is of no recording in the store, or of several; one was ingested again
-            meanwhile; the store cannot be written. Nothing is removed.
+        StoreError: a name fits no recording in the store, or several; a recording was ingested
+            again meanwhile; the store cannot be written. Nothing is removed.
     """
     store.expect_store()
     live = sorted(store.live().to_pylist(maps_as_pydicts="strict"), key=_by_path)
@@ -87,7 +87,7 @@ def _by_path(row: Mapping[str, Any]) -> tuple[str, str]:
 def _chosen(
     live: Sequence[dict[str, Any]], names: Iterable[str], where: str
 ) -> list[dict[str, Any]]:
-    """Return the named manifests, each once. Raise StoreError if a name is ambiguous or unknown."""
+    """Return the named manifest rows, or raise StoreError for ambiguous and unknown names."""
     chosen: dict[str, dict[str, Any]] = {}
     problems = []
     for name in dict.fromkeys(names):
@@ -119,7 +119,7 @@ def _named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
         if (is_prefix and row["recording_id"].startswith(digits))
         or _absolute(row["source_file"]) == _absolute(name)
     ]
-    parts = PurePath(name).parts  # `logs/b.mcap` ends in `b.mcap`
+    parts = PurePath(name).parts  # the name `b.mcap` fits `logs/b.mcap`
     ends = [(row, PurePath(row["source_file"]).parts[-len(parts) :]) for row in live if parts]
     return found or [row for row, end in ends if end == parts]
 
@@ -129,7 +129,7 @@ def _absolute(path: str) -> str:
 
 
 def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:
-    """Say why a name does not select one recording, and which ones it may mean."""
+    """Explain why a name does not select exactly one recording, and list candidates."""
     if found:
         what = f"{name!r} is the name of {len(found)} recordings"
         return f"{what}: {_listed(found)}"

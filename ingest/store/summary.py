@@ -1,15 +1,14 @@
-"""What is kept of a recording in its manifest: a summary of its rows, and a sketch of them.
+"""Compute the summary and the sketch of a recording's rows, which its manifest stores.
 
-The summary answers common questions without a scan of rows: episodes, how many rows and episodes
-each cell of coverage has, what drift compares, the rows that are flawed, one number per signal, and
-the ends of episodes. Every writer of rows writes it, so it is true for as long as the rows are
-there.
+The summary answers common queries without a scan of rows. It has the episodes, the rows and
+episodes of each coverage cell, the values per episode that drift compares, the flawed rows, and the
+ends of episodes. Every writer of rows also writes their summary, so the two always agree.
 
-The sketch tells whether a recording is already in the store under another id: a part of it, or a
-copy. Ids come from bytes, so a salvaged part, another cut or a drive that was replayed and recorded
-again has another one. A sketch is the smallest hashes of a recording's rows (bottom-k, Broder
-1997): an ingest reads only the rows of those recordings that look alike. The audit `repeated_steps`
-finds the same in SQL, of all rows.
+The sketch shows whether a recording, a part or a copy of it is already in the store under another
+id. Ids are computed from a file's bytes, so a salvaged part, another cut, or a drive that was
+replayed and recorded again has another id. A sketch is the smallest hashes of a recording's rows
+(bottom-k, Broder 1997). An ingest then reads only the rows of recordings with a similar sketch. The
+audit `repeated_steps` finds repeated drives in SQL, by comparing all rows.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ from restock.arrays import Bools, Ints
 from restock.errors import StoreError
 from restock.ingest.task.schema import splitmix64
 
-if TYPE_CHECKING:  # slow to import, and not for what is in the store already
+if TYPE_CHECKING:  # slow to import, and not needed if all recordings are in the store already
     import duckdb
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
-# Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.
+# Rows of whole episodes that are queried together: bounds memory. Each part costs 40 ms to plan.
 STRETCH_ROWS = 8192
-# Tables whose rows are made of one episode's each, by queries of their names, and their order.
+# Table computed one episode at a time, by the .sql file of its name -> its order.
 BY_EPISODE = {
     "measured_signals": "episode_id, signal",
     "flawed_rows": "transition_id",
     "zone_steps": "ALL",
     "condition_steps": "ALL",
 }
-WIDE = ("observation", "next_observation")  # columns that only those look at
+WIDE = ("observation", "next_observation")  # columns that only the queries of BY_EPISODE read
 
 
 def _rows_of(**columns: pa.DataType) -> pa.DataType:
@@ -55,7 +54,7 @@ def _rows_of(**columns: pa.DataType) -> pa.DataType:
 
 
 _TEXT, _TEXTS, _COUNT, _NUMBER = pa.string(), pa.list_(pa.string()), pa.int64(), pa.float64()
-TABLES = {  # of summary.sql, and `distinctive_rows`; each a column
+TABLES = {  # column of a manifest -> its type: tables of summary.sql and BY_EPISODE, and hashes
     "episode_rows": _rows_of(
         episode_id=_TEXT,
         episode_index=pa.int32(),
@@ -118,7 +117,7 @@ TABLES = {  # of summary.sql, and `distinctive_rows`; each a column
     ),
     "distinctive_rows": _rows_of(transition_id=_COUNT, content=_COUNT),
 }
-# Beside the columns of `recording_schema`.
+# The summary's columns of `recordings`, besides those of `recording_schema`.
 SUMMARY_SCHEMA = pa.schema(
     [
         pa.field("sketch", _TEXT),
@@ -129,15 +128,16 @@ SUMMARY_SCHEMA = pa.schema(
 
 
 def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
-    """Return a manifest row with the summary of its recording's rows, and their number."""
+    """Return a manifest row with the summary and the number of its recording's rows."""
     (found,) = summarise([(manifest, rows)])
     return found
 
 
 def summarise(recordings: Sequence[tuple[pa.Table, pa.Table]]) -> list[pa.Table]:
-    """Return what `summarised` does of each recording, those with the same columns in one go.
+    """Summarise several recordings, given as (manifest row, rows), like `summarised` does one.
 
-    They are several recordings: planning the queries takes longer than some hundred rows do.
+    Recordings with the same columns are queried together: planning the queries takes longer than
+    running them on some hundred rows.
     """
     counted: list[pa.Table] = []
     alike: dict[str, list[int]] = {}
@@ -157,12 +157,12 @@ def summarise(recordings: Sequence[tuple[pa.Table, pa.Table]]) -> list[pa.Table]
 
 
 def _tables(recordings: Sequence[tuple[pa.Table, pa.Table]]) -> dict[str, pa.Table]:
-    """Return the tables of summary.sql and BY_EPISODE, of recordings with the same columns."""
+    """Compute the tables of summary.sql and BY_EPISODE for recordings with the same columns."""
     manifests, rows = (pa.concat_tables(several) for several in zip(*recordings, strict=True))
-    with _database().cursor() as connection:  # with temporary tables of its own
+    with _database().cursor() as connection:  # each cursor has its own temporary tables
         connection.register("recordings", manifests)
-        rows = rows.rename_columns({"condition": "primary_condition"})  # as rows.sql
-        custom = any(manifests["signals"].to_pylist())  # whether the profile has its own
+        rows = rows.rename_columns({"condition": "primary_condition"})  # as rows.sql does
+        custom = any(manifests["signals"].to_pylist())  # whether a profile has its own signals
         tables = _of_episodes(connection, rows, custom=custom)
         connection.register("transitions", rows.drop_columns(list(WIDE)))
         connection.execute(_query("summary"))
@@ -196,10 +196,10 @@ def _with_summary(manifest: pa.Table, rows: pa.Table, tables: dict[str, pa.Table
 def _of_episodes(
     connection: duckdb.DuckDBPyConnection, rows: pa.Table, *, custom: bool
 ) -> dict[str, pa.Table]:
-    """Make the tables BY_EPISODE, some whole episodes at a time.
+    """Compute the tables BY_EPISODE, some whole episodes at a time.
 
-    An episode's rows of them depend on its own steps alone. A window over all steps would hold them
-    all twice.
+    Their rows depend only on the steps of one episode, and a window over all steps would need twice
+    their memory.
     """
     for number, (first, stop) in enumerate(_whole_episodes(rows)):
         connection.register("transitions", _unchunked(rows.slice(first, stop - first)))
@@ -209,7 +209,7 @@ def _of_episodes(
         if custom:
             added = _query("measured_custom_signals")
             connection.execute(f"INSERT INTO measured_signals\n{added}")
-        connection.unregister("transitions")  # its copies go before the next are made
+        connection.unregister("transitions")  # frees its copies before the next ones are made
     return {
         name: connection.sql(f"FROM {name} ORDER BY {order}").to_arrow_table()
         for name, order in BY_EPISODE.items()
@@ -217,9 +217,9 @@ def _of_episodes(
 
 
 def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
-    """Return where to cut the rows, as first and one past the last, some STRETCH_ROWS apart.
+    """Cut the rows into parts of about STRETCH_ROWS; return each as first and one past the last.
 
-    No episode lies in two parts. All rows are one part if an episode's do not lie together.
+    No episode is in two parts. If the rows of an episode are not contiguous, all rows are one part.
     """
     coded = rows["episode_id"].combine_chunks().dictionary_encode()
     codes = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
@@ -230,7 +230,7 @@ def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
 
 
 def _unchunked(rows: pa.Table) -> pa.Table:
-    """Join the chunks of WIDE columns, one per episode: for DuckDB each is a batch."""
+    """Join the chunks of WIDE columns, one per episode: DuckDB reads each chunk as a batch."""
     for name in WIDE:
         place = rows.schema.get_field_index(name)
         rows = rows.set_column(place, name, rows[name].combine_chunks())
@@ -238,17 +238,17 @@ def _unchunked(rows: pa.Table) -> pa.Table:
 
 
 def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
-    """Return a recording's rows with the ends of episodes from its manifest in their metadata."""
+    """Return rows with the packed ends of episodes from their manifest in the metadata."""
     metadata = {ENDS: packed_ends.encode()} if packed_ends else None
     return rows.replace_schema_metadata(metadata)
 
 
 @cache
 def _database() -> duckdb.DuckDBPyConnection:
-    """Return one connection for all recordings: opening it takes as long as a summary."""
+    """Return one connection for all recordings: opening one takes as long as a summary."""
     import duckdb
 
-    atexit.register(_database.cache_clear)  # nanobind complains of what outlives its module
+    atexit.register(_database.cache_clear)  # nanobind warns of objects that outlive their module
     return duckdb.connect(config={"threads": 1})
 
 
@@ -258,9 +258,9 @@ def _query(name: str) -> str:
 
 
 def with_included(text: str, beside: Traversable | None = None) -> str:
-    """Insert into SQL the files that it names: definitions which several statements share.
+    """Replace each `-- include: FILE.sql` in SQL by that file, which several statements share.
 
-    They are in this folder or else in the one `beside`.
+    Files are looked up in this folder, then in the folder `beside`.
     """
 
     def included(named: re.Match[str]) -> str:
@@ -273,7 +273,7 @@ def with_included(text: str, beside: Traversable | None = None) -> str:
 
 
 def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:
-    """Return all rows of a table as the one value of a list column."""
+    """Return all rows of a table as a list column with a single value."""
     fields = list(kind.value_type)
     columns = [rows[field.name].cast(field.type).combine_chunks() for field in fields]
     values = pa.StructArray.from_arrays(columns, fields=fields)
@@ -282,34 +282,34 @@ def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:
 
 SKETCH_HASHES = 256
 MIN_HASHES = 3  # that two recordings must share
-LARGELY = 0.5  # of the smaller recording's rows
-NEARLY_ALL = 0.95  # at its cut, a part has rows of its own
-# Replaced meanwhile, or damaged: no fault of the recording that is being ingested.
+LARGELY = 0.5  # share of the smaller recording's rows
+NEARLY_ALL = 0.95  # less than 1: near its cut, a part has rows that the whole does not have
+# Another recording was replaced meanwhile, or is damaged: the one being ingested must not fail.
 UNREADABLE = (OSError, StoreError, pa.ArrowException)
-PART_ROWS = 2048  # hashed at a time: bounds memory
-_LARGE = 2e15  # what stands for infinity
+PART_ROWS = 2048  # rows hashed at a time: bounds memory
+_LARGE = 2e15  # stands for infinity, and limits scaled values
 Hashes = NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
 class RepeatedDrive:
-    """A recording of the store that holds the same rows."""
+    """A stored recording that has rows of the new recording."""
 
     recording_id: str
     source_file: str
-    rows: int  # of the new recording that it holds too
-    share: float  # of the new recording's rows
-    share_of_other: float  # of its own rows
-    held: float  # of its own rows that look like no other of it
+    rows: int  # rows that both have
+    share: float  # these as a share of the new recording's rows
+    share_of_other: float  # as a share of the stored recording's rows
+    held: float  # as a share of the stored recording's distinctive rows
 
     @property
     def is_part(self) -> bool:
-        """Return whether the new one holds (nearly) all that it has, and more."""
+        """Return whether the new recording has (nearly) all that the stored one has, and more."""
         return self.the_less and self.held >= NEARLY_ALL
 
     @property
     def the_less(self) -> bool:
-        """Return whether it holds less of the drive than the new one: a part or a cut of it."""
+        """Return whether the stored recording has less of the drive than the new one."""
         return self.share_of_other > self.share
 
     def __str__(self) -> str:
@@ -323,7 +323,7 @@ class RepeatedDrive:
 
 @dataclass(frozen=True)
 class Sketch:
-    """The smallest hashes of a stored recording, (k,) ascending, and where its rows are."""
+    """The smallest row hashes of a stored recording, (k,) ascending, and its ids."""
 
     recording_id: str
     ingest_id: str
@@ -336,17 +336,17 @@ class Sketch:
 
 
 def sketch(hashes: Hashes) -> str:
-    """Write the sketch of a recording's `distinctive` hashes as a manifest keeps it."""
+    """Encode the sketch of a recording's `distinctive` hashes for its manifest."""
     return hashes[:SKETCH_HASHES].astype("<u8").tobytes().hex()
 
 
 def read_sketch(text: str) -> Hashes:
-    """Read a manifest's sketch; "" gives none, as of a manifest that another tool wrote."""
+    """Decode a manifest's sketch; "" gives no hashes, as in manifests that other tools wrote."""
     return np.frombuffer(bytes.fromhex(text), "<u8")
 
 
 def row_hashes(rows: pa.Table) -> Hashes:
-    """Hash each row's task, action, observation and pose, (N,), to a thousandth."""
+    """Hash each row's task, action, observation and pose (rounded to thousandths), (N,)."""
     parts = [_hashes(rows.slice(first, PART_ROWS)) for first in range(0, len(rows), PART_ROWS)]
     return np.concatenate([np.zeros(0, np.uint64), *parts])
 
@@ -365,15 +365,15 @@ def _hashes(rows: pa.Table) -> Hashes:
     tasks = rows["task_hash"].combine_chunks().dictionary_encode()
     seeds = [hashlib.blake2b(str(t).encode(), digest_size=8).digest() for t in tasks.dictionary]
     total ^= np.frombuffer(b"".join(seeds), "<u8")[tasks.indices.to_numpy()]
-    return splitmix64(total)  # mixed: the smallest are a random sample of the rows
+    return splitmix64(total)  # mixed, so that the smallest are a random sample of the rows
 
 
 def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
-    """Return the sketches that have MIN_HASHES of a recording's hashes (N,), ascending."""
+    """Return the sketches that share at least MIN_HASHES with `mine`, (N,) ascending hashes."""
     if not len(mine):
         return []
     hashes = np.concatenate([one.hashes for one in sketches] or [mine[:0]])
-    marked = np.zeros(1 << 16, np.bool_)  # most have other low bits, which are quick to look up
+    marked = np.zeros(1 << 16, np.bool_)  # most hashes differ in the low bits: a quick lookup
     marked[mine.astype(np.uint16)] = True
     at = np.flatnonzero(marked[hashes.astype(np.uint16)])
     at = at[mine[np.minimum(np.searchsorted(mine, hashes[at]), len(mine) - 1)] == hashes[at]]
@@ -383,10 +383,10 @@ def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
 
 
 def looks_alike(mine: Hashes, other: Sketch) -> bool:
-    """Return whether the rows (N,) and a sketch may be largely the same."""
+    """Return whether rows with hashes `mine` (N,) may largely repeat another recording."""
     if not len(other.hashes):
         return False
-    # Below its largest hash, a full sketch has all of its recording's.
+    # A full sketch has all hashes of its recording up to its own largest one.
     full = len(other.hashes) == SKETCH_HASHES
     compared = mine[mine <= other.hashes[-1]] if full else mine
     both = len(np.intersect1d(compared, other.hashes))
@@ -395,10 +395,10 @@ def looks_alike(mine: Hashes, other: Sketch) -> bool:
 
 
 def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive | None:
-    """Return what the new rows share with those of another recording, if they largely do.
+    """Return what the new rows share with those of another recording; None if it is not enough.
 
-    One constant shift between the stamps of the two is taken out; rows further apart than half a
-    control period do not count.
+    The median shift between their stamps is subtracted. Rows whose stamps then differ by more than
+    half a control period do not count as the same.
     """
     mine, at = distinctive(rows)
     theirs, there = distinctive(other)
@@ -428,10 +428,10 @@ def find_repeat(
     read: Callable[[str, str], pa.Table],
     period_s: float,
 ) -> RepeatedDrive | None:
-    """Return the recording with the most of the rows, of those that `compare` finds the same.
+    """Return the stored recording that repeats the most of the new rows, or None.
 
-    `mine` are the rows' `distinctive` hashes; `rows()`, and `read(recording_id, ingest_id)` of one
-    whose sketch looks alike, are asked for where there is one.
+    `mine` are the new rows' `distinctive` hashes. Only if a sketch looks alike, `rows()` is called
+    for the new rows, and `read(recording_id, ingest_id)` for those of the stored recording.
     """
     found = []
     for one in sharing(mine, list(sketches)):
@@ -447,9 +447,9 @@ def find_repeat(
 
 
 def distinctive(rows: pa.Table) -> tuple[Hashes, Ints]:
-    """Return the hashes of rows that look like no other of their recording, ascending.
+    """Return the hashes that occur only once in a recording, ascending, and their rows' indices.
 
-    Also return which rows they are of. A robot that stands proves nothing.
+    Repeated hashes are left out because the rows of a robot that stands prove nothing.
     """
     found, first, counts = np.unique(row_hashes(rows), return_index=True, return_counts=True)
     once: Bools = counts == 1

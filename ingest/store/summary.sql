@@ -1,7 +1,7 @@
--- What the common views need of a recording, from its `transitions` and its manifest (`recordings`). Kept
--- in its manifest; summaries.sql adds them up over the store. Cells are counted as views.sql, which scans,
--- counts them: a test holds that both give the same. What is of one episode alone (measured_signals,
--- flawed_rows, zone_steps, condition_steps) has files of its own: it is worked out some episodes at a time.
+-- Summary tables of a recording, from its `transitions` and its manifest (`recordings`). The manifest stores
+-- them, and summaries.sql adds them up over the store. Cells are counted as in views.sql, which scans the
+-- rows: a test compares both. Tables that need only one episode at a time (measured_signals, flawed_rows,
+-- zone_steps, condition_steps) have their own files and are computed some episodes at a time.
 CREATE TEMP TABLE steps AS
 SELECT
     *,
@@ -37,7 +37,7 @@ FROM steps
 GROUP BY episode_id
 ORDER BY min(step_index), episode_index;
 
--- A line for each condition that holds in a step, or one, nominal, if none does.
+-- A row for each condition that holds at a step, or one row with the primary condition if none holds.
 CREATE TEMP TABLE held AS
 SELECT *, unnest(conditions) AS condition
 FROM steps
@@ -46,7 +46,7 @@ SELECT *, primary_condition
 FROM steps
 WHERE coalesce(len(conditions), 0) < 1;
 
--- Episodes do not reach over recordings: numbers of distinct ones add up.
+-- An episode belongs to one recording, so numbers of distinct episodes can be added up over recordings.
 CREATE TEMP TABLE cells AS
 SELECT
     recording_id,

@@ -1,4 +1,4 @@
-"""Transition rows of a store: from the steps of episodes with their labels, and the twin's."""
+"""Build a store's transition rows from labelled steps of a recording or of the twin."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ from restock.ingest.task.task import Signals, observe, reward
 from restock.ingest.task.task_sql import own_reward
 from restock.process import Work
 
-GROUP_ROWS = 8192  # of whole episodes that are worked out together: bounds memory
+GROUP_ROWS = 8192  # steps of whole episodes that are processed together: bounds memory
 
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """The steps of all episodes, one after the other: R rows, the last of each only an end."""
+    """R steps of consecutive episodes. The last step of each begins no transition: it only ends."""
 
     tick: Ints  # (R,)
     episode: Ints  # (R,) index of the episode
     step: Ints  # (R,) in its episode, from 0
     is_end: Bools  # (R,)
-    signals: Signals  # leading axis R, as the row's episode sees them
-    labels: dict[str, Bools]  # condition that can be told -> (R,)
+    signals: Signals  # leading axis R, with the route of the row's episode
+    labels: dict[str, Bools]  # condition that these steps can show -> (R,)
     custom: pa.Table  # (R,) the profile's own signals
-    probabilities: dict[str, F32]  # condition that has a rule for it -> (R,); NaN: not known
-    exposures: dict[str, Bools]  # as `labels`
+    probabilities: dict[str, F32]  # condition with a probability rule -> (R,); NaN: unknown
+    exposures: dict[str, Bools]  # exposure that these steps can show -> (R,)
 
     @property
     def starts(self) -> Ints:
-        """Return the rows that begin a transition, (N,); the row after each is its successor."""
+        """Return the rows that begin a transition, (N,); the row after each is its next step."""
         return np.flatnonzero(~self.is_end)
 
     def ends_table(self) -> pa.Table:
-        """Return the ends of the episodes, as `label_table` has them."""
+        """Return the last steps of the episodes as a `label_table`."""
         ends = np.flatnonzero(self.is_end)
         signals = {name: column[ends] for name, column in self.signals.items()}
         custom = self.custom.take(pa.array(ends))
@@ -68,7 +68,7 @@ class EpisodeRows:
 
     @classmethod
     def join(cls, parts: Sequence[EpisodeRows]) -> EpisodeRows:
-        """Join steps of several groups of episodes, without their signals."""
+        """Concatenate the steps of several groups of episodes, without their signals."""
         none: Signals = {}
         labels, exposures = (
             {name: np.concatenate([getattr(p, kind)[name] for p in parts]) for name in first}
@@ -91,7 +91,7 @@ class EpisodeRows:
 
 
 def groups(episodes: Split) -> Iterator[range]:
-    """Yield the episodes by their numbers, some GROUP_ROWS steps at a time."""
+    """Yield ranges of episode numbers of about GROUP_ROWS steps each."""
     first = count = 0
     for number, episode in enumerate(episodes.episodes):
         count += episode.last - episode.first + 1
@@ -105,7 +105,7 @@ def groups(episodes: Split) -> Iterator[range]:
 def episode_rows(
     profile: Profile, steps: Steps, episodes: Split, group: range | None = None
 ) -> Work[EpisodeRows]:
-    """Lay the steps of these episodes (None: of all) out, with their own route, and label them."""
+    """Collect and label the steps of a `group` of episodes (None: all), each with its own route."""
     group = range(len(episodes.episodes)) if group is None else group
     chosen = [episodes.episodes[number] for number in group]
     lengths = np.array([e.last - e.first + 1 for e in chosen], np.int64)
@@ -115,7 +115,7 @@ def episode_rows(
     is_end = step == np.repeat(lengths, lengths) - 1
     episode = np.repeat(np.arange(group.start, group.stop, dtype=np.int64), lengths)
     signals = {name: column[tick] for name, column in steps.signals.items()}
-    # A tick that ends one episode and begins the next is seen with each one's own route.
+    # A tick may end one episode and begin the next: each episode has it with its own route.
     old = np.flatnonzero(is_end & np.isin(tick, changed_route(steps)))
     if len(old):
         before, routing = tick[old] - 1, steps.routing
@@ -136,17 +136,17 @@ def episode_rows(
 
 
 def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -> pa.Table:
-    """Return the steps as conditions see them: stored signals and custom ones."""
+    """Return the steps as the table that conditions query: stored and custom signals."""
     columns = signal_columns(signals)
     columns |= dict(zip(custom.column_names, custom.columns, strict=True))
     return pa.table({"episode_index": episode, "step_index": step, **columns})
 
 
 def episode_ends(table: pa.Table) -> pa.Table | None:
-    """Return the steps of a recording's rows that only end an episode, as conditions see them.
+    """Return the last steps of a recording's episodes as a `label_table`, or None if missing.
 
-    They are no transitions, but conditions that look ahead see them; they lie in the rows'
-    metadata (and so in that of their Parquet file). None where the rows carry none.
+    They begin no transition, but conditions that look ahead need them. They are stored in the
+    metadata of the rows, and so of their Parquet file.
     """
     packed = (table.schema.metadata or {}).get(ENDS)
     if packed is None:
@@ -163,12 +163,12 @@ def packed(table: pa.Table) -> bytes:
 
 
 _OF_ONE_VALUE = ("recording_id", *(column.name for column in PROVENANCE))
-_SECTORS = "sector_clearance_m"  # the one signal of many numbers a step
+_SECTORS = "sector_clearance_m"  # the only signal with several numbers per step
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where rows come from; the same in every row of an ingest."""
+    """The source of rows; the same in every row of an ingest."""
 
     recording_id: str
     ingest_id: str
@@ -178,23 +178,23 @@ class Provenance:
 
 @dataclass(frozen=True)
 class TransitionValues:
-    """What rows hold of N transitions, beside the signals and labels of their R steps."""
+    """Columns of N transitions that are not signals or labels of their R steps."""
 
-    observation: NDArray[np.float32]  # (R, D) at every step, those that only end an episode too
+    observation: NDArray[np.float32]  # (R, D) at every step, including the last of each episode
     action: Ints  # (N,)
     reward: NDArray[np.float32]  # (N,)
     progress_m: NDArray[np.floating]  # (N,)
-    residual: NDArray[np.floating]  # (N,) from the command to the action
-    terminates: Bools  # (N,) whether the episode that it is in terminates
+    residual: NDArray[np.floating]  # (N,) scaled distance from the command to the action
+    terminates: Bools  # (N,) whether the row's episode ends by termination
     zone: Sequence[str]  # (N,)
     truth: Sequence[str | None]  # (N,) true condition
     policy: Sequence[str]  # (N,)
     policy_version: Sequence[str | None]  # (N,)
     probability: Sequence[float | None] | NDArray[np.floating]  # (N,) of the action
-    perturbation: tuple[pa.Array, pa.Array]  # (N,) its name and its values
-    true_exposure: Sequence[str | None] | None = None  # (N,); None: not known of any
-    goal_source: str | None = None  # of all; None: there is no goal
-    logged_ns: Ints | None = None  # (N,); None: as far from the stamps as the manifest says
+    perturbation: tuple[pa.Array, pa.Array]  # (N,) names, and (N,) values
+    true_exposure: Sequence[str | None] | None = None  # (N,); None: unknown in all rows
+    goal_source: str | None = None  # of all rows; None: there is no goal
+    logged_ns: Ints | None = None  # (N,); None: stamp_ns plus the manifest's clock_offset_ns
 
 
 def recording_table(
@@ -207,15 +207,15 @@ def recording_table(
 ) -> Work[tuple[pa.Table, EpisodeRows]]:
     """Return all transitions of a recording, and their steps (without signals).
 
-    Some whole episodes at a time, which changes no value: an episode's rows and labels depend on
-    its own steps alone, and only those of one group are in memory in full. `done` is told how many
-    ticks are.
+    They are computed for some whole episodes at a time, so that the signals of only one group are
+    in memory. This changes no value: an episode's rows and labels depend on its own steps alone.
+    `done` is called with the number of ticks that are finished.
 
     Raises:
         RecordingError: as `transitions`.
     """
     tables, ends, parts = [], [], []
-    same: dict[str, pa.ChunkedArray] = {}  # the longest so far of each column of one value
+    same: dict[str, pa.ChunkedArray] = {}  # column with one value in all rows -> its longest array
     for group in groups(episodes):
         rows = yield from episode_rows(profile, steps, episodes, group)
         made = transitions(profile, steps, episodes, rows, provenance)
@@ -232,8 +232,8 @@ def recording_table(
 def _joined(tables: list[pa.Table]) -> pa.Table:
     """Join the groups' rows to one table, and empty `tables`.
 
-    Column by column each gets memory of its own: a group's columns lie between much that is gone
-    by now, which Arrow can only give back together with them.
+    Each column is copied to new memory: a group's columns lie between arrays that are no longer
+    used, and Arrow can only free them together.
     """
     schema = tables[0].schema
     columns = [[table.column(place) for table in tables] for place in range(len(schema))]
@@ -249,7 +249,7 @@ def _joined(tables: list[pa.Table]) -> pa.Table:
 
 
 def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
-    """Store columns of one value, the same in every group, in one memory."""
+    """Let all groups share the memory of columns that have one value in the whole recording."""
     for name in _OF_ONE_VALUE:
         longest = same.setdefault(name, rows[name])
         if len(longest) < len(rows):
@@ -264,7 +264,7 @@ def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
 def transitions(
     profile: Profile, steps: Steps, episodes: Split, rows: EpisodeRows, provenance: Provenance
 ) -> pa.Table:
-    """Return one row a transition of a recording.
+    """Return one row per transition of a recording.
 
     Raises:
         RecordingError: as `transition_table`.
@@ -306,7 +306,7 @@ def transitions(
 def transition_table(
     profile: Profile, rows: EpisodeRows, values: TransitionValues, provenance: Provenance
 ) -> pa.Table:
-    """Build the store's rows of a recording or of the twin, by `restock.ingest.task.schema`.
+    """Build store rows of a recording or of the twin, with the columns of `transition_schema`.
 
     Raises:
         RecordingError: there are more steps than a transition id can number.
@@ -320,7 +320,7 @@ def transition_table(
             remedy="split the recording",
         )
     last = rows.is_end[begin + 1]
-    # The twin evaluates no condition over signals that it does not fill.
+    # The twin does not evaluate conditions over signals that it does not fill.
     evaluated = [one for one in profile.conditions if one.name in rows.labels]
     observation, next_observation = _vectors(values.observation, begin)
     columns: dict[str, Any] = {
@@ -371,7 +371,7 @@ def label_columns(
     conditions: Sequence[Condition],
     rows: Ints,
 ) -> dict[str, Any]:
-    """Return the columns that say which conditions and exposures hold at these rows.
+    """Return the columns of the conditions and exposures that hold at these rows.
 
     `conditions` are the definitions of `labels`.
     """
@@ -386,9 +386,9 @@ def label_columns(
 
 
 def _sorted_truths(truth: Sequence[str | None], tick: Ints) -> list[str | None]:
-    """Return the true conditions at these ticks (N,), their names sorted in each text.
+    """Return the true conditions at these ticks (N,), with sorted names in each text.
 
-    A recording has a few different texts, each of which is read once.
+    A recording has only a few different texts, so each is parsed once.
     """
     texts = [truth[index] for index in tick]
     ordered = {text: truth_text(true_names(text)) for text in set(texts) if text is not None}
@@ -398,10 +398,10 @@ def _sorted_truths(truth: Sequence[str | None], tick: Ints) -> list[str | None]:
 def _vectors(
     observation: NDArray[np.float32], begin: Ints
 ) -> tuple[pa.ChunkedArray, pa.ChunkedArray]:
-    """Return what is observed (R, D) at steps that begin a transition (N,), and at those after.
+    """Return columns `observation` and `next_observation` (N,) of observations (R, D).
 
-    Two columns of fixed-size lists over the same memory, a chunk an episode: all but the first and
-    the last observation of an episode are in both.
+    `begin` (N,) are the steps that begin a transition. Both columns are fixed-size lists over the
+    same memory, one chunk per episode: all but an episode's first and last observation are in both.
     """
     size = observation.shape[1]
     flat = pa.array(np.ascontiguousarray(observation, np.float32).reshape(-1))
@@ -419,7 +419,7 @@ def _vectors(
 
 
 def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
-    """Return values as a column of this type; a single text is repeated `count` times."""
+    """Return values as a column of this type; a single string is repeated `count` times."""
     if isinstance(values, str):
         return pa.repeat(pa.scalar(values, kind), count)
     if isinstance(values, pa.Array | pa.ChunkedArray):
@@ -430,7 +430,7 @@ def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
 
 
 def replaced(rows: pa.Table, columns: Mapping[str, Any]) -> pa.Table:
-    """Return the table with other values in some columns, and its metadata."""
+    """Replace the values of some columns, keeping types and metadata."""
     metadata = rows.schema.metadata
     for name, values in columns.items():
         index = rows.schema.get_field_index(name)
@@ -440,7 +440,7 @@ def replaced(rows: pa.Table, columns: Mapping[str, Any]) -> pa.Table:
 
 
 def by_name(values: Mapping[str, F32], rows: Ints) -> pa.Array:
-    """Return the values of these rows by their names as a map array, without NaN."""
+    """Return a map array of name -> value for these rows, without NaN."""
     table = np.stack([column[rows] for column in values.values()], axis=1) if values else None
     if table is None:
         table = np.zeros((len(rows), 0), np.float32)
@@ -453,7 +453,7 @@ def by_name(values: Mapping[str, F32], rows: Ints) -> pa.Array:
 
 
 def names_of(labels: Mapping[str, Bools], rows: Ints) -> pa.Array:
-    """Return the labels that hold in each of these rows, in their order, as a list array."""
+    """Return a list array of the labels that hold in each of these rows, in `labels` order."""
     table = np.zeros((len(rows), len(labels)), np.bool_)
     for column, holds in zip(table.T, labels.values(), strict=True):
         column[:] = holds[rows]

@@ -1,14 +1,14 @@
-"""Which version of a store, and whether Restock can read and write what is in it.
+"""Parse versions of a store, and check that Restock can read and write its tables.
 
-A version is a number, or the moment whose newest version it was. Every commit to a store makes a
-version of its transitions table; older ones stay readable for as long as the files they need are
-kept (`RETENTION_HOURS` after they were replaced).
+A version is a number, or a time, which stands for the newest version at that time. Every commit to
+`transitions` makes a new version of the store. Older versions stay readable as long as the files
+that they need are kept (`RETENTION_HOURS` after they were replaced).
 
-The description of a table says which format of the store it has: this Restock reads FORMAT alone.
+The description of each table contains the store's format. This Restock reads only FORMAT.
 
 Other tools may set features that change what a file's rows mean (deletion vectors, column mapping),
 or that every writer must follow (constraints, change feeds). Delta's library opens some of these
-tables, while Restock reads the Parquet files themselves: a feature that is not known here is
+tables, but Restock reads the Parquet files directly. So features that Restock does not know are
 refused by name.
 """
 
@@ -28,12 +28,12 @@ from restock.errors import StoreError
 from restock.files import first_line
 
 Version = int | datetime
-# The description of its tables. Raise it when columns, their meaning or the summaries change.
+# The description of a store's tables. Raise it when columns, their meaning or summaries change.
 FORMAT = "restock-store/2"
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
-LOG = "_delta_log"  # of a table, its folder
+LOG = "_delta_log"  # folder of a table's log
 _LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
-_SHORT = 1024  # bytes: what a commit of rows says of itself, without a file, is a third of it
+_SHORT = 1024  # bytes; commits below this may be cut: a commitInfo of rows alone takes a third
 _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
 
@@ -56,9 +56,9 @@ def parse_version(text: str) -> Version:
 
 
 def split_version(place: str) -> tuple[str, Version | None]:
-    """`store@12` or `store@2026-11-01` as path and version; None where it names none.
+    """Split `store@12` or `store@2026-11-01` into path and version (None if there is no `@`).
 
-    A folder that exists is taken as it is called.
+    If a path of the whole name exists, it has no version.
     """
     match = _AFTER_AT.fullmatch(place)
     if match is None or Path(place).exists():
@@ -67,13 +67,13 @@ def split_version(place: str) -> tuple[str, Version | None]:
 
 
 def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
-    """Return the newest version of a table at a moment; in UTC if it names no zone.
+    """Return the version of a table that was the newest at a moment (UTC if it has no time zone).
 
     Raises:
-        StoreError: it was made later.
+        StoreError: the table's first version is later.
     """
     moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    # The time that a commit says, not that of its file, which a copy of the store changes.
+    # The commit's own timestamp: copying a store changes the write times of its files.
     made = {
         int(commit["version"]): datetime.fromtimestamp(commit["timestamp"] / 1000, UTC)
         for commit in table.history()
@@ -88,12 +88,12 @@ def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
 
 
 def expect_whole(log: Path, version: int, *, where: str) -> None:
-    """Check that the commits that a version is read from are complete.
+    """Check that all commits are complete that a version is read from.
 
     Delta's library silently accepts an empty or truncated commit: rows would be missing.
 
     Raises:
-        StoreError: one of them does not.
+        StoreError: a commit is empty or truncated.
     """
     for number in range(version, -1, -1):
         file = log / f"{number:020}.json"
@@ -102,7 +102,7 @@ def expect_whole(log: Path, version: int, *, where: str) -> None:
                 return
             short = file.stat().st_size < _SHORT
             problem = _problem_of_commit(file) if short else None
-        except FileNotFoundError:  # of an older version: it is in a checkpoint of another kind
+        except FileNotFoundError:  # an older commit that a checkpoint of another kind covers
             return
         if problem:
             raise _damaged(file, problem, where, newest=version)
@@ -131,7 +131,7 @@ def log_damage(log: Path, *, where: str) -> StoreError | None:
 
 
 def _hinted_checkpoint(log: Path) -> int | None:
-    """Return the version of the checkpoint that a reader looks for first."""
+    """Return the version of the checkpoint that `_last_checkpoint` names, or None."""
     try:
         return int(json.loads((log / "_last_checkpoint").read_bytes())["version"])
     except (FileNotFoundError, ValueError, KeyError, TypeError):
@@ -170,9 +170,9 @@ def _problem_of_checkpoint(file: Path) -> str | None:
 def _damaged(
     file: Path, problem: str, where: str, *, newest: int | None = None, needless: bool = False
 ) -> StoreError:
-    """Return the error of a damaged log, whose last commit has the number `newest`.
+    """Return the error for a damaged file of a log whose last commit has the number `newest`.
 
-    A checkpoint is `needless` if all commits before it are there.
+    A checkpoint is `needless` if all commits up to it exist.
     """
     remedy = "if there is none, ingest the recordings into a new store"
     if newest is not None and file.stem == f"{newest:020}":
@@ -190,10 +190,10 @@ def _damaged(
     )
 
 
-# They change nothing about files of rows: a column type, the log's checkpoints, who may vacuum.
+# Features that Restock supports: they concern a column type, checkpoints and vacuum, not row files.
 _READ = {"timestampNtz", "v2Checkpoint", "vacuumProtocolCheck"}
 _WRITTEN = {"timestampNtz", "v2Checkpoint"}
-# What a table's version of the protocol stands for where it does not list features.
+# Protocol version -> features that it implies, for tables that do not list their features.
 _BY_READER_VERSION = {2: ("columnMapping",)}
 _BY_WRITER_VERSION = {
     2: ("appendOnly", "invariants"),
@@ -202,8 +202,8 @@ _BY_WRITER_VERSION = {
     5: ("columnMapping",),
     6: ("identityColumns",),
 }
-_LISTED_READER, _LISTED_WRITER = 3, 7  # the versions that list features, and the newest
-# Features that ask nothing unless the table's properties, or a column's, say so: the key of one.
+_LISTED_READER, _LISTED_WRITER = 3, 7  # the newest versions, and the first that list features
+# Feature -> pattern of the property (of the table or a column) without which it has no effect.
 _PROPERTIES = {
     "appendOnly": r"delta\.appendOnly=true",
     "checkConstraints": r"delta\.constraints\..*",
@@ -218,7 +218,7 @@ _REMOVE = (
 )
 _AGAIN = "ingest the recordings into a new store"
 _EARLIER = f"name a version from before, as in STORE@12, or {_AGAIN}"
-_UNSUPPORTED = re.compile(r"Feature '([^']+)' is not supported")  # Delta's library
+_UNSUPPORTED = re.compile(r"Feature '([^']+)' is not supported")  # error text of Delta's library
 
 
 def expect_format(table: DeltaTable, *, where: str) -> None:
@@ -246,7 +246,7 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
 
 
 def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) -> None:
-    """Check that commits may be made to a store's table; `removing`: commits that remove files.
+    """Check that Restock may commit to a store's table; `removing`: even remove files.
 
     Raises:
         StoreError: the table uses a feature that Restock cannot write.
@@ -266,9 +266,9 @@ def _asked(
     by_version: Mapping[int, tuple[str, ...]],
     key: str,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what the protocol of a table requires of a program: features in use, and each in words.
+    """Yield what a table's protocol requires: the features in use, each with a phrase for errors.
 
-    They are "" for a `version` newer than the `newest` known, which lists its features.
+    A `version` above `newest` (the newest known, which lists features) yields "" and its phrase.
     """
     if version > newest:
         yield "", f"version {version} of the protocol ({key})"
@@ -284,19 +284,19 @@ def _name(table: DeltaTable) -> str:
 
 
 def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None:
-    """Return the refusal of table `name` for a feature that Delta's library cannot open.
+    """Return the error for table `name` if Delta's library does not support one of its features.
 
-    None if that is not the error.
+    Return None if `error` is another one.
     """
     named = _UNSUPPORTED.search(str(error))
     if named is None:
         return None
-    # Older versions cannot be named: the library opens the newest first.
+    # Naming an older version does not help: the library opens the newest first.
     return _unreadable(f"feature `{named[1]}`", name, where, otherwise=_AGAIN)
 
 
 def _in_use(table: DeltaTable, feature: str) -> bool:
-    """Return whether a feature that a table lists is in use; unknown features count as used."""
+    """Return whether a table uses a feature; features not in _PROPERTIES always count as used."""
     if feature not in _PROPERTIES:
         return True
     columns = [field.metadata for field in table.schema().fields]

@@ -1,17 +1,17 @@
-"""The store, for writing: two Delta tables of plain Parquet, and commits that are atomic.
+"""Write recordings to a store: two Delta tables of plain Parquet with atomic commits.
 
-`recordings` holds one manifest row an ingest, `transitions` the rows; `ingest_id` joins them. Both
-files of an ingest have the same name, unless many of a commit share one of manifests. The manifest
-is committed first and the transitions second, so an ingest that is cut between the two is a
-manifest that joins nothing, and a reader sees each recording whole or not at all. A recording that
-is ingested again replaces its old rows in the same commit that adds the new ones; the manifests of
-what was replaced go last, by the writer that replaced it. A manifest that joins nothing yet is
-removed by its age only: another writer may be about to commit its transitions. Files outlive their
-removal by the same window, so that who opened a version before can read it: its manifests too, by
-the names of its rows' files.
+`recordings` has one manifest row per ingest, `transitions` has the rows; `ingest_id` joins them.
+The two files of an ingest have the same name, unless many recordings of a commit share one file of
+manifests. The manifest is committed first and the transitions second. An ingest that is killed in
+between leaves a manifest without rows, so a reader sees each recording whole or not at all. If a
+recording is ingested again, one commit removes its old rows and adds the new ones; the same writer
+then removes the old manifest. A manifest without rows is removed only when it is old enough:
+another writer may be about to commit its transitions. Removed files are deleted after the same
+retention window. Until then a reader that opened an older version can read it, and finds its
+manifests by the names of its rows' files.
 
-Frames of cameras are plain Parquet in `frames`, one file per ingest, written before both commits. A
-file is kept as long as a manifest names it.
+Camera frames are plain Parquet in `frames`, one file per ingest, written before both commits. A
+frame file is kept as long as a manifest names it.
 """
 
 from __future__ import annotations
@@ -66,24 +66,24 @@ ROW_GROUP_ROWS = 32_768
 
 @dataclass(frozen=True)
 class Staged:
-    """A recording whose rows are written and in no commit yet."""
+    """A recording whose rows are written but not yet committed."""
 
     recording_id: str
     ingest_id: str
     manifest: pa.Table  # its row, with its summary
-    rows: AddedFile  # of `transitions`
-    columns: pa.Schema  # of `transitions`
-    contents: Hashes  # of its distinctive rows, (N,) ascending
-    instead_of: str | None = None  # the ingest that was read to make it, if one was
+    rows: AddedFile  # its file in `transitions`
+    columns: pa.Schema  # the columns of that file
+    contents: Hashes  # hashes of its distinctive rows, (N,) ascending
+    instead_of: str | None = None  # the ingest that these rows were made from and replace, if any
 
 
 class StoreWriter(TableCommits):
-    """Writes recordings to a store, which is made when the first one is written."""
+    """Writer of a store; creates the store with the first recording."""
 
     def __init__(self, path: str | Path | Location) -> None:
         super().__init__(path)
         self.path.expect_newest()
-        self._fitting: list[pa.Schema] = []  # columns that its tables are known to have
+        self._fitting: list[pa.Schema] = []  # schemas whose columns the tables are known to have
         self._reached = False
 
     def repeated(
@@ -94,10 +94,10 @@ class StoreWriter(TableCommits):
         ahead: Sequence[Staged] = (),
         aside: Collection[str] = (),
     ) -> RepeatedDrive | None:
-        """Return the recording that holds most of one's rows under other ids, if one largely does.
+        """Return the stored recording that repeats most of this one's rows, or None.
 
-        `period_s` is the control period: rows further apart than half of it do not count. Those
-        `ahead` of it are looked at as if they were in the store, ingests `aside` are not.
+        Rows count as the same if their stamps differ by at most half a control period (`period_s`).
+        Recordings in `ahead`, staged before this one, are compared too. Ingests in `aside` are not.
         """
         others = [one for one in self.shown() if one.ingest_id not in aside]
         sketches = [
@@ -110,9 +110,9 @@ class StoreWriter(TableCommits):
         )
 
     def write_frames(self, path: str, batches: Iterable[pa.RecordBatch]) -> int:
-        """Write a recording's frames to a file of `frames`; returns how many they are.
+        """Write a recording's frames to a file of `frames`; return the number of frames.
 
-        No manifest names it yet: `discard_frames` where none will.
+        If no manifest is committed that names the file, call `discard_frames`.
 
         Raises:
             StoreError: it cannot be written.
@@ -131,7 +131,7 @@ class StoreWriter(TableCommits):
         return count
 
     def discard_frames(self, path: str) -> None:
-        """Delete a file of frames that no manifest names."""
+        """Delete a frame file that no manifest names."""
         with suppress(OSError, StoreError):
             self.path.delete([f"{FRAMES}/{path}"])
 
@@ -141,7 +141,7 @@ class StoreWriter(TableCommits):
         Returns the version of `transitions` that has them.
 
         Raises:
-            StoreError: `path` is something else, or other writers were faster too many times.
+            StoreError: the path is not a store's, or other writers were faster too many times.
         """
         return self.write_all([(manifest, rows)])
 
@@ -153,18 +153,18 @@ class StoreWriter(TableCommits):
     ) -> int:
         """Write several recordings, as (manifest row, transitions), in one commit.
 
-        `instead_of` (recording -> ingest) are the ingests that were read to make them: if another
+        `instead_of` maps each recording to the ingest that its new rows were made from: if another
         writer has replaced one since, nothing is written.
 
         Raises:
-            StoreError: as `write`, or what was to be replaced has changed.
+            StoreError: as `write`, or another writer has replaced or removed one of the recordings.
         """
         staged: list[Staged] = []
         try:
             for manifest, rows in recordings:
                 staged.append(self.stage(manifest, rows))
                 self.fit(staged[-1:])
-        except BaseException:  # no commit has begun, so they are not needed
+        except BaseException:  # no commit has begun, so no table needs the files
             self.discard(staged)
             raise
         try:
@@ -174,16 +174,16 @@ class StoreWriter(TableCommits):
             raise
 
     def stage(self, manifest: pa.Table, rows: pa.Table, *, instead_of: str | None = None) -> Staged:
-        """Write the files of a recording, of which nothing shows before `commit_staged`.
+        """Write a recording's rows to a file; readers do not see them before `commit_staged`.
 
-        The manifest row may have its summary already.
+        A summary is added to the manifest row, unless it has one already.
 
         Raises:
-            StoreError: they cannot be written.
+            StoreError: the file cannot be written.
         """
         self.expect_folder()
         if not self._reached:
-            self.reach()  # Delta's library says of S3 what is wrong; Arrow's writer says less
+            self.reach()  # before the write: Delta's library explains S3 errors better than Arrow
             self._reached = True
         ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()
         if "distinctive_rows" not in manifest.column_names:
@@ -205,13 +205,13 @@ class StoreWriter(TableCommits):
         return staged
 
     def commit_staged(self, staged: Sequence[Staged]) -> int:
-        """Commit recordings that the tables `fit`, each of them once, together: all or none.
+        """Commit staged recordings, each different, all or none; call `fit` before.
 
         Returns the version of `transitions` that has them.
 
         Raises:
-            StoreError: what one was to replace has changed, other writers were faster too many
-                times, or the tables cannot be written. `take_back` what is not to be tried again.
+            StoreError: an ingest to be replaced has changed, other writers were faster too many
+                times, or the tables cannot be written. Call `take_back` if you will not try again.
         """
         pa.default_memory_pool().release_unused()
         read = {one.recording_id: one.instead_of for one in staged if one.instead_of}
@@ -223,14 +223,15 @@ class StoreWriter(TableCommits):
     def _commit_files(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> int:
         self._commit_manifests(staged, instead_of)
         version, replaced = self.commit(TRANSITIONS, [one.rows for one in staged], instead_of)
-        with suppress(StoreError):  # the rows are there: what joins nothing, `clean` removes
+        with suppress(StoreError):  # the rows are committed; `clean` removes manifests without rows
             self.remove(RECORDINGS, replaced)
         return version
 
     def _commit_manifests(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> None:
-        """Write and commit what is not in `recordings` already: an attempt before may have failed.
+        """Write and commit the manifests that are not in `recordings` yet.
 
-        Many become one file. It stays if a part of its recordings cannot be committed.
+        An earlier attempt that failed may have committed some. From MIN_JOINED on, they become one
+        file, which stays in the table even if some of its recordings cannot be committed.
         """
         held = self._listing(RECORDINGS).paths
         new = [one for one in staged if one.ingest_id not in held]
@@ -245,16 +246,15 @@ class StoreWriter(TableCommits):
             self.commit(RECORDINGS, made, instead_of)
 
     def remove_recordings(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
-        """Take recordings out of the store in one commit, by their ingests (recording -> ingest).
+        """Remove recordings from the store in one commit; `ingests` maps recording to ingest.
 
-        Their files stay for as long as those of replaced ones.
+        Their files are kept as long as those of replaced recordings.
 
-        Returns the version of `transitions` that they were read from, and the newest, without
-        them.
+        Returns the last version of `transitions` that has them, and the new version without them.
 
         Raises:
             StoreError: one was ingested again or removed in the meantime, or other writers were
-                faster too many times. The store is as it was.
+                faster too many times. The store is unchanged.
         """
         versions = self.take_out(ingests, operation)
         self.remove(RECORDINGS, {own_path(*ids) for ids in ingests.items()})
@@ -264,7 +264,7 @@ class StoreWriter(TableCommits):
         """Ensure that the tables exist and have the columns of these recordings.
 
         Raises:
-            StoreError: they cannot be written, or have other columns by these names.
+            StoreError: they cannot be written, or have columns of other types under these names.
         """
         for one in staged:
             if one.columns not in self._fitting:
@@ -273,25 +273,25 @@ class StoreWriter(TableCommits):
                 self._fitting.append(one.columns)
 
     def discard(self, staged: Sequence[Staged]) -> None:
-        """Delete the files of recordings whose commit has not begun, with their frames."""
+        """Delete the files of recordings whose commit has not begun, including their frames."""
         with suppress(OSError, StoreError):
             for name in (RECORDINGS, TRANSITIONS, FRAMES):
                 self.path.delete(f"{name}/{one.rows.path}" for one in staged)
 
     def take_back(self, staged: Sequence[Staged]) -> None:
-        """Delete the files of recordings whose commit failed or was interrupted.
+        """Delete the files of recordings whose commit failed or was interrupted, where possible.
 
-        That is as far as possible, and only of those whose rows are in no commit.
+        Recordings whose rows were committed after all are left alone.
 
-        On S3 nothing is: a commit whose answer was lost may be there later. `clean` deletes what
-        is left when it is older than its window.
+        On S3 nothing is deleted: a commit without an answer may still appear later. `clean`
+        deletes the files when they are older than its window.
         """
         if self.path.folder is None:
             return
         with suppress(OSError, StoreError, DeltaError):
             there = {one.ingest_id for one in self.shown()}
             gone = [one for one in staged if one.ingest_id not in there]
-            # Rows first: on a full disk they give back the room to take the manifests out.
+            # Rows first: on a full disk this frees the space to commit the removal of manifests.
             self.discard_uncommitted(TRANSITIONS, [one.rows for one in gone])
             ids = {(one.recording_id, one.ingest_id) for one in gone}
             manifests = [file for file in self.files(RECORDINGS) if file.ingests]
@@ -300,17 +300,17 @@ class StoreWriter(TableCommits):
             self.discard(gone)
 
     def clean(self, retention_hours: int = RETENTION_HOURS) -> list[str]:
-        """Delete files that no version within the retention window needs; returns their paths.
+        """Delete files that no version within the retention window needs; return their paths.
 
-        They are what killed writers left, and what replaced recordings had. The window must be
-        longer than any writer takes from its first file to its last commit.
+        These are files that killed writers left, and files of replaced or removed recordings. The
+        window must be longer than any writer takes from its first file to its last commit.
         """
         deleted = []
         self.remove(RECORDINGS, self._abandoned(retention_hours))
         for name in (RECORDINGS, TRANSITIONS):
             if not self.path.has_table(name):
                 continue
-            # Files of versions within the window are among them, which the log knows.
+            # A stale file may still belong to a version within the window: vacuum excludes those.
             stale = self._written_before(name, retention_hours)
             if not stale.difference(file.path for file in self.files(name)):
                 continue
@@ -321,9 +321,9 @@ class StoreWriter(TableCommits):
                     enforce_retention_duration=False,
                     full=True,
                 )
-            # It names removed files for as long as the log does, there or not.
+            # Vacuum also names files that were deleted long ago, as long as the log has them.
             deleted += [f"{name}/{file}" for file in sorted(stale.intersection(unneeded))]
-        # Without commits of its own: cleaning changes no version of a table.
+        # Vacuum ran dry and files are deleted here, so that cleaning adds no commit to the table.
         self.path.delete(deleted)
         frames = self._unnamed_frames(retention_hours)
         self.path.delete(frames)
@@ -332,14 +332,14 @@ class StoreWriter(TableCommits):
     def _written_before(self, name: str, retention_hours: int) -> set[str]:
         """Return the files in a folder that are older than the window.
 
-        A manifest may be younger than its removal in the log: compaction writes it again where a
-        version within the window needs it.
+        A manifest's file may be younger than its removal in the log: compaction writes it again if
+        a version within the window needs it.
         """
         before_s = time.time() - retention_hours * 3600
         return {path for path, at_s in self.path.times(name).items() if at_s <= before_s}
 
     def _unnamed_frames(self, retention_hours: int) -> list[str]:
-        """Return frame files older than the window that no manifest names, even a removed one."""
+        """Return frame files older than the window that no manifest file names, removed or not."""
         found = self._written_before(FRAMES, retention_hours)
         if not found:
             return []
@@ -348,45 +348,45 @@ class StoreWriter(TableCommits):
                 try:
                     reported = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])
                 except UNREADABLE:
-                    return []  # which frames it names is not known
+                    return []  # the unreadable manifest may name any of them
                 found -= set(frame_files(reported))
         return [f"{FRAMES}/{path}" for path in sorted(found)]
 
     def _abandoned(self, retention_hours: int) -> list[str]:
-        """Return manifests that join nothing and are too old for a writer to be about to commit."""
+        """Return manifests without rows, too old for a writer to be about to commit their rows."""
         if not self.path.has_table(RECORDINGS) or not self.path.has_table(TRANSITIONS):
             return []
-        manifests = self.files(RECORDINGS)  # before the transitions that may join them
+        manifests = self.files(RECORDINGS)  # read first: rows committed since then are found below
         shown = {one.ingest_id for one in self.shown()}
         before_ms = (time.time() - retention_hours * 3600) * 1000
         return [
             file.path
             for file in manifests
-            # A joined file was of recordings that were there: versions before need it still.
+            # A joined file had recordings with rows: older versions still need it.
             if file.own
             and file.added_ms < before_ms
             and not shown & {one.ingest_id for one in file.ingests}
         ]
 
     def _write(self, rows: pa.Table, path: str) -> int:
-        """Write a Parquet file; returns its size in bytes.
+        """Write a Parquet file; return its size in bytes.
 
-        Lists of fixed size become plain lists, which every engine that knows Delta reads.
+        Fixed-size lists become plain lists, which every engine that supports Delta can read.
         """
         rows = plain_lists(rows)
         options = parquet_options(rows.schema)
         with written_whole(self.path, path):
             size = self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)
-        # What encoding took, tens of MB: Arrow would keep it, and a commit takes as much again.
+        # Encoding took tens of MB, which Arrow would keep, and a commit takes as much again.
         pa.default_memory_pool().release_unused()
         return size
 
 
-FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writes again, at most
+FILE_ROWS = 500_000  # most rows of a joined file, which is rewritten to replace one recording
 MIN_FILES = 2
-FOLD_FILES = 16  # of few manifests, which cost each opening 10 ms each, and joining one as much
-MIN_JOINED = 8  # recordings of a commit whose manifests become one file
-FULL_MANIFESTS = 500  # a file of so many is left alone; joining them again would take a second
+FOLD_FILES = 16  # files of few manifests that trigger a fold; each costs 10 ms to open or to join
+MIN_JOINED = 8  # from this many recordings in a commit, their manifests become one file
+FULL_MANIFESTS = 500  # a file of so many is left alone: joining it again would take a second
 OPERATION = "restock store compact"
 
 
@@ -394,18 +394,18 @@ OPERATION = "restock store compact"
 class Compacted:
     """What a compaction did, or would do."""
 
-    rows: int = 0  # of transitions that were written again
-    files_before: int = 0  # of transitions
-    files_after: int = 0  # of those: what other writers added meanwhile is not counted
+    rows: int = 0  # transitions that were written again
+    files_before: int = 0  # files of transitions
+    files_after: int = 0  # without those that other writers added meanwhile
     manifests_before: int = 0  # files of manifests
     manifests_after: int = 0
-    summaries: int = 0  # of recordings whose rows another tool changed
-    changed_meanwhile: int = 0  # files that another writer replaced before they were done
-    version: int | None = None  # of the store's transitions, where they were written
+    summaries: int = 0  # new summaries of recordings whose rows another tool changed
+    changed_meanwhile: int = 0  # files to join, not joined because another writer replaced some
+    version: int | None = None  # of `transitions` after its last commit; None without a commit
 
 
 def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
-    """Make few files of many: of the manifests, and of the transitions.
+    """Join small files of manifests and of transitions into few large ones.
 
     Raises:
         StoreError: there is no store, or it cannot be written.
@@ -422,9 +422,9 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
         if store.path.has_table(RECORDINGS):
             _Fold.of(store, changed).count(done)
         return done
-    if changed:  # first: once their files are Restock's own, the summaries are taken for true
+    if changed:  # before the rows: summaries of files that Restock wrote are trusted
         fold(store, done, changed)
-    for group in groups:  # else first: where one is damaged, the manifests stay as they are
+    for group in groups:  # otherwise rows first: if a file is damaged, manifests stay unchanged
         _merge_rows(store, group, done)
     if not changed:
         fold(store, done)
@@ -438,15 +438,15 @@ def fold(
     *,
     small: bool = False,
 ) -> None:
-    """Make one file of the manifests of all recordings; if `small`, of those in small files.
+    """Join the manifests of all recordings into one file; if `small`, only those in small files.
 
     Ingests whose rows another tool `changed` get new summaries.
 
-    Manifests whose rows are not there yet, those of replaced rows, and files that have many already
-    stay as they are.
+    Manifests without rows (not there yet, or replaced) and files with many manifests stay as they
+    are.
     """
     done = done or Compacted()
-    made: dict[str, pa.Table] = {}  # manifests with new summaries, by ingest
+    made: dict[str, pa.Table] = {}  # ingest -> manifest with its new summary
     if not store.path.has_table(RECORDINGS):
         return
     store.create(RECORDINGS, recording_columns())
@@ -476,29 +476,29 @@ def fold(
 
 
 def fold_if_many(store: StoreWriter) -> None:
-    """Fold the manifests if their number makes every opening slow."""
+    """Fold the manifests if so many small files make every opening slow."""
     if not store.path.has_table(TRANSITIONS):
         return
     sizes = [len(file.ingests) for file in store.files(RECORDINGS)]
     if sum(size < FULL_MANIFESTS for size in sizes) >= FOLD_FILES:
-        with suppress(StoreError):  # the ingest before it is done; queries say what is damaged
+        with suppress(StoreError):  # the ingest itself succeeded; queries report damaged files
             fold(store, small=True)
 
 
 @dataclass
 class _Fold:
-    """What a fold does: the files that it makes one of, and the ingests in that."""
+    """Plan of a fold: the files that it joins, and the ingests that the new file will have."""
 
-    files: int
+    files: int  # all files of manifests
     chosen: list[StoredFile]
     live: list[Ingest]
-    lacking: list[Ingest]  # of these, those whose summary is of other rows
+    lacking: list[Ingest]  # the live ingests whose summary does not match their rows
 
     @classmethod
     def of(cls, store: StoreWriter, changed: Collection[str], *, small: bool = False) -> _Fold:
-        """Plan it. If `small`, a file is left that holds more than all smaller ones together.
+        """Plan a fold. If `small`, leave joined files with more ingests than all smaller ones have.
 
-        So a manifest is written again a few times only, however many follow.
+        So each manifest is rewritten only a few times, however many follow.
         """
         shown = {one.ingest_id for one in store.shown()}
         files = store.files(RECORDINGS)
@@ -526,7 +526,7 @@ class _Fold:
         return bool(self.lacking) or len(self.chosen) >= MIN_FILES
 
     def count(self, done: Compacted) -> None:
-        """Say what becomes of the files."""
+        """Enter the numbers of files before and after the fold, and of new summaries."""
         done.manifests_before = done.manifests_after = self.files
         if self.worth_it:
             done.manifests_after -= len(self.chosen) - 1
@@ -534,7 +534,7 @@ class _Fold:
 
 
 def _summarise(store: StoreWriter, lacking: Sequence[Ingest], made: dict[str, pa.Table]) -> None:
-    """Add the manifests of these ingests with a summary of their rows."""
+    """Add the manifests of these ingests, with new summaries, to `made` (by ingest id)."""
     manifests = store.manifests(lacking, recording_schema())
     for one in lacking:
         with suppress(FileNotFoundError):  # replaced meanwhile
@@ -549,9 +549,9 @@ def _of(manifests: pa.Table, one: Ingest) -> pa.Table:
 
 
 def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
-    """Write manifests of replaced rows in compacted files as files of their own.
+    """Write each manifest of replaced rows in the chosen files as a file of its own.
 
-    Older versions need them: they are found by their names until cleaning removes them.
+    Older versions need them, and find them by file name until cleaning deletes them.
     """
     live = {one.ingest_id for one in plan.live}
     held = [one for file in plan.chosen for one in file.ingests]
@@ -565,7 +565,7 @@ def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
 
 
 def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
-    """Return the ingests of these files whose rows are not those that their manifests describe."""
+    """Return the ingests in these files whose rows their manifests may no longer describe."""
     names = pa.schema([("ingest_id", pa.string()), ("transitions", pa.int64())])
     reported = store.manifests([one for file in files for one in file.ingests], names)
     written = dict(zip(*(reported[name].to_pylist() for name in names.names), strict=True))
@@ -573,9 +573,9 @@ def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
 
 
 def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
-    """Group files of transitions to join, robot by robot in the order of their time.
+    """Group small files of transitions to join, ordered by robot, then time.
 
-    One that another tool wrote may be alone.
+    A file that another tool wrote may form a group alone.
     """
     files = store.files(TRANSITIONS)
     small = [file for file in files if file.rows < FILE_ROWS / 2 or not file.listed]
@@ -606,7 +606,7 @@ def _worth_it(group: Sequence[StoredFile]) -> bool:
 
 def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted) -> None:
     """Join these files in their own commit; do nothing if one is gone by then."""
-    held: dict[str, Ingest] = {}  # another tool may have cut the rows of one into several files
+    held: dict[str, Ingest] = {}  # another tool may have split an ingest's rows over several files
     for one in (one for file in group for one in file.ingests):
         before = held.get(one.ingest_id)
         held[one.ingest_id] = one._replace(rows=one.rows + (before.rows if before else 0))
