@@ -1,4 +1,4 @@
-"""A DQN on logs and in the twin: train it, evaluate it, compare and diagnose runs."""
+"""Train a DQN on logs and in the twin, evaluate it, and compare and diagnose runs."""
 
 from __future__ import annotations
 

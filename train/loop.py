@@ -2,7 +2,7 @@
 
 Double DQN (arXiv:1509.06461) with n-step returns and half of each online batch from logs (RLPD,
 arXiv:2302.02948), after an offline phase on the logs and warm-up rollouts without updates (WSRL,
-arXiv:2412.07762). Read `_train` from top to bottom: it is the whole of it.
+arXiv:2412.07762). `_train` is the whole algorithm, from top to bottom.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 
-_CONSERVATIVE_STEPS = 20_000  # environment steps in which the CQL term's weight changes
-_OFFLINE_BLOCK = 64  # updates between two looks at the clock and at Ctrl-C
-# Of a budget in seconds, what may have passed when the teacher's rows are cloned, and when the
-# updates on the logs end: the other half is for the twin.
+_CONSERVATIVE_STEPS = 20_000  # environment steps in which the CQL term's weight falls to 0
+_OFFLINE_BLOCK = 64  # updates between two checks of the clock and of Ctrl-C
+# Shares of a budget in seconds after which cloning, and then the updates on the logs, must end: the
+# other half is for the twin.
 _OF_CLONING, _OF_LOGS = 0.25, 0.5
 Notify = Callable[[str, dict[str, Any]], None]  # name of an event, its values
 
 
 class TrainingInterrupted(RestockError):
-    """A run was interrupted; it has a checkpoint to resume from."""
+    """The run was interrupted, and has a checkpoint to resume from."""
 
     exit_code = ExitCode.INTERRUPTED
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """How a run ended."""
+    """The counts and scores of a run at its end."""
 
     env_steps: int
     gradient_steps: int
-    online_updates: int  # of the gradient steps, those made while it drove in the twin
+    online_updates: int  # gradient steps made while it drove in the twin
     wall_s: float
     best: Score | None
     last: Score | None
@@ -67,18 +67,18 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     notify: Notify = lambda event, values: None,
 ) -> TrainResult:
-    """Run a session to the end of its budget; do nothing if it is there already.
+    """Train to the end of the session's budget; do nothing if the budget is used up.
 
     Args:
         stop: called between steps and while the policy is evaluated; True ends the run with a
-            checkpoint. An evaluation under way is abandoned, and made by the run that goes on.
+            checkpoint. An evaluation under way is abandoned, and repeated when the run is resumed.
         notify: called with every row of `progress`, every evaluation, and the notes of an
-            off-policy evaluation on its logs.
+            off-policy evaluation on the logs.
 
     Raises:
-        TrainingInterrupted: `stop` said so.
-        TeacherFailed: the teacher did, before the step that it was asked for; a checkpoint was
-            written.
+        TrainingInterrupted: `stop` returned True.
+        TeacherFailed: the teacher raised an error or returned invalid actions. The step that it was
+            queried for was not made, and a checkpoint was written.
         NotFinite: a loss or gradient is NaN or infinite; names the rows of the batch.
     """
     if nothing_to_do(session) is not None:
@@ -122,7 +122,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
-    _evaluate_if_due(session, notify, stop)  # if the run stopped during one
+    _evaluate_if_due(session, notify, stop)  # if the run was stopped during an evaluation
     while progress.env_steps < schedule.env_steps and time_left(session):
         _interrupt(session, stop)
         # 2. Warm-up: the policy from the logs drives; nothing is learnt from its rows yet.
@@ -142,8 +142,8 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         acting_step = learner.gradient_steps
         session.collector.start(action, probability)
 
-        # 4. … while ended episodes get their labels, and the learner learns from what the ring held
-        # before this step.
+        # 4. … while ended episodes are labelled, and the learner learns from the rows that the ring
+        # had before this step.
         session.run.append("episodes", session.collector.label())
         due = _updates_due(session)
         _updates(session, due, "online", notify)
@@ -160,7 +160,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             session.interval.episodes += 1
             session.interval.successes += bool(episode.success)
             session.interval.returns += episode.undiscounted_return
-        # … and when an interval of practice ends, the twin's next missions get its shares.
+        # … and at the end of a practice interval, the twin gets the shares of its next missions.
         session.practice.note(ended)
         session.run.append("practice", session.practice.advance(session.steps))
 
@@ -204,7 +204,7 @@ def _interval_is_open(session: Session) -> bool:
 
 
 def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
-    """Train the behaviour network on the logs' rows of the teacher's policies."""
+    """Train the behaviour network on the logged rows to clone, if no update was made yet."""
     behaviour, imitation = session.learner.behaviour, session.imitation
     if behaviour is None or imitation is None or session.learner.gradient_steps:
         return
@@ -233,7 +233,7 @@ def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
         sync = target.last_sync
         for number, (batch, loss, tail) in enumerate(_made(session, made, phase), start=1):
             _note(session, batch, loss, sync, tail, phase)
-            if number < made:  # the last one's is `_follow`'s
+            if number < made:  # `_follow` does it for the last update
                 target.after(session.learner.gradient_steps)
             sync = target.last_sync
         _follow(session, phase, notify)
@@ -241,7 +241,7 @@ def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
 
 
 def _until_due(session: Session, count: int) -> int:
-    """Return how many of `count` updates come before an interval ends or a target is copied."""
+    """Return how many of `count` updates to make up to the next interval's end or target copy."""
     if session.blocks is None:
         count = 1 if session.batches.needs_td else min(count, LONGEST)
     step, rule = session.learner.gradient_steps, session.learner.target.rule
@@ -267,7 +267,7 @@ def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
             count, draw, conservative=conservative, labelled=imitation is not None
         )
         return
-    # Drawn together: after an update the caches no longer hold what draws need.
+    # All are drawn first: an update displaces the data of draws from the CPU's caches.
     drawn, failed = drawn_ahead(draw, count)
     labelled = [None if imitation is None else imitation.draw_online() for _ in drawn]
     for batch, labels in zip(drawn, labelled, strict=True):
@@ -293,7 +293,7 @@ def _note(
     tail: Tensor | None,
     phase: str,
 ) -> None:
-    """Record the update just counted; `last_sync` is the target's, before it."""
+    """Record the last update; `last_sync` is the target's last sync before it."""
     interval, update = session.interval, session.learner.gradient_steps
     session.feed.batch(update, session.progress.env_steps, batch, loss, last_sync, tail=tail)
     value = float(loss.value.detach())
@@ -304,13 +304,13 @@ def _note(
 
 
 def _follow(session: Session, phase: str, notify: Notify) -> None:
-    """Advance the target after an update, and close the interval at its end."""
+    """Advance the target after the last update, and close the interval if it ends here."""
     learner, interval = session.learner, session.interval
     step, every = learner.gradient_steps, session.config.record.every_updates
     rule = learner.target.rule
     last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
     if isinstance(rule, Hard) and learner.target.is_due(step) and last_of_interval:
-        # At a hard sync the distance is 0 by definition, so it is measured just before.
+        # A hard sync makes the distance 0, so it is measured just before.
         interval.distance_before_sync = learner.target.distance()
         if session.probe is not None:
             interval.lag_before_sync = session.probe.measure(learner)[1]
@@ -320,7 +320,7 @@ def _follow(session: Session, phase: str, notify: Notify) -> None:
 
 
 def _conservative_weight(session: Session, phase: str) -> float:
-    """Return the CQL term's weight: constant offline, then linear to 0."""
+    """Return the CQL term's weight: constant until online updates begin, then linear to 0."""
     loss, progress = session.config.loss, session.progress
     if phase == "offline" or progress.online_from is None:
         return loss.conservative
@@ -380,10 +380,10 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
 
 
 def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
-    """Evaluate the policy on held-out logs into the table `off_policy`, if any are held out."""
+    """Evaluate the policy on held-out logs, if there are any, and write the table `off_policy`."""
     if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
         return
-    if session.run.table("off_policy").num_rows:  # before the run stopped
+    if session.run.table("off_policy").num_rows:  # evaluated before the run was stopped
         return
     config, learner = session.config, session.learner
     ope = OpeConfig(seed=config.seed)
@@ -409,7 +409,7 @@ def _evaluate_if_due(session: Session, notify: Notify, stop: Callable[[], bool])
 def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
     """Drive the fixed episodes greedily, and keep the policy if it is the best so far.
 
-    Without a twin nothing drives: what is learnt by now is kept.
+    Without a twin there are no episodes: the current policy is kept.
     """
     check_parameters(session)
     if not session.config.env.twin:
@@ -451,10 +451,10 @@ def _save(session: Session) -> None:
 
 
 def time_left(session: Session, part: float = 1.0) -> bool:
-    """Return whether this part of the budget of time leaves room for more than an evaluation.
+    """Return whether the first `part` of the budget in seconds has room for more than evaluating.
 
-    The budget is all that a user waits for: cloning, updates on the logs, driving, evaluations.
-    Whatever it is, a first interval of updates is made, so that there is something to report.
+    The budget covers all that a user waits for: cloning, updates on the logs, driving, evaluations.
+    The first interval of updates is always made, so that there is something to report.
     """
     seconds = session.config.schedule.seconds
     if seconds is None or session.learner.gradient_steps < session.config.record.every_updates:
@@ -463,10 +463,10 @@ def time_left(session: Session, part: float = 1.0) -> bool:
 
 
 def nothing_to_do(session: Session) -> str | None:
-    """Return why a resumed run ends at once, and what to do; None if it goes on."""
+    """Return why a resumed run would end at once, and what to do; None if it has work left."""
     progress, schedule = session.progress, session.config.schedule
     if progress.evaluated_at != progress.env_steps or _interval_is_open(session):
-        return None  # its end is still to be made
+        return None  # its last evaluation or interval is missing
     if not session.config.env.twin:
         return "it learns from logs alone, and has made its updates"
     if progress.env_steps >= schedule.env_steps:
@@ -480,10 +480,10 @@ def nothing_to_do(session: Session) -> str | None:
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
-    """Save and end the run if `stop` says so.
+    """Save and end the run if `stop` returns True.
 
-    An evaluation or another step that is abandoned here is made again, from its beginning, by the
-    run that goes on.
+    An evaluation or another stage that is abandoned here is repeated from its beginning when the
+    run is resumed.
     """
     if stop():
         _save(session)
@@ -497,17 +497,17 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
 
 
 def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, phase: str) -> None:
-    """Check the update just made, whose batch `session.feed` has kept.
+    """Check the loss of the last update, whose batch `session.feed` holds.
 
     Raises:
-        NotFinite: `value`, its loss, is not finite; names the rows.
+        NotFinite: the loss, `value`, is not finite; names the rows of the batch to blame.
     """
     if math.isfinite(value):
         return
     bad_rows = ~np.isfinite(batch.rows.cpu().numpy()).all(axis=1)
     td = loss.td.cpu().numpy()
     bad = bad_rows | ~np.isfinite(td)
-    if not bad.any():  # finite one by one, but not their sum
+    if not bad.any():  # each error is finite, but their sum is not
         bad = np.abs(td) == np.abs(td).max()
     what = f"the loss is {value} ({phase})"
     if bad_rows.any():
@@ -522,7 +522,7 @@ def check_parameters(session: Session) -> None:
     """Check the parameters before they are recorded, evaluated or kept.
 
     Raises:
-        NotFinite: one is not finite; names the rows of the last batch.
+        NotFinite: a parameter is not finite; names the rows of the last batch.
     """
     if session.learner.is_finite:
         return

@@ -1,4 +1,4 @@
-"""Prepare a run from its flags: check config, panel and twin against each other first."""
+"""Prepare a run: check config, panel and twin against each other before anything is written."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ class Prepared:
     panel: Panel | None
     document: dict[str, Any]  # config.json
     resumed: Run | None = None
-    teacher: Any = None  # that Python code passed in
-    requested: AskedTeacher | None = None  # that a new run's config names
+    teacher: Any = None  # a teacher that Python code passed in
+    requested: AskedTeacher | None = None  # the teacher that a new run's config names
 
     def open(self) -> Session:
         """Make or reopen the run directory, and build the twin and the learner.
 
         Raises:
-            RunError: another process trains this run; or it cannot go on, and why.
+            RunError: another process trains this run, or the run cannot be resumed.
         """
         env = make_twin(self.config, self.profile, self.config.env.num_envs)
         teacher = self.requested
@@ -96,7 +96,7 @@ class Prepared:
             teacher = open_teacher(
                 self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
             )
-        if teacher is not None and self.resumed is None:  # refused before anything is written
+        if teacher is not None and self.resumed is None:  # an error before anything is written
             teacher.ask(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
         lock = RunLock(self.path)
@@ -105,7 +105,7 @@ class Prepared:
             try:
                 session = self._session(run, env, teacher, layouts)
             except BaseException:
-                if self.resumed is None:  # leave no folder of a run that never began
+                if self.resumed is None:  # remove the folder of a run that never began
                     shutil.rmtree(self.path, ignore_errors=True)
                 raise
         except BaseException:
@@ -115,7 +115,7 @@ class Prepared:
         return session
 
     def _run(self) -> Run:
-        """Create the run's directory, or open the old one as its checkpoint left it."""
+        """Create the run's directory, or remove a stopped process's leftovers from the old one."""
         if self.resumed is None:
             return Run.create(self.path, self.document)
         self.resumed.remove_leftovers()
@@ -159,21 +159,21 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     notify: Notify = lambda event, values: None,
 ) -> TrainResult:
-    """Train a new run to the end of its budget, as `restock train`; the run is the folder `out`.
+    """Train a new run in the folder `out` to the end of its budget, as `restock train` does.
 
     Args:
         config: a config, the path of its TOML file, or None for the defaults.
         panel: the folder of a panel; None: online only.
-        settings: `key.path=value`, over the config.
-        teacher: queried in the twin, in place of what `teacher.source` names: an object with
-            `act(env, observation)`, or a function like it, that gives actions (N,).
+        settings: overrides of the config, each as `key.path=value`.
+        teacher: queried in the twin instead of the one that `teacher.source` names: an object with
+            `act(env, observation)`, or such a function. It returns actions (N,).
         stop: called between steps; True ends the run with a checkpoint.
         notify: called for every row of `progress` and every evaluation.
 
     Raises:
         RunError: `out` already exists.
-        ConfigError: a config that cannot be used, or no such device.
-        PanelError: a panel made for another task or discount than the twin's.
+        ConfigError: the config cannot be used, or there is no such device.
+        PanelError: the panel was made for another task than the twin's, or another discount.
         TrainingInterrupted: `stop` returned True.
     """
     panel_path = None if panel is None else Path(panel)
@@ -202,9 +202,9 @@ def prepare_new(
 
     Raises:
         RunError: `out` already exists.
-        ConfigError: a config that cannot be used, or no such device.
-        PanelError: a panel of another discount, or of a profile that is not at hand.
-        TeacherFailed: the user's class raised an error as it was made.
+        ConfigError: the config cannot be used, or there is no such device.
+        PanelError: the panel has another task or discount, or its profile is not available.
+        TeacherFailed: the user's teacher class raised an error when it was created.
     """
     check_free(out)
     if isinstance(config, TrainConfig):
@@ -237,17 +237,18 @@ def prepare_new(
     config = resolve_config(config, panel)
     check_new_run(config, profile.task, panel)
     requested = None
-    if config.teacher.source != GIVEN:  # made once: it may be large
+    if config.teacher.source != GIVEN:  # created only once, as it may be large
         requested = open_teacher(config.teacher, profile.task, seed=config.seed)
     written = _document(config, profile, panel)
     return Prepared(out, config, profile, panel, written, requested=requested)
 
 
 def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
-    """Check a run to go on with; `overrides` may extend its budget or move it to another device.
+    """Check a run to resume; `overrides` may extend its budget or move it to another device.
 
     Raises:
-        RunError: no such run or checkpoint, or its panel or task changed since.
+        RunError: there is no such run, or its task has changed since.
+        PanelError: its panel is gone, damaged or replaced by another.
     """
     run = Run.open(path)
     stored = run.document["config"]
@@ -265,7 +266,7 @@ def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
         )
     if config.teacher.mirror:
         mirrors(config.teacher, profile.task)
-    panel = run_panel(run.document)  # refused if it is gone or has been replaced
+    panel = run_panel(run.document)  # raises if it is gone or was replaced
     if panel is not None:
         panel = open_panel(panel.path, config, profile)
     return Prepared(path, config, profile, panel, run.document, run)
@@ -281,7 +282,7 @@ def conditions_of_twin(profile: Profile) -> tuple[list[Condition], list[Conditio
 
 
 def _never_driven(names: Sequence[str], config: TrainConfig) -> Bools:
-    """Return which strata (S,) are of kinds of missions that the twin never drives."""
+    """Return which strata (S,) are named after a kind of mission that the twin never drives."""
     env = config.env
     return np.array(
         [name in KINDS and not env.conditions.get(name) and env.missions is None for name in names]
@@ -289,10 +290,10 @@ def _never_driven(names: Sequence[str], config: TrainConfig) -> Bools:
 
 
 def refuse_short_budget(session: Session, seconds: float) -> None:
-    """Estimate the time of an evaluation, and refuse a budget that two of them would use up.
+    """Estimate how long an evaluation takes, and refuse a budget that two would use up.
 
     Raises:
-        ConfigError: says what the budget must be.
+        ConfigError: the budget is too short; names one that suffices.
     """
     env, specs = session.evaluation_buffer.env, session.fixed_episodes
     one_s = evaluation_time_s(env, specs, session.task.time_limit_steps)
@@ -311,7 +312,7 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
     """Open a panel, check its bytes, and compare it with the twin's task and the config's discount.
 
     Raises:
-        PanelError: it is damaged, or does not fit; says which side says what.
+        PanelError: it is damaged, or its task or discount differs; names both values.
     """
     panel = Panel.open(path, verify=True)
     if panel.task_hash != profile.task.hash:
@@ -361,11 +362,12 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         controller = controller_for(panel, planned, config.replay.logs_share, fresh)
         fed = {
             **panel_document(panel),
-            # The quotas and their fill, judged by this run's own draws.
+            # The quotas, and how far the draws of this run can fill them.
             "forecast": controller.forecast(),
             "planned_draws": asdict(planned),
         }
-    # Earlier runs had the target's value; an algorithm of one's own has what it takes.
+    # Left out in runs of earlier Restocks, whose target had the target network's value, and for a
+    # user's own algorithm, which defines its own target.
     lower = config.loss.algorithm == "dqn" and config.loss.double and not config.teacher.filters
     return {
         "created_ns": now_ns(),
@@ -375,7 +377,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "target": describe(config.target),
         "update_path": update_path(config.device, config.threads),
         **profile_document(profile),
-        # Conditions that only logs can have, with the signals that the twin does not fill.
+        # Conditions that only logs can have, each with the signals that the twin does not fill.
         "not_evaluated": conditions_in_twin(
             profile.conditions, profile.signals, lidar=profile.task.lidar
         )[1],

@@ -1,7 +1,7 @@
-"""Resolve a config's open settings by panel and profile, and refuse what cannot be trained.
+"""Fill in a config's open settings by panel and profile, and refuse runs that cannot be trained.
 
-Refused before anything is written: settings that name what the panel does not have, settings
-without effect, and a run that the machine's memory cannot hold.
+Refused are settings that name what the panel does not have, settings without effect, and a ring
+larger than the machine's memory. Nothing is written before these checks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
         learns_first = panel is not None and config.schedule.offline_updates > 0
         epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
     env = config.env
-    if env.perturbation not in PERTURBATIONS:  # what is in a file may change: the run keeps it
+    if env.perturbation not in PERTURBATIONS:  # a file may change later: the run keeps its content
         perturbation = find_perturbation(env.perturbation, where="env.perturbation")
         env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
     if isinstance(env.missions, str):
@@ -42,11 +42,11 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 
-FIRST_GUESS = 800.0  # environment steps a second, of a budget in seconds, until it is measured
+FIRST_GUESS = 800.0  # environment steps per second, assumed until the speed is measured
 
 
 def planned_env_steps(config: TrainConfig) -> int:
-    """Return the environment steps a budget allows, before this machine's speed is known."""
+    """Return the environment steps that a budget allows, before this machine's speed is known."""
     schedule = config.schedule
     if schedule.seconds is None:
         return schedule.env_steps
@@ -66,16 +66,17 @@ def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedD
     )
 
 
-_ROWS_OF_UPDATES = 5_000  # cloned rows; for more, it makes more updates than the critic
-_MAX_UPDATES = 10.0  # times the critic's
+_ROWS_OF_UPDATES = 5_000  # cloned rows for as many updates as the critic's; more rows take more
+_MAX_UPDATES = 10.0  # limit of the behaviour network's updates, in multiples of the critic's
 
 
 def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) -> TrainConfig:
     """Fill in the teacher's open settings: the operator teaches if the task has a goal.
 
     Raises:
-        ConfigError: rows are to be mirrored, and an action has no opposite; successes are to be
-            cloned where no goals are logged; a setting has no effect, because nobody teaches.
+        ConfigError: a setting does not apply to the teacher's source; the planner is to teach, but
+            the profile does not read its commands; successes are to be cloned, but no goals are
+            logged; or rows are to be mirrored, but an action has no opposite.
     """
     teacher = config.teacher
     if teacher.source is None:
@@ -109,14 +110,15 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
             where="teacher.successes",
             remedy="leave it out, or add drivers to teacher.policies",
         )
-    # Where the twin's operator answers from the first step on, they slow it down: docs/train.md.
+    # If a teacher answers in the twin from the first step on, they slow learning: docs/train.md.
     return logged and not teacher.asks if teacher.successes is None else teacher.successes
 
 
 def mirrors(teacher: TeacherConfig, task: Task) -> bool:
     """Decide whether the behaviour network learns from mirror images.
 
-    Raises ConfigError where it is asked, and an action has no opposite.
+    Raises:
+        ConfigError: the config asks for them, but an action has no opposite.
     """
     try:
         Mirror.of(task)
@@ -132,7 +134,7 @@ def mirrors(teacher: TeacherConfig, task: Task) -> bool:
     return teacher.mirror is True or teacher.source == "operator"
 
 
-_SLOT_BYTES = 18  # of a row's stratum, its place there, and its age
+_SLOT_BYTES = 18  # for a row's stratum, its position there, and its age
 
 
 def row_bytes(observation_size: int) -> int:
@@ -142,10 +144,10 @@ def row_bytes(observation_size: int) -> int:
 
 
 def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
-    """Refuse what would fail, or have no effect, once the run has begun.
+    """Refuse settings that would fail, or have no effect, once the run has begun.
 
     Raises:
-        ConfigError: as the module says; names the setting.
+        ConfigError: see the top of this file; names the setting.
     """
     _refuse_no_effect(config)
     check_terms(config, panel)
@@ -164,7 +166,7 @@ def _refuse_no_effect(config: TrainConfig) -> None:
 def _refuse_too_large(config: TrainConfig, task: Task) -> None:
     """Raise ConfigError if the ring exceeds the machine's memory.
 
-    Its pages are taken as it fills, so the run would be killed hours after it began.
+    The ring takes memory only as it fills, so the run would be killed hours after it began.
     """
     needed = config.replay.ring_capacity * row_bytes(task.observation_size)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -180,7 +182,7 @@ def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     """Return the config of a run without a twin: no environment steps, no teacher in the twin.
 
     Raises:
-        ConfigError: it has no panel, or something of it needs a twin.
+        ConfigError: there is no panel, or the teacher needs the twin.
     """
     where = "env.twin"
     if panel is None:

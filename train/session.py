@@ -1,7 +1,7 @@
 """The live state of a training run: its parts and clocks, and how to save and restore them.
 
 Every random draw comes from a generator that belongs to one of the parts, and every part is in the
-checkpoint, so a run that is resumed goes on exactly as it would have.
+checkpoint, so a resumed run continues exactly as if it had never stopped.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ from restock.train.run.run import Run, RunLock
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
-_MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # as `train --resume` may
+_MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # by `train --resume`
 
 
 @dataclass
 class Progress:
-    """Where the run is. Gradient steps are the learner's."""
+    """The counters and times of a run; the learner counts gradient steps."""
 
     env_steps: int = 0
     online_from: int | None = None  # environment steps when online updates began
     online_updates: int = 0
     evaluated_at: int = -1  # environment steps of the last evaluation
     checkpointed_at: int = 0
-    wall_s: float = 0.0  # of training, before this process
-    driving_from_s: float | None = None  # of training, when driving in the twin began
-    online_from_s: float | None = None  # of training, when online updates began
-    offline_update_s: float = 0.0  # of an update on the logs, on average
-    evaluation_s: float = 0.0  # of the last evaluation; before it, an estimate
-    planned_env_steps: int = 0  # that the shares of batches are planned for
+    wall_s: float = 0.0  # training time up to the last checkpoint
+    driving_from_s: float | None = None  # training time when driving in the twin began
+    online_from_s: float | None = None  # training time when online updates began
+    offline_update_s: float = 0.0  # mean time of an update on the logs
+    evaluation_s: float = 0.0  # time of the last evaluation; before the first, an estimate
+    planned_env_steps: int = 0  # steps that the shares of batches are planned for
 
 
 @dataclass
@@ -110,7 +110,7 @@ class Session(Stateful):
     ring: FreshRing
     batches: Batches
     collector: Collector
-    fixed_episodes: Sequence[EpisodeSpec]  # that evaluations drive: every named kind
+    fixed_episodes: Sequence[EpisodeSpec]  # driven by every evaluation: all kinds of the config
     feed: FeedRecord
     events: Events
     probe: Probe | None
@@ -119,7 +119,7 @@ class Session(Stateful):
     logs: Logs | None
     log_terms: LogTerms
     practice: Practice
-    imitation: Imitation | None  # what the behaviour network learns from
+    imitation: Imitation | None  # batches for the behaviour network
     lock: RunLock | None = None  # held while this process writes the run
     blocks: UpdateBlocks | None = None  # makes updates, if the learner is not on the CPU
     progress: Progress = field(default_factory=Progress)
@@ -135,7 +135,7 @@ class Session(Stateful):
 
     @property
     def steps(self) -> dict[str, int]:
-        """Return the two clocks of a run, with which every row of its tables begins."""
+        """Return the run's two clocks, the first columns of most of its tables."""
         return {
             "env_steps": self.progress.env_steps,
             "gradient_steps": self.learner.gradient_steps,
@@ -144,8 +144,8 @@ class Session(Stateful):
     def plan(self) -> None:
         """Plan the shares of batches for the environment steps that the budget still allows.
 
-        Of a budget in seconds these follow from the steps per second so far. To be called where
-        a checkpoint is written: a run that goes on from it then has the same plan.
+        A budget in seconds is converted by the steps per second so far. After online updates have
+        begun, call this only just before a checkpoint, so that a resumed run has the same plan.
         """
         config, progress = self.config, self.progress
         schedule = config.schedule
@@ -166,7 +166,7 @@ class Session(Stateful):
         made = progress.env_steps - (progress.online_from or 0)
         if made >= self.config.record.every_updates:
             return made / max(wall_s - progress.online_from_s, 1e-9)
-        # Online updates begin: the speed of driving alone, and of updates on the logs.
+        # Online updates have just begun: add up the times of driving and of updates on the logs.
         step_s = (wall_s - progress.driving_from_s) / max(progress.env_steps, 1)
         update_s = self.config.schedule.updates_per_env_step * progress.offline_update_s
         return 1.0 / max(step_s + update_s, 1e-9)
@@ -182,15 +182,15 @@ class Session(Stateful):
         checkpoint.save(self.run.latest, {**self.state_dict(), **extra})
 
     def write_held(self) -> None:
-        """Also write rows that wait for their episodes' end; a resumed run reads them back.
+        """Also write the rows whose episodes have not ended, so that the tables are complete.
 
-        Call after `save`: rows beyond the checkpoint's are removed when the run is resumed.
+        Call it after `save`: a resumed run removes these rows, and has them from its checkpoint.
         """
         self.feed.write_held()
         self.run.flush()
 
     def open_events(self) -> None:
-        """Begin to write curves; a resumed run purges those after its checkpoint."""
+        """Open the trackers' curves; a resumed run removes points after its checkpoint."""
         run, record = self.run, self.config.record
         from_step = self.progress.env_steps if run.latest.exists() else None
         self.events = Events(run.path, tracker_sinks(run, record.trackers, from_step))
@@ -199,8 +199,8 @@ class Session(Stateful):
         """Continue from the run's latest checkpoint.
 
         Raises:
-            RunError: no such checkpoint, the policy that was kept is missing or damaged, or
-                config.json or the logs' rows are not those that the run began with.
+            RunError: there is no checkpoint, the kept policy is missing or damaged, or config.json
+                or the logged rows have changed since the run began.
         """
         state = checkpoint.load(self.run.latest)
         _refuse_edited(self.run, state.get("config"))
@@ -234,9 +234,9 @@ class Session(Stateful):
 
 
 def _refuse_edited(run: Run, before: Mapping[str, Any] | None) -> None:
-    """Refuse a config.json that was edited since a checkpoint with the config `before`.
+    """Raise RunError if config.json was edited after the checkpoint, whose config is `before`.
 
-    None: an earlier Restock did not keep it.
+    `before` is None if an earlier Restock wrote the checkpoint.
     """
     if before is None:
         return
