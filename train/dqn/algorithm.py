@@ -1,4 +1,4 @@
-"""The seam for value-based algorithms, and DQN, written once as PyTorch.
+"""The interface of value-based algorithms, and DQN written once in PyTorch.
 
     y_i     = r_i + d_i * Q_target(s'_i, a_i')                       Double DQN, arXiv:1509.06461
     a_i'    = argmax_a Q(s'_i, a)
@@ -8,8 +8,8 @@
 `d_i` is the discount of row i: gamma**n for an n-step row that bootstraps, 0 for one that
 terminated. A truncated episode bootstraps: its d is not 0.
 
-Where no filter keeps a_i' to what somebody does, min(Q, Q_target) takes the place of Q_target
-(clipped double Q-learning, arXiv:1802.09477): the best action of a logged row is often one that
+Without a behaviour network to filter a_i', min(Q, Q_target) takes the place of Q_target (clipped
+double Q-learning, arXiv:1802.09477): the action with the largest value in s' is often one that
 nobody has tried, and nothing corrects its value.
 
 `loss.algorithm` of a run's config names an entry of `ALGORITHMS`, or your own as `module:name`.
@@ -48,13 +48,13 @@ class TrainingBatch:
     next_observation: Tensor  # (B, D) float32
     action: Tensor  # (B,) int64
     reward: Tensor  # (B,) float32, the sum of the row's n discounted rewards
-    discount: Tensor  # (B,) float32, gamma**n where the row bootstraps, else 0
+    discount: Tensor  # (B,) float32, gamma**n if the row bootstraps, else 0
     weight: Tensor | None = None  # (B,) importance weights; None: ones
-    # (B, A) float32, added to Q(s', a) where the next action is chosen; None: nothing.
+    # (B, A) float32, added to Q(s', a) to choose the next action; None: nothing.
     preference: Tensor | None = None
-    lower: bool = False  # the lower of both networks' values of the next action counts
+    lower: bool = False  # bootstrap from the lower of both networks' values
     logged: int = 0  # L, how many of the first rows are from logs
-    conservative: float | Tensor = 0.0  # weight of the CQL term, or that of each logged row (L,)
+    conservative: float | Tensor = 0.0  # weight of the CQL term, or one per logged row (L,)
     expert: Tensor | None = None  # (L,) bool, rows with the margin term; None: none
 
 
@@ -69,10 +69,10 @@ class Loss:
 
 
 class Algorithm(Protocol):
-    """How values are learnt. Made from a run's `LossConfig`.
+    """A way to learn action values, constructed from a run's `LossConfig`.
 
-    The greedy action is the best value of the network, to which a teacher's preference may be
-    added: one rule for the twin, evaluation and ONNX.
+    The greedy action has the network's largest value, after a teacher's preference, if any, is
+    added. The twin, evaluation and ONNX all use this rule.
     """
 
     def make_network(
@@ -88,8 +88,8 @@ class Algorithm(Protocol):
     def loss(self, network: Any, target: Any, batch: TrainingBatch) -> Loss:
         """Return the loss of `network` on a batch; `target` is its slow copy.
 
-        Both are what `make_network` returned. A plain `QNetwork` may be replaced by a compiled
-        function that gives the same values and gradients.
+        Both come from `make_network`. A compiled function with the same values and gradients may
+        take the place of a plain `QNetwork`.
         """
         ...
 
@@ -107,7 +107,7 @@ class DQN:
         actions: int,
         generator: torch.Generator | None = None,
     ) -> QNetwork:
-        """Return a multilayer perceptron with one output an action."""
+        """Return a multilayer perceptron with one output per action."""
         return QNetwork(
             observation_size,
             actions,
@@ -143,8 +143,8 @@ class DQN:
     ) -> tuple[Loss, F32]:
         """Return the loss without penalty, and its gradient by `q` (B, A), as autograd rounds it.
 
-        `scalars` (B, 3) are action, reward and discount, `next_value` (B,) that of the next action,
-        `weight` (B,) importance weights, or None: ones.
+        `scalars` (B, 3) are action, reward and discount, `next_value` (B,) is the value of the next
+        action, `weight` (B,) importance weights; None: ones.
         """
         chosen = np.arange(len(q)), scalars[:, 0].astype(np.int64)
         td = q[chosen] - (scalars[:, 1] + scalars[:, 2] * next_value)
@@ -159,7 +159,7 @@ class DQN:
         return Loss(loss.mean(), *of_rows), gradient
 
     def _penalty(self, q: Tensor, batch: TrainingBatch) -> Tensor | None:
-        """Sum the terms on logged rows, in proportion to their share of the batch."""
+        """Return the terms on logged rows, times their share of the batch; None without terms."""
         logged, share = batch.logged, batch.logged / len(q)
         action = batch.action[:logged]
         terms = []
@@ -179,7 +179,7 @@ def make_algorithm(config: LossConfig) -> Algorithm:
     """Return the algorithm that `config.algorithm` names.
 
     Raises:
-        ConfigError: no such name, module or attribute.
+        ConfigError: there is no such name, module or attribute.
     """
     named = ALGORITHMS.get(config.algorithm)
     if named is None:
@@ -230,13 +230,13 @@ def td_target(
 
     Args:
         reward: (B,), the sum of the row's n discounted rewards.
-        discount: (B,), gamma**n where the row bootstraps, else 0.
+        discount: (B,), gamma**n if the row bootstraps, else 0.
         next_target_q: (B, A), the target network at s'.
         next_online_q: (B, A), the online network at s': it selects the action that the target
-            network evaluates (Double DQN). None lets the target network do both (DQN).
-        preference: (B, A), added where the next action is selected, and not to its value: -inf
-            for what may not be selected (discrete BCQ, arXiv:1910.01708). None: nothing.
-        lower: the lower of both networks' values counts.
+            network evaluates (Double DQN). None: the target network does both (DQN).
+        preference: (B, A), added to select the next action, but not to its value: -inf for actions
+            that may not be selected (discrete BCQ, arXiv:1910.01708). None: nothing.
+        lower: bootstrap from the lower of both networks' values.
     """
     chooses = next_target_q if next_online_q is None else next_online_q
     if preference is not None:
@@ -258,9 +258,9 @@ def dqn_loss(
 ) -> Loss:
     """Return the loss of action values `q` (B, A) at `action` (B,) int64 against `target` (B,).
 
-    `weight` (B,) are importance weights that correct the sampling; None is all ones.
+    `weight` (B,) are importance weights that correct the sampling; None: ones.
     """
-    chosen = q.gather(1, action.unsqueeze(1))  # (B, 1), as autograd has fewer operations to undo
+    chosen = q.gather(1, action.unsqueeze(1))  # (B, 1): fewer operations in the backward pass
     wanted = target.unsqueeze(1)
     if weight is None:
         value = functional.huber_loss(chosen, wanted, delta=huber_delta)
@@ -275,7 +275,7 @@ def conservative_penalty(q: Tensor, action: Tensor, weight: float | Tensor = 1.0
     """Return discrete CQL's regulariser, the mean of weight * (logsumexp_a Q(s, a) - Q(s, a_log)).
 
     It pushes down the values of actions that the logs never took (arXiv:2006.04779, CQL(H)).
-    `weight` is of all rows or of each, (B,).
+    `weight` is one number for all rows, or one per row, (B,).
     """
     chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
     return ((q.logsumexp(dim=1) - chosen) * weight).mean()
@@ -285,8 +285,8 @@ def margin_penalty(q: Tensor, action: Tensor, expert: Tensor, margin: float) -> 
     """Return DQfD's large-margin term, the mean of max_a [Q(s, a) + l(a)] - Q(s, a_E).
 
     l(a) is `margin` for every action but the expert's, so that the expert's must be better by that
-    much (arXiv:1704.03732, equation 1). `expert` (B,) bool says which rows are an expert's; the
-    mean is over all B rows, so a batch with few of them has little of it.
+    much (arXiv:1704.03732, equation 1). `expert` (B,) bool marks the expert's rows. The mean is
+    over all B rows, so the term is small in a batch with few of them.
     """
     others = torch.full_like(q, margin).scatter_(1, action.unsqueeze(1), 0.0)
     chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)

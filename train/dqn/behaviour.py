@@ -1,18 +1,18 @@
-"""What a teacher prefers is added to Q: the best sum is taken.
+"""Policies that add a teacher's preference to Q, and take the action with the largest sum.
 
-Navigation's proposal is preferred by a margin: another action is taken where Q says that it is
-better by more than that. So the policy begins as the stack that drives today, and deviates where
-its values have learnt that deviating pays (safe policy improvement with a baseline,
-arXiv:1712.06924). Its target chooses by the same rule, so Q is the value of this very policy.
+`ProposalNetwork` prefers navigation's proposal by a margin: it takes another action only if Q of
+that action is larger by more than the margin. So the policy begins as the stack that drives today,
+and deviates where its values have learnt that deviating pays (safe policy improvement with a
+baseline, arXiv:1712.06924). Its target chooses by the same rule, so Q is the value of this policy.
 
-A behaviour network says which actions are plausible, and Q chooses among them.
+`FilteredNetwork` takes the best action by Q of those that a behaviour network finds plausible.
 
-G(a|s) is learnt by cross-entropy from what a teacher would do in the visited states, and from
-what it did in the logs. An action is plausible where G(a|s) is at least `ratio` times the largest;
-Q takes the best of those, and its target may look no further (discrete BCQ, arXiv:1910.01708). The
-teacher is asked where the agent goes, not where it went itself (DAgger, arXiv:1011.0686).
+The behaviour network gives G(a|s). It learns by cross-entropy from the teacher's answers in visited
+states, and from the teacher's logged actions. An action is plausible if G(a|s) is at least `ratio`
+times the largest. Target values use only plausible actions, too (discrete BCQ, arXiv:1910.01708).
+The teacher is queried where the agent goes, not where it drove itself (DAgger, arXiv:1011.0686).
 
-G has a network of its own: imitation and values pull one network apart.
+G has a network of its own, because imitation and values pull a shared network apart.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from restock.train.dqn.network import (
 )
 
 Values = QNetwork | Ensemble
-UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
+UNKNOWN = -1  # code of the action if the teacher was not queried or had no opinion
 HIDDEN = (256, 256)  # widths of the behaviour network's layers
 _LEARNING_RATE = 1e-3
-_SEED = 1 << 32  # apart from that of Q, which may be as large
+_SEED = 1 << 32  # added to the run's seed: larger than any seed of Q
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Labelled:
 
 
 def plausible_actions(logits: Tensor, ratio: Tensor) -> Tensor:
-    """Return which actions (B, A) bool have G(a|s) >= ratio * max G(.|s); at least one of each row.
+    """Return which actions (B, A) bool have G(a|s) >= ratio * max G(.|s); at least one per row.
 
     Args:
         logits: (B, A), of which G is the softmax.
@@ -93,22 +93,19 @@ class FilteredNetwork(nn.Module):
 
 
 # How to read a proposal from an observation o (D,): W (A, D) and b (A,), with W @ o + b largest for
-# the proposed action; and k (D,), with k @ o = 1 where there is one, else 0.
+# the proposed action; and k (D,), with k @ o = 1 if there is a proposal, else 0.
 Proposal = tuple[F64, F64, F64]
 
 
 class ProposalNetwork(nn.Module):
-    """A network that gives Q, and `margin` more for the action that navigation proposes.
+    """A network that gives Q, plus `margin` for the action that navigation proposes, if any."""
 
-    Where nothing is proposed it gives Q alone.
-    """
-
-    nearest: Tensor  # (A, D): which action is nearest to the proposal, by the largest value
-    offset: Tensor  # (A,)
-    lead: Tensor  # (D,), the margin where a proposal is known
+    nearest: Tensor  # (A, D), W of `Proposal`
+    offset: Tensor  # (A,), b
+    lead: Tensor  # (D,), margin * k
 
     def __init__(self, values: Values, proposal: Proposal | None, margin: float) -> None:
-        """`proposal` None: buffers wait for kept weights."""
+        """Without a `proposal`, the buffers are 0 until kept weights are loaded."""
         super().__init__()
         self.values = values
         self.observation_size, self.actions = values.observation_size, values.actions
@@ -122,7 +119,7 @@ class ProposalNetwork(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.asarray(of, np.float32)))
 
     def preference(self, observation: Tensor) -> Tensor:
-        """Return what is added to the values (B, A) of observations (B, D)."""
+        """Return the amount added to each action value (B, A) of observations (B, D)."""
         near = functional.linear(observation, self.nearest, self.offset)
         proposed = near >= near.amax(dim=1, keepdim=True)
         return proposed * (observation @ self.lead)[:, None]
@@ -141,14 +138,14 @@ def make_behaviour(
     actions: int,
     generator: torch.Generator | None = None,
 ) -> QNetwork:
-    """Return the network whose softmax is G."""
+    """Return a new behaviour network, whose softmax is G."""
     return QNetwork(observation_size, actions, hidden=HIDDEN, generator=generator)
 
 
 def make_policy(
     config: TrainConfig, observation_size: int, actions: int, *, runs: int = 1
 ) -> PolicyNetwork:
-    """Return a run's policy network, or that of a mean of runs, to load weights into."""
+    """Return the policy network of a run, or of a mean of `runs`, to load kept weights into."""
     values = _of_runs([make_network(config, observation_size, actions) for _ in range(runs)])
     if config.teacher.source == PLANNER:
         return ProposalNetwork(values, None, config.teacher.margin)
@@ -163,10 +160,10 @@ def _of_runs(networks: Sequence[QNetwork]) -> Values:
 
 
 class Behaviour(Stateful):
-    """G with its optimizer and the ratio. `average` is the G that is evaluated and kept.
+    """The behaviour network with its optimizer and the ratio.
 
-    Args:
-        path: how its network is differentiated.
+    `average` is the average of its weights, which is evaluated and kept. `path` is how its gradient
+    is computed.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates")
@@ -190,7 +187,7 @@ class Behaviour(Stateful):
         self._logits = differentiable(path, self.network, learns.values, learns.gradient)
         self.updates = 0
         self.ratio = torch.tensor(config.ratio, device=device)
-        self._floor = np.float32(self.ratio.log().cpu())  # of plausible logits, from the best on
+        self._floor = np.float32(self.ratio.log().cpu())  # plausible: logit >= largest + floor
 
     def learn(self, labelled: Labelled) -> None:
         """Make one gradient step."""
@@ -200,7 +197,7 @@ class Behaviour(Stateful):
         self.optimizer.step(self._slow, averaging_rate(self.updates))
 
     def move(self, labelled: Labelled, rate: Tensor) -> None:
-        """Make one gradient step on the device alone; the caller keeps the counts."""
+        """Make one gradient step by operations on the device alone; `count` counts it."""
         self._fill_gradient(labelled)
         self.optimizer.move(self._slow, rate)
 
@@ -215,13 +212,13 @@ class Behaviour(Stateful):
         return [*self.optimizer.moved, self._slow]
 
     def plausible(self, observation: F32) -> Bools:
-        """Return plausible actions (B, A) in observations (B, D), by compiled code."""
+        """Return which actions (B, A) are plausible in observations (B, D), by compiled code."""
         assert isinstance(self._logits, Kernel)
         logits = self._logits.values(observation)
         return np.asarray(logits >= logits.max(axis=1, keepdims=True) + self._floor)
 
     def _fill_gradient(self, labelled: Labelled) -> None:
-        if isinstance(self._logits, Kernel):  # to the bits of what follows
+        if isinstance(self._logits, Kernel):  # bit for bit the gradient that autograd computes
             logits = torch.from_numpy(self._logits.values(labelled.observation.numpy()))
             likely, action = torch.log_softmax(logits, dim=1), labelled.action.numpy()
             known = np.flatnonzero(action != UNKNOWN)

@@ -32,7 +32,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
-LAST_SEED = 2**31 - 1  # every generator, of the twin and of the libraries, takes as much
+LAST_SEED = 2**31 - 1  # the largest that all generators of the twin and of the libraries accept
 Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 
 
@@ -47,17 +47,17 @@ class NetworkConfig(Checked, frozen=True):
 
 class LossConfig(Checked, frozen=True):
     algorithm: str = "dqn"  # or your own, as module:name; docs/extending.md
-    discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # per step; must be that of the panel
+    discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # per step; must equal the panel's
     n_step: Count = 3  # steps of fresh rows' returns; the panel has its own
     double: bool = True
     huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
-    # Weight of the CQL term on rows from logs, while offline; online it falls to 0, linearly.
+    # Weight of the CQL term on logged rows while offline; online it falls linearly to 0.
     conservative: NonNegative = 0.1
     margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `teacher.policies`
 
 
 class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
-    """Copy the online network at every `every`-th update (arXiv:1312.5602)."""
+    """A target that copies the online network at every `every`-th update (arXiv:1312.5602)."""
 
     every: Annotated[int, Meta(ge=1)] = 1000
 
@@ -71,7 +71,7 @@ class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
 
 
 class Polyak(Checked, frozen=True, tag_field="rule", tag="polyak"):
-    """target += tau * (online - target), after every update (arXiv:1509.02971)."""
+    """A target that adds tau * (online - target) after every update (arXiv:1509.02971)."""
 
     tau: Annotated[float, Meta(gt=0, le=1)] = 0.005
 
@@ -88,7 +88,7 @@ TargetRule = Hard | Polyak
 
 
 def describe(rule: TargetRule) -> dict[str, Any]:
-    """Return the rule as the run's config states it."""
+    """Return the rule as `config.json` has it, with the target's mean age in updates."""
     return {**msgspec.to_builtins(rule), "effective_lag_updates": rule.effective_lag}
 
 
@@ -100,7 +100,7 @@ class ReplayConfig(Checked, frozen=True):
     batch_size: Count = 128
     logs_share: Share | None = None  # share of each online batch; None: the mixture's
     ring_capacity: int = 100_000  # fresh rows kept
-    ring_reserved: Share = 0.0  # share of it reserved for conditions, in equal parts
+    ring_reserved: Share = 0.0  # share of the ring reserved for conditions, in equal parts
 
     def check(self) -> None:
         if self.ring_capacity < self.batch_size:
@@ -121,22 +121,22 @@ class ScheduleConfig(Checked, frozen=True):
 class TeacherConfig(Checked, frozen=True):
     """The teacher, and how far the policy may deviate from its actions."""
 
-    # operator: the twin's; planner: navigation's proposal, from which the policy deviates where Q
-    # sees `margin` more; logs: rows of `policies` alone; none; or your own, as module:name.
-    # None: the operator where the task has a goal, else none.
+    # operator: of the twin; planner: what navigation proposes, unless Q of another action is larger
+    # by more than `margin`; logs: only cloned rows; none; or your own, as module:name.
+    # None: the operator if the task has a goal, else none.
     source: str | None = None
     margin: NonNegative = 0.2  # reward by which another action must be better than the planner's
     ratio: Share = 0.3  # plausible: G(a|s) >= ratio * max G
-    policies: tuple[str, ...] = ("operator",)  # whose logged rows are cloned, or have `loss.margin`
-    # And rows of other drivers' episodes that reached their goal without one of `policies`: before
-    # the first environment step, and for good where nobody is asked. None: where goals are logged
-    # and nobody is asked in the twin.
+    policies: tuple[str, ...] = ("operator",)  # drivers whose rows are cloned, or have loss.margin
+    # Also clone other drivers' episodes that reached their goal without one of `policies`: before
+    # the first environment step, and to the end if no teacher is queried in the twin.
+    # None: true if goals are logged and no teacher is queried in the twin.
     successes: bool | None = None
-    # Updates on those rows, before any of the critic's; None: as many as the critic's will be, and
-    # of more than 5,000 rows in proportion, up to ten times as many.
+    # Updates of the behaviour network on cloned rows, before the critic's first update. None:
+    # `schedule.offline_updates`, times the rows / 5,000 if there are more, at most ten times.
     offline_updates: NonNegativeInt | None = None
-    # It learns from each row's mirror image as often as from the row: of a teacher who keeps to no
-    # side. None: where the twin's operator is asked and each action has its opposite.
+    # Draw half of the behaviour network's rows as their mirror image: only for a teacher who keeps
+    # to no side. None: true if the twin's operator teaches and each action has its opposite.
     mirror: bool | None = None
 
     @property
@@ -146,7 +146,7 @@ class TeacherConfig(Checked, frozen=True):
 
     @property
     def asks(self) -> bool:
-        """Return whether somebody is asked in the twin."""
+        """Return whether a teacher is queried in the twin."""
         return self.source not in (None, "none", "logs", PLANNER)
 
     def check(self) -> None:
@@ -165,11 +165,11 @@ class EnvConfig(Checked, frozen=True):
     conditions: dict[str, NonNegative] = msgspec.field(
         default_factory=lambda: dict(DEFAULT_CONDITIONS)
     )
-    # A missions file, or its [[missions]]: that part of the episodes is of those; docs/train.md.
+    # A missions file, or its [[missions]], for `missions_share` of the episodes; docs/train.md.
     missions: str | tuple[MissionOrder, ...] | None = None
     missions_share: Share = 0.5
     layouts: str = "default"  # floors: generated:train, FILE.toml, map.yaml; docs/layouts.md
-    # A ready-made one's name, a TOML file, or its table; of a schedule, one drawn an episode.
+    # The name of a ready-made one, a TOML file, or its table; a schedule draws one per episode.
     perturbation: str | dict[str, Any] = "nominal"
 
     def check(self) -> None:
@@ -180,7 +180,7 @@ class EnvConfig(Checked, frozen=True):
 
 
 class PracticeConfig(Checked, frozen=True):
-    """Which missions the twin gives next: see `restock.train.feed.practice`."""
+    """The choice of the missions that the twin gives next: see `restock.train.feed.practice`."""
 
     rule: Literal["natural", "even", "success"] = "natural"
 
@@ -197,7 +197,7 @@ class RecordConfig(Checked, frozen=True):
     every_updates: Count = 500  # length of a logging interval
     audit_share: Share = 0.01  # share of batches whose rows are all recorded
     checkpoint_every_env_steps: Count = 40_000
-    trackers: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ("tensorboard",)  # of curves
+    trackers: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ("tensorboard",)  # get curves
 
 
 class TrainConfig(Checked, frozen=True):
@@ -230,7 +230,7 @@ class TrainConfig(Checked, frozen=True):
 
 
 def has_effect(config: TrainConfig, key: str) -> bool:
-    """Return whether the teacher of this config has the setting `teacher.<key>`."""
+    """Return whether `teacher.<key>` has an effect in this config."""
     if key == "policies" and config.loss.margin:
         return True
     source = config.teacher.source
@@ -238,7 +238,7 @@ def has_effect(config: TrainConfig, key: str) -> bool:
 
 
 def refuse_untaught(config: TrainConfig, *, within: str = "") -> None:
-    """Raise ConfigError where a setting of the teacher is given that its source does not have."""
+    """Raise ConfigError if a setting of the teacher is given that its source does not use."""
     source = config.teacher.source
     given = changed(config.teacher, source=source)
     if idle := [key for key in given if not has_effect(config, key)]:
@@ -254,7 +254,8 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     """Load a config from a TOML file (or the defaults), then apply `key.path=value` overrides.
 
     Raises:
-        ConfigError: no such file, no TOML, an unknown key or a value out of range; names the key.
+        ConfigError: the file is missing or not TOML, or a key is unknown or its value out of range;
+            names the key.
     """
     if path is None:
         return parse_config(apply_overrides({}, overrides), where="--set")
@@ -262,7 +263,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     applied = apply_overrides(document, overrides)
     try:
         return parse_config(applied, where=f"{path} and --set")
-    except ConfigError:  # wrong in one of the two, or in their combination
+    except ConfigError:  # name the file or --set alone, if it is wrong without the other
         parse_config(document, where=str(path))
         parse_config(apply_overrides({}, overrides), where="--set")
         raise
@@ -271,7 +272,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
 def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """Return a copy of plain values with `key.path=value` applied.
 
-    Values are TOML, or bare strings.
+    A value that is not TOML is taken as a string.
     """
     applied = copy.deepcopy(dict(document))
     for override in overrides:
@@ -280,7 +281,7 @@ def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> di
 
 
 def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Return nested settings as `key.path=value`, which `apply_overrides` takes."""
+    """Return nested settings as a list of `key.path=value` for `apply_overrides`."""
     overrides = []
     for key, value in document.items():
         # A target rule is one value: half of one and half of another is invalid.
@@ -303,7 +304,7 @@ def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
 
 
 def _refuse_other_rule(target: Any, where: str) -> None:
-    """Raise ConfigError where a setting of one target rule stands under the other."""
+    """Raise ConfigError if a setting of one target rule is given under the other."""
     if not isinstance(target, Mapping):
         return
     for key, rule, other in (("every", "hard", "polyak"), ("tau", "polyak", "hard")):

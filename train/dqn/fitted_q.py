@@ -1,8 +1,8 @@
-"""Fitted Q evaluation: the value of a policy, learnt from rows that other policies drove.
+"""Fitted Q evaluation: estimate the values of a policy from rows that other policies drove.
 
 Le, Voloshin and Yue 2019 (arXiv:1903.08738); the strongest of the direct methods in Voloshin et al.
-2019 (arXiv:1911.06854). Iteration k is a regression on r + gamma E_{a ~ policy} Q_{k-1}(s', a),
-from Q_0 = 0: after K of them Q is the value of the next K steps.
+2019 (arXiv:1911.06854). Iteration k fits Q_k to r + gamma E_{a ~ policy} Q_{k-1}(s', a), with
+Q_0 = 0, so Q_K is the value of the next K steps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from restock.arrays import F32
 from restock.train.dqn.behaviour import PolicyNetwork
 from restock.train.dqn.network import QNetwork, clone
 
-_PART = 8192  # rows
+_PART = 8192  # rows evaluated at a time
 
 
 @dataclass(frozen=True)
@@ -39,22 +39,22 @@ class Transitions:
 
 @dataclass(frozen=True)
 class FittedQConfig:
-    """How a model is fitted."""
+    """The settings of a fit."""
 
-    iterations: int = 240  # steps that it looks ahead: the warehouse task's time limit
-    updates: int = 25  # gradient steps an iteration
+    iterations: int = 240  # also the steps that it looks ahead: the warehouse task's time limit
+    updates: int = 25  # gradient steps per iteration
     batch_size: int = 256
     hidden: Sequence[int] = (128, 128)
     layer_norm: bool = True
     learning_rate: float = 1e-3  # falls to a tenth over the iterations
-    cloning_updates: int = 1500  # of the behaviour, where its probabilities are not logged
+    cloning_updates: int = 1500  # gradient steps of `cloned_behaviour`
 
 
 def soft_greedy(network: PolicyNetwork, observation: F32, epsilon: float) -> F32:
     """Return the probabilities (N, A) of the greedy policy that acts at random with `epsilon`.
 
-    A deterministic policy has none for any action but one, so an episode in which the logs did
-    anything else once says nothing about it.
+    A deterministic policy gives all other actions probability 0, so an episode in which the logs
+    took another action just once would have no weight.
     """
     q = values(network, observation)
     probability = np.full(q.shape, epsilon / q.shape[1], np.float32)
@@ -72,14 +72,14 @@ def fitted_q(
     seed: int = 0,
     between: Callable[[], None] = lambda: None,
 ) -> QNetwork:
-    """Fit the values of a policy.
+    """Fit the action values of a policy.
 
     Args:
         rows: the logged transitions.
-        next_probability: (N, A) the policy's, of each action in `next_observation`.
-        discount: of one step.
+        next_probability: (N, A) the policy's probability of each action in `next_observation`.
+        discount: per step.
         bounds: lower and upper bound of every value.
-        seed: of the network's beginning and of the batches.
+        seed: of the initial weights and of the batches.
         between: called before every update; what it raises ends the fit.
     """
     actions = next_probability.shape[1]
@@ -126,9 +126,9 @@ def cloned_behaviour(
     seed: int = 0,
     between: Callable[[], None] = lambda: None,
 ) -> QNetwork:
-    """Clone the behaviour: a network whose softmax is the probability of each logged action.
+    """Fit a network whose softmax is the probability with which the logs chose each action.
 
-    For logs that do not say with which probability they acted. Weights from it are estimates.
+    This is for logs without action probabilities; importance weights from it are estimates.
     `between` is called before every update; what it raises ends the fit.
     """
     generator = torch.Generator().manual_seed(seed)

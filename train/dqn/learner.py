@@ -2,7 +2,7 @@
 
 Two clocks run in DQN: the online network moves at every update, the target network by its own
 rule. The rule decides how old the values are that the critic learns from, so it is a typed value
-that the config, metrics and checkpoints of a run all carry.
+that is in the config, metrics and checkpoints of a run.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Terms:
 
     weight: Tensor | None  # (B,) importance weights; None: ones
     logged: int  # how many of the first rows the terms below apply to
-    conservative: float | Tensor  # weight of the CQL term, or that of each such row (logged,)
+    conservative: float | Tensor  # weight of the CQL term, or one per such row (logged,)
     expert: Tensor | None  # (logged,) bool
 
 
@@ -79,8 +79,8 @@ class Learner(Stateful):
         """Build the networks.
 
         Args:
-            path: None takes the fastest allowed; paths agree up to rounding.
-            proposal: of the task, where navigation's is the teacher.
+            path: None chooses the fastest allowed; paths agree up to rounding.
+            proposal: how the task's observations show navigation's proposal, if that teaches.
         """
         self.device = open_device(config.device)
         self.algorithm = make_algorithm(config.loss)
@@ -98,7 +98,7 @@ class Learner(Stateful):
         self._slow = FlatParameters(self.target_network, learns=False).values
         self.target = TargetUpdate(config.target, [self.optimizer.values], [self._slow])
         learns = self.optimizer
-        # What the loss is computed with: the networks, or kernels that do the same.
+        # The networks that the loss is computed with, or kernels in their place.
         self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
         self._target = differentiable(self.path, self.target_network, self._slow)
         self._has_kernels = type(self.algorithm) is DQN and type(self._online) is Kernel
@@ -143,15 +143,15 @@ class Learner(Stateful):
             weight: (B,) importance weights, or None for ones.
             logged: how many of the first rows are from logs; the conservative term sees only those.
             conservative: the weight of that term.
-            expert: (logged,) bool, whether the margin term applies, or None: to none.
-            labelled: what the behaviour network learns from, where there is one.
+            expert: (logged,) bool, whether the margin term applies; None: to no row.
+            labelled: a batch for the behaviour network, if there is one.
         """
         terms = Terms(weight, logged, conservative if logged else 0.0, expert)
         is_plain = terms.conservative == 0 and terms.expert is None
         fill = self._fill_by_kernels if is_plain and self._has_kernels else self._fill_gradient
         loss = fill(rows, terms)
         self.gradient_steps += 1
-        # `policy_network`, the one that is evaluated and kept, follows as an average of weights.
+        # `policy_network`, which is evaluated and kept, follows as an average of weights.
         self.optimizer.step(self._policy, averaging_rate(self.gradient_steps))
         if self.behaviour is not None and labelled is not None:
             self.behaviour.learn(labelled)
@@ -167,8 +167,8 @@ class Learner(Stateful):
     ) -> Loss:
         """Make an update by operations on the device alone, which a CUDA graph can repeat.
 
-        With the target's, where that follows at every update. Rates () are of the averages. The
-        counts are the caller's to keep, by `count`.
+        A Polyak target is moved, too. `rate` and `behaviour_rate`, (), are those of the averages of
+        weights. The caller counts the update by `count`.
         """
         loss = self._fill_gradient(rows, terms)
         self.optimizer.move(self._policy, rate)
@@ -201,7 +201,7 @@ class Learner(Stateful):
         return Loss(loss.value.detach(), loss.td, loss.q)
 
     def _fill_by_kernels(self, rows: Tensor, terms: Terms) -> Loss:
-        """Do the same for DQN without terms on logged rows: same bits, fewer small operations."""
+        """Do as `_fill_gradient`, for DQN without terms on logged rows: same bits, fewer calls."""
         parts = self._online, self._target, self.algorithm
         online, target, algorithm = cast("tuple[Kernel, Kernel, DQN]", parts)
         packed, count, size = rows.numpy(), len(rows), self.network.observation_size
@@ -238,7 +238,7 @@ class Learner(Stateful):
 
     @property
     def is_finite(self) -> bool:
-        """Return whether every parameter is finite; a gradient that is not makes them so, too."""
+        """Return whether all parameters are finite; a gradient that is not finite spoils them."""
         of_values = [self.optimizer.values]
         if self.behaviour is not None:
             of_values.append(self.behaviour.optimizer.values)
@@ -248,7 +248,7 @@ class Learner(Stateful):
     def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Return Q(s, a) - y (B,), Q(s) (B, A) and Q_target(s) (B, A) of rows, without learning.
 
-        `online` lets the online network bootstrap y, as if the target's clock did not lag.
+        With `online`, the online network bootstraps y, as if the target did not lag.
         """
         batch = self._batch(rows, Terms(None, 0, 0.0, None))
         slow = self.network if online else self.target_network
@@ -261,7 +261,7 @@ class Learner(Stateful):
 
 
 class TargetUpdate(Stateful):
-    """A rule applied to the parameters of a pair of networks, in the same order."""
+    """A target rule, applied to the parameters of two networks given in the same order."""
 
     STATE: ClassVar[tuple[str, ...]] = ("last_sync",)
 
@@ -279,9 +279,9 @@ class TargetUpdate(Stateful):
 
     @torch.no_grad()
     def after(self, gradient_step: int) -> bool:
-        """Call after update number `gradient_step` (from 1); returns whether the target moved.
+        """Move the target after update number `gradient_step` (from 1) if due; return whether.
 
-        It does not again for an update that it has followed, as in `Learner.move`.
+        Do nothing if the target has already moved for this update, as in `Learner.move`.
         """
         if gradient_step == self.last_sync or not self.is_due(gradient_step):
             return False
@@ -291,7 +291,7 @@ class TargetUpdate(Stateful):
 
     @torch.no_grad()
     def pull(self) -> None:
-        """Move the target as the rule does when it is due."""
+        """Move the target by its rule, whether it is due or not."""
         for slow, fast in zip(self._target, self._online, strict=True):
             if isinstance(self.rule, Polyak):
                 slow.lerp_(fast, self.rule.tau)
@@ -338,7 +338,7 @@ def open_device(name: str) -> torch.device:
     """Return the device.
 
     Raises:
-        ConfigError: `cuda` where this PyTorch sees none.
+        ConfigError: `cuda` is given, but PyTorch finds no CUDA device.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError(

@@ -1,13 +1,14 @@
-"""The Q network, how it is differentiated, and Adam over its parameters in one flat vector.
+"""The Q network, its gradient, and Adam over its parameters in one flat vector.
 
-Adam's step, the target's pull and the average of weights are each one operation over one tensor.
+The network is an MLP with LayerNorm, which bounds how far values can extrapolate away from the
+data. That keeps off-policy learning on logs and fresh experience together stable (RLPD,
+arXiv:2302.02948).
 
-A LayerNorm MLP. LayerNorm bounds how far values can extrapolate away from the data, which is what
-keeps off-policy learning on logs and fresh experience together stable (RLPD, arXiv:2302.02948).
+Adam's step, the target's update and the average of weights are one operation on one tensor each.
 
-Compiled code may make a plain network's forward and backward pass for PyTorch's autograd. That
-kernel knows no loss: it gives action values, and takes their gradient. `restock.native` says
-whether there is one.
+If compiled code is available (`restock.native`), a kernel makes the forward and backward pass of a
+plain network for PyTorch's autograd. It returns action values and takes their gradient, so it
+depends on no loss.
 """
 
 from __future__ import annotations
@@ -71,10 +72,10 @@ class QNetwork(nn.Module):
 
 
 class Ensemble(nn.Module):
-    """The networks of several runs; the mean of their values acts.
+    """The networks of several runs, as one network that returns the mean of their values.
 
-    Their errors differ, as the runs explored by themselves, and an action that one of them
-    overestimates is rarely overestimated by all (arXiv:1611.01929).
+    Each run explored by itself, so their errors differ: an action that one of them overestimates is
+    rarely overestimated by all (arXiv:1611.01929).
     """
 
     def __init__(self, members: Sequence[nn.Module]) -> None:
@@ -90,12 +91,12 @@ class Ensemble(nn.Module):
 
 
 def members_of(network: nn.Module) -> list[Any]:
-    """Return the networks of an ensemble; of any other network, itself."""
+    """Return the networks of an ensemble, or a list of the network itself."""
     return list(network.members) if isinstance(network, Ensemble) else [network]
 
 
 def clone(network: N) -> N:
-    """Return a copy that takes no gradients: the target network."""
+    """Return a copy without gradients, such as a target network."""
     import copy
 
     copied = copy.deepcopy(network)
@@ -108,7 +109,7 @@ def clone(network: N) -> N:
 def torch_threads(number: int) -> Iterator[None]:
     """Set the number of torch's CPU threads while the block runs.
 
-    Networks of this size are slower on several, much slower if other processes use the cores.
+    Networks of this size are slower on several, and much slower if other processes use the cores.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(number)
@@ -122,7 +123,7 @@ UpdatePath = Literal["native", "autograd"]
 
 
 class Differentiable(Protocol):
-    """A learning network, or a kernel that computes the same."""
+    """A network, or a kernel that computes the same values and gradients."""
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return action values (B, A) of observations (B, D)."""
@@ -134,7 +135,7 @@ class Differentiable(Protocol):
 
 
 def update_path(device: str, threads: int = 1) -> UpdatePath:
-    """Return how a run's networks are differentiated; `config.json` keeps it as `update_path`.
+    """Return how the gradients of a run are computed; `config.json` has it as `update_path`.
 
     The kernel computes on one thread of the CPU. A run with more threads or on another device uses
     PyTorch's operations, as does a network that is not a plain `QNetwork`.
@@ -146,11 +147,11 @@ def update_path(device: str, threads: int = 1) -> UpdatePath:
 def differentiable(
     path: UpdatePath, network: nn.Module, values: Tensor, gradient: Tensor | None = None
 ) -> Differentiable:
-    """Return what the loss is computed with: a kernel, or the network itself.
+    """Return a kernel of the network, or the network itself, to compute the loss with.
 
     Args:
-        path: which of both is wanted; only a plain `QNetwork` has a kernel.
-        network: its parameters are in `values`, by `FlatParameters`.
+        path: "native" for a kernel; only a plain `QNetwork` has one.
+        network: a network whose parameters `FlatParameters` moved into `values`.
         values: all parameters.
         gradient: their gradients; None if the network does not learn.
     """
@@ -160,16 +161,16 @@ def differentiable(
 
 
 class Kernel:
-    """A plain `QNetwork` on flat parameters: observations (B, D) to action values (B, A).
+    """A compiled plain `QNetwork`, from observations (B, D) to action values (B, A).
 
     Gradients are added up until `zero_grad`, as autograd does. One thread at a time may use it;
     while it computes, other threads run.
 
     Args:
-        network: float32, on the CPU, its parameters in `values` by `FlatParameters`.
+        network: float32 on the CPU, its parameters moved into `values` by `FlatParameters`.
         values: all parameters.
-        gradient: where their gradients go; None if it does not learn.
-        wide: whether AVX-512 may be used: the result is the same.
+        gradient: receives their gradients; None if the network does not learn.
+        wide: whether AVX-512 may be used; the result is the same.
     """
 
     def __init__(
@@ -196,9 +197,9 @@ class Kernel:
         )
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Return action values (B, A); those of a network that learns are a leaf of the graph.
+        """Return action values (B, A), as a leaf of autograd's graph if the network learns.
 
-        Their gradient goes through the kernel as soon as autograd has all of it.
+        The kernel's backward pass runs as soon as autograd has accumulated the leaf's gradient.
         """
         values = torch.from_numpy(self.values(observation.numpy()))
         if self._gradient is not None and torch.is_grad_enabled():
@@ -209,7 +210,7 @@ class Kernel:
         return values
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Let the next backward pass overwrite the gradient instead of adding to it."""
+        """Make the next backward pass overwrite the gradient instead of adding to it."""
         self._adds = False
 
     def values(self, *observation: F32) -> F32:
@@ -220,13 +221,13 @@ class Kernel:
         return out
 
     def descend(self, gradient: F32) -> None:
-        """Fill the parameters' gradient from that of the last pass's first values (B, A)."""
+        """Compute the parameters' gradient from that of the last pass's first values (B, A)."""
         self._network.backward(gradient)
 
     def _backward(self, observation: Tensor, made_by: int, gradient: Tensor | None) -> None:
         assert self._gradient is not None
         assert gradient is not None
-        if made_by != self._passes:  # another pass has overwritten what this one left
+        if made_by != self._passes:  # a later pass has overwritten this one's activations
             self.values(observation.numpy())
         earlier = self._gradient.clone() if self._adds else None
         self.descend(gradient.contiguous().numpy())
@@ -236,14 +237,14 @@ class Kernel:
 
 
 _ALIGNMENT = 16  # elements: every parameter begins on a cache line, as its own tensor would
-_SLICE = 4096  # elements that a GPU moves at a time: of one tensor, two blocks would move all
+_SLICE = 4096  # elements per tensor of Adam on a GPU: one large tensor would occupy two blocks
 
 
 class FlatParameters:
     """The parameters of `network`, moved into `values`; their gradients are views of `gradient`.
 
-    `load_state_dict` and in-place writes go through the views. Whatever replaces a parameter's
-    `.data` (`Module.to`) must come before.
+    `load_state_dict` and in-place writes go through the views. Replacing a parameter's `.data`, as
+    `Module.to` does, breaks them: do it before.
 
     Args:
         network: whose parameters are moved.
@@ -268,14 +269,14 @@ class FlatParameters:
                 parameter.grad = view
 
     def views(self, flat: Tensor) -> list[Tensor]:
-        """Return views of a tensor as long as `values`, one a parameter, in the network's order."""
+        """Return views of a tensor as long as `values`: one per parameter, in network order."""
         return [
             flat[offset : offset + shape.numel()].view(shape)
             for offset, shape in zip(self._offsets, self._shapes, strict=True)
         ]
 
     def flat_of(self, pieces: list[Tensor]) -> Tensor:
-        """Return the inverse of `views`: a new tensor, 0 between parameters."""
+        """Return a new flat tensor whose `views` are these pieces, with 0 between them."""
         flat = torch.zeros_like(self.values)
         for view, piece in zip(self.views(flat), pieces, strict=True):
             view.copy_(piece)
@@ -292,9 +293,9 @@ AVERAGING = 0.001  # rate of the average of weights that is evaluated and kept
 def averaging_rate(steps: int) -> float:
     """Return the rate of an average of weights at step number `steps` (from 1).
 
-    The greedy policy of a single update is noisy: a small change of values turns over many
-    actions at once. The average over the last 1 / AVERAGING updates is not (Polyak and Juditsky
-    1992). Until there are as many, it is the mean of all of them.
+    The greedy policy of a single update is noisy: a small change of values changes many actions at
+    once. The average over about the last 1 / AVERAGING updates is not (Polyak and Juditsky 1992).
+    While there are fewer updates, it is the mean of all of them.
     """
     return max(AVERAGING, 1.0 / steps)
 
@@ -302,13 +303,13 @@ def averaging_rate(steps: int) -> float:
 class FlatAdam(Stateful):
     """Adam on all parameters of `network` as one tensor.
 
-    By the function behind `torch.optim.Adam(fused=True)`, to the same bits: with one tensor a fifth
-    of the class's step goes into hooks, groups and schedules, of which there are none here.
+    It calls the function behind `torch.optim.Adam(fused=True)` and gives the same bits. The class
+    itself would spend a fifth of each step on hooks, groups and schedules, which are unused here.
 
     Args:
-        network: whose parameters are moved into `values`, their gradients into `gradient`.
+        network: its parameters are moved into `values`, their gradients into `gradient`.
         learning_rate: Adam's.
-        compiled: by the compiled step, to the same bits: one pass over memory, the average's too.
+        compiled: use the compiled step: the same bits in one pass over memory, average included.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("moments",)
@@ -323,9 +324,9 @@ class FlatAdam(Stateful):
         self._flat = FlatParameters(network, learns=True)
         self.values, self.gradient = self._flat.values, self._flat.gradient
         self.learning_rate, self._compiled = learning_rate, compiled
-        # Written in place from here on: a CUDA graph keeps hold of them.
+        # Only written in place from here on, because a CUDA graph refers to these tensors.
         self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
-        # What `adam` moves, and counts in tensors: all as one, and on a GPU in slices.
+        # The arguments of `adam`, which counts steps per tensor: one on the CPU, slices on a GPU.
         device = self.values.device
         size = len(self.values) if device.type == "cpu" else _SLICE
         whole = (self.values, self.gradient, *self._moments)
@@ -338,7 +339,7 @@ class FlatAdam(Stateful):
 
     @torch.no_grad()
     def step(self, average: Tensor | None = None, rate: float = 0.0) -> None:
-        """Move the parameters by the gradient that they have; then `average` to them, by `rate`."""
+        """Update the parameters by their gradient, then move `average` towards them by `rate`."""
         self.count(1)
         if not self._compiled:
             self.move(average, rate)
@@ -356,7 +357,7 @@ class FlatAdam(Stateful):
 
     @torch.no_grad()
     def move(self, average: Tensor | None, rate: float | Tensor) -> None:
-        """Step by operations on the device alone, which a CUDA graph can repeat."""
+        """Make a step by operations on the device alone, which a CUDA graph can repeat."""
         values, gradient, moved, squares = self._moved
         adam(
             *(values, gradient, moved, squares, [], list(self._step.unbind())),
