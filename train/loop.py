@@ -513,7 +513,7 @@ def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, 
     if bad_rows.any():
         _stop_not_finite(session, what, bad_rows, "hold values that are not finite", LEAVE_OUT)
     if bad.all():
-        why = "have such TD errors, after an update that left no parameter whole"
+        why = "have such TD errors, after an update that made the parameters NaN or infinite"
         _stop_not_finite(session, what, bad, why, TRAIN_SLOWER, before=True)
     _stop_not_finite(session, what, bad, "have such TD errors, or the largest", TRAIN_SLOWER)
 

@@ -1,7 +1,7 @@
 """Record what the critic was fed: exact sums over all batches, and all rows of a seeded sample.
 
 A batch's rows, strata, TD errors and values are kept as they are sampled (no statistics inside the
-update loop) and summed once an interval. The sums go to the run's tables `fed`, `strata`,
+update loop) and summed once per interval. The sums go to the run's tables `fed`, `strata`,
 `conditions`, `actions`, `ages`, `sampled_episodes` and `policies`; the rows of audited batches to
 `audit`. Fresh rows are written once their episodes have ended, when their conditions are known.
 
@@ -9,8 +9,8 @@ Numbers that are not finite end a run with an error that names the rows of the b
 gradient that is NaN or infinite makes every value NaN within an update. `restock.train.loop` checks
 the loss of every update, which costs nothing because it is summed anyway. A gradient that is not
 finite under a finite loss shows in the parameters: they are checked before an interval is closed, a
-policy is evaluated and a checkpoint is written. Another library's loop is its own: there the rows
-and TD errors that its buffer sees are checked.
+policy is evaluated and a checkpoint is written. In the training loop of another library, the rows
+and TD errors of its replay buffer are checked.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-# Fresh rows; beyond that, the oldest interval is written without waiting for labels.
+# Fresh rows held at most; beyond that, the oldest interval is written without all its labels.
 _MAX_HELD = 1 << 21
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
@@ -65,12 +65,12 @@ class FeedRecord(Stateful):
     """The record of a run's batches.
 
     Args:
-        audit_share: of all batches, chosen by `seed`.
-        actions: names of the task's; without them there are no rows in `actions`.
+        audit_share: share of batches that are audited, chosen by `seed`.
+        actions: names of the task's actions; None: the table `actions` gets no rows.
         greedy: returns the policy's action (B,) for observations (B, D) of audited batches.
-        labels: of the ring's episodes as they end; None: there are none, and no row waits.
+        labels: of the ring's episodes as they end; None: rows are never labelled nor held back.
         perturbations: in force in the ring's episodes, if they are known.
-        quotas: decides the shares of a batch; None: there are no quotas, and `fed` has no rows.
+        quotas: decides the shares of a batch; None: there are no quotas, and `fed` gets no rows.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -111,21 +111,21 @@ class FeedRecord(Stateful):
         self._age_days = (
             np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None
         )
-        # Rows since the run began, by stratum: (S,) of each source.
+        # Rows drawn since the run began, by stratum (S,), for each source.
         sizes = {"logs": 0 if logs is None else len(logs.strata), "fresh": len(ring.strata) + 1}
         self._total = {name: np.zeros(size, np.int64) for name, size in sizes.items()}
         self._logged, self._fresh = SampledRows(LOGGED), SampledRows(FRESH)
-        # Of audited batches in the open interval: logged rows, and columns of the fresh ones.
+        # Audited batches of the open interval: their logged rows, and columns of the fresh ones.
         self._greedy = SampledRows(GREEDY)
         self._audits: list[dict[str, Any]] = []
         self._held: list[HeldInterval] = []  # closed intervals, the oldest first
-        # Of batches with logged rows in the open interval: the sum (S,) of the shares in force.
+        # Sum (S,) of the shares in force, over the open interval's batches with logged rows.
         self._quota = np.zeros(sizes["logs"])
         self._quota_batches = 0
-        # Of all batches in it: the sum (S,) of the quotas of the batch.
+        # Sum (S,) of the quotas, over all batches of the open interval.
         self._wanted = np.zeros(0 if quotas is None else len(quotas.wanted))
         self._batches = 0
-        # Of the last two batches: rows of the panel, the ring's episodes, and their steps.
+        # The last batch and the one before: rows of the panel, the ring's episodes, their steps.
         none: NDArray[np.int64] = np.empty(0, np.int64)
         self._last: tuple[NDArray[np.int64], ...] = (none, none, none)
         self._before: tuple[NDArray[np.int64], ...] = self._last
@@ -142,9 +142,9 @@ class FeedRecord(Stateful):
     ) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
 
-        Inside the update loop: only what will not be there any more when the interval is closed.
-        `last_sync` is the update after which the target last moved; None: nobody tells.
-        `tail` (B, 3) is the rows' action, reward and discount, where whoever learnt has them.
+        This is inside the update loop, so it keeps only what is gone when the interval is closed.
+        `last_sync` is the update after which the target last moved; None if unknown. `tail` (B, 3)
+        is the rows' action, reward and discount; None: they are read from the batch.
         """
         last = batch.rows if tail is None else tail
         values = BatchValues(
@@ -180,7 +180,7 @@ class FeedRecord(Stateful):
         return row_ids(self.logs, *(self._before if before else self._last))
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
-        """Close an interval, write its known rows, and return its means for `progress`."""
+        """Close an interval, write the rows whose labels are known, and return `progress` means."""
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
         logged, fresh = self._logged.columns, self._fresh.columns
         drawn = len(self._logged) + len(self._fresh)
@@ -211,13 +211,13 @@ class FeedRecord(Stateful):
         return means
 
     def write_held(self) -> None:
-        """Write what waits for its episodes' end as it is: the run ends, or is left."""
+        """Write the held intervals, whether all their rows are labelled or not."""
         for interval in self._held:
             self._write_fresh(interval)
         self._held = []
 
     def restored(self) -> None:
-        """Return the waiting intervals from a checkpoint's values."""
+        """Rebuild the held intervals from a checkpoint's values."""
         held: Sequence[Any] = self._held
         self._held = [HeldInterval(**interval) for interval in held]
 
@@ -244,11 +244,7 @@ class FeedRecord(Stateful):
         return np.bincount(_told(stratum, size), minlength=size + 1)
 
     def _quotas_met(self) -> dict[str, NDArray[Any]] | None:
-        """Return the open interval's quotas by stratum, (S,).
-
-        That is the quota of the batches, how often the logs have it, the logged rows drawn, and why
-        it is short if it is.
-        """
+        """Return the open interval's `quotas` for `sampled_rows.fed`; None without quotas."""
         quotas = self.quotas
         if quotas is None or not self._batches:
             return None
@@ -406,7 +402,7 @@ class FeedRecord(Stateful):
 
 
 def _told(code: NDArray[Any], kinds: int) -> Ints:
-    """Return codes (n,) of `kinds` names, with one more code for rows that have none."""
+    """Return codes (n,) of `kinds` names, with `kinds` in place of negative codes (no name)."""
     return np.where(code < 0, kinds, code).astype(np.int64)
 
 
@@ -454,7 +450,7 @@ def check_fed(
         steps: `env_steps` and `gradient_steps` so far.
 
     Raises:
-        NotFinite: one of them is not finite; names the rows.
+        NotFinite: a row or a TD error is not finite; names the rows.
     """
     bad_rows: Bools = np.logical_not(np.isfinite(packed).all(axis=1))
     bad_td: Bools = np.zeros(len(packed), np.bool_)
@@ -467,7 +463,7 @@ def check_fed(
         what = "the loss is not finite"
         why = "have such TD errors"
         if bad_td.all():
-            why += ", after an update that left no parameter whole"
+            why += ", after an update that made the parameters NaN or infinite"
         refuse(what, bad_td, why, TRAIN_SLOWER, rows(), run, steps)
 
 
@@ -481,7 +477,7 @@ def refuse(
     steps: Mapping[str, int],
     rows_before: Sequence[dict[str, Any]] = (),
 ) -> NoReturn:
-    """Write the rows into the run, if there is one, and raise."""
+    """Write the rows to `not_finite.json` in the run, if there is a run, and raise NotFinite."""
     named = [row for row, is_bad in zip(rows, bad, strict=True) if is_bad]
     message = f"{what} at update {steps['gradient_steps']}"
     if named:

@@ -5,8 +5,8 @@ from two sources that share one packed row layout, by one gather each. The share
 (`restock.replay.mixture.share_controller`) decides the share of each stratum, and how much of it
 is logged.
 
-The gather: `torch.index_select` copies one row after the other and waits for the memory of each.
-The compiled gather (`restock.native`) asks for rows well ahead of the one that it copies.
+`torch.index_select` copies one row after the other and waits for the memory of each. The compiled
+gather (`restock.native`) prefetches rows well ahead of the one that it copies.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, _NO_SHARES)
 class ReplayBatch:
     """One batch: the logged rows first, then the fresh ones."""
 
-    gather: Callable[[], Tensor]  # its rows, while the ring holds them
+    gather: Callable[[], Tensor]  # returns its rows, while the ring holds them
     weight: Tensor | None  # (B,) float32
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
     slots: Ints = field(default_factory=lambda: _NO_ROWS)  # (B - L,) slots of the ring
-    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) in force, of the logs
-    wanted: F64 = field(default_factory=lambda: np.empty(0))  # (S,) quotas, of the batch
+    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) shares of the logged rows
+    wanted: F64 = field(default_factory=lambda: np.empty(0))  # (S,) quotas of the whole batch
 
     @property
     def logged(self) -> int:
@@ -65,11 +65,11 @@ class Batches(Stateful):
     Without logs every batch is fresh. Each source has its own generator, seeded from `seed`.
 
     Args:
-        logs_share: of an online batch; None leaves it to the mixture of the logs' panel.
-        fresh: (S,) which strata the ring's rows can be in; None: it is drawn from as it is.
+        logs_share: share of an online batch; None: as the mixture of the logs' panel.
+        fresh: (S,) which strata the ring's rows can be in; None: its rows are drawn uniformly.
 
     Raises:
-        MixtureError: the panel's rows cannot bear what the run will draw, where that is refused.
+        MixtureError: the panel has too few rows for the run's draws, and its mixture refuses that.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -92,8 +92,8 @@ class Batches(Stateful):
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._draws: LoggedSampler | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
-        # Logged rows of an online batch and the rounding carried over; quotas of the fresh ones,
-        # the last for rows of any kind.
+        # Logged rows of an online batch, the rounding error carried over to the next, and the share
+        # that they were computed from. The last quota of fresh rows is for rows of any stratum.
         self._logged, self._owed, self._taken_over = 0, 0.0, 0.0
         strata = 0 if fresh is None else len(fresh)
         self._fresh_quotas = Quotas(np.append(np.zeros(strata), 1.0), batch_size)
@@ -121,7 +121,7 @@ class Batches(Stateful):
         """Draw a batch from logs alone.
 
         Raises:
-            MixtureError: every row was drawn as often as it may be.
+            MixtureError: every row has reached its limit of draws.
         """
         if self._draws is None:
             raise RuntimeError("there are no logs to sample from")
@@ -149,13 +149,13 @@ class Batches(Stateful):
         return self._gather(drawn, slots)
 
     def replan(self, planned: PlannedDraws) -> None:
-        """Plan the shares for other draws than before."""
+        """Plan the shares again, for another number of draws."""
         if self._draws is not None:
             self._draws.replan(planned)
             self._share_out()
 
     def _share_out(self) -> None:
-        """Take over the controller's shares of logged and fresh rows."""
+        """Set the numbers of logged and fresh rows by the controller's shares."""
         controller = self.controller
         if controller is None:
             return
@@ -225,10 +225,10 @@ class LogTerms:
 
     @classmethod
     def of(cls, config: TrainConfig, logs: Logs | None, device: torch.device) -> LogTerms:
-        """Make the terms of the loss on these logs.
+        """Make the masks that the loss needs on these logs.
 
         Raises:
-            ConfigError: it names a behaviour policy that they do not have, or there are no logs.
+            ConfigError: the margin applies to a policy that the logs do not have, or to no logs.
         """
         if logs is None:
             _refuse_without_logs(config.loss)
@@ -239,7 +239,7 @@ class LogTerms:
         return cls(torch.from_numpy(expert).to(device))
 
     def expert_rows(self, log_rows: Ints) -> Tensor | None:
-        """Return `expert` of some rows of the panel."""
+        """Return `expert` of these rows (L,) of the panel."""
         if self.expert is None:
             return None
         return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
@@ -248,7 +248,7 @@ class LogTerms:
 def drawn_ahead(
     draw: Callable[[], ReplayBatch], count: int
 ) -> tuple[list[ReplayBatch], MixtureError | None]:
-    """Draw batches; return them, and the error that ended them early, if any."""
+    """Draw `count` batches; return them, and the error that ended the draws early, if any."""
     batches: list[ReplayBatch] = []
     for _ in range(count):
         try:
@@ -259,7 +259,7 @@ def drawn_ahead(
 
 
 def check_terms(config: TrainConfig, panel: Panel | None) -> None:
-    """Refuse what `LogTerms.of` would, from the panel's columns alone."""
+    """Raise the errors of `LogTerms.of`, but read only columns of the panel."""
     if panel is None:
         _refuse_without_logs(config.loss)
     elif config.loss.margin:

@@ -1,7 +1,7 @@
 """Collect the twin's steps into the fresh ring, and label the episodes that ended.
 
-Finished episodes are labelled by the very conditions that label logs, over the same signals,
-several episodes per query.
+Finished episodes are labelled by the same conditions as logs, over the same signals, several
+episodes per query.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from restock.train.feed.teacher import AskedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
-_EPISODES_PER_QUERY = 32  # planning one takes as long as labelling a thousand of their steps
-_NO_VALUES = ("{}",)  # of a twin that has only a name for them
+_EPISODES_PER_QUERY = 32  # planning a query takes as long as labelling a thousand steps
+_NO_VALUES = ("{}",)  # for a twin that reports a perturbation only by name
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,16 @@ class EndedEpisode:
     bumps: int
     steps: int
     signals: Signals  # (steps + 1,) each
-    perturbation_values: str = "{}"  # JSON: those that are not nominal
+    perturbation_values: str = "{}"  # JSON of the values that are not nominal
     layout: str = DEFAULT
-    arm: int = -1  # of the twin's `mission_arms`; -1: none was chosen
+    arm: int = -1  # index into the twin's `mission_arms`; -1: none was chosen
 
 
 class Collector(Stateful):
     """A collector that steps the twin and keeps the signals that labels need.
 
-    `start` sends the actions off (to a thread, with an executor), `finish` takes the result in;
-    between them the learner may learn from what the ring held before.
+    `start` begins a step, in a thread if there is an executor, and `finish` adds its result to the
+    ring. In between, the learner may learn from the rows that the ring already has.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -98,7 +98,7 @@ class Collector(Stateful):
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
         self.strata = strata  # of the ring's rows; None: their conditions
-        self.goal = task.goal != "none"  # else success is not defined
+        self.goal = task.goal != "none"  # whether success is defined
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
         self._executor = executor
@@ -113,14 +113,14 @@ class Collector(Stateful):
         self._bumps = np.zeros(count, np.int64)
         self._touching = np.zeros(count, np.bool_)
         self._unlabelled: list[EndedEpisode] = []
-        self.invalid_steps = 0  # whose physics blew up
+        self.invalid_steps = 0  # steps whose physics diverged
         self.observation: NDArray[np.float32] = np.zeros(0, np.float32)
         self._sent: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
         self._future: Future[Any] | None = None
         self._result: Any = None
-        self._label: Label | int = UNKNOWN  # what the teacher would have done in the step
+        self._label: Label | int = UNKNOWN  # the teacher's actions in the current step
         self.perturbations = FreshPerturbations()
-        self.labels = EpisodeLabels()  # of the episodes that ended, until the record takes them
+        self.labels = EpisodeLabels()  # of ended episodes, until the record has used them
 
     def check_conditions(self) -> None:
         """Raise ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
@@ -131,7 +131,7 @@ class Collector(Stateful):
         label(pa.table(columns), self.conditions)
 
     def reset(self, seed: int) -> None:
-        """Reset the twin; return the first observations (N, D)."""
+        """Reset the twin, and keep its first observations (N, D)."""
         self.observation, _ = self.env.reset(seed=seed)
 
     @property
@@ -144,15 +144,15 @@ class Collector(Stateful):
         action: NDArray[np.int64],
         probability: NDArray[np.float32],
     ) -> Any:
-        """Send one action per environment, (N,), each drawn with its `probability` (N,).
+        """Begin a step with one action per environment, (N,), each drawn with `probability` (N,).
 
-        Returns what the step returned, which `finish` takes in; None where a thread makes it.
+        Returns the result of the step, or None if a thread makes it; `finish` adds it to the ring.
         """
         envs = np.arange(self.env.num_envs)
         now = self.env.signals
         for name, history in self._history.items():
             history[envs, self._steps] = now[name]
-        # The command in force over the step that begins, as a log has it.
+        # The command in force during the step that begins, as in a log.
         self._history["command_speed_mps"][envs, self._steps] = self._actions[action, 0]
         self._history["command_yaw_rate_radps"][envs, self._steps] = self._actions[action, 1]
         if self._executor is not None:
@@ -170,7 +170,7 @@ class Collector(Stateful):
     def finish(
         self, *, env_steps: int, gradient_steps: int, acting_step: int
     ) -> list[EndedEpisode]:
-        """Take the step's result into the ring.
+        """Add the result of the step to the ring.
 
         Args:
             env_steps: of the run before this step.
@@ -181,7 +181,7 @@ class Collector(Stateful):
         """
         if self._sent is None:
             raise RuntimeError("finish() without start()")
-        # Before the result: if the teacher failed, no step was made, and none is under way.
+        # Cleared before the result is read: if the teacher failed, no step was made.
         (action, probability), self._sent = self._sent, None
         future, self._future = self._future, None
         result, self._result = future.result() if future is not None else self._result, None
@@ -211,7 +211,7 @@ class Collector(Stateful):
         self._steps += 1
         self._return += reward
         self._bumps += bumped & ~self._touching
-        self._touching = bumped.copy()  # the step's own array is another reader's too
+        self._touching = bumped.copy()  # others read the step's own array, too
         values = info.get("perturbation_values", _NO_VALUES * self.env.num_envs)
         self.perturbations.note(keys, info["perturbation"], values)
         finished = []
@@ -260,14 +260,14 @@ class Collector(Stateful):
             self.invalid_steps += 1
 
     def forget(self, episodes: Sequence[EndedEpisode]) -> None:
-        """Mark ended episodes as never labelled: their rows belong to no condition."""
+        """Mark ended episodes as never labelled: their rows get no condition."""
         keys = {episode.key for episode in episodes}
         for key in sorted(keys):
             self.labels.give_up(key)
         self._unlabelled = [episode for episode in self._unlabelled if episode.key not in keys]
 
     def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
-        """Label the ended episodes once enough wait; return rows for the run's `episodes`."""
+        """Label the ended episodes once enough wait; return rows for the run's table `episodes`."""
         waiting = self._unlabelled
         if not waiting or (len(waiting) < _EPISODES_PER_QUERY and not all_of_them):
             return []
@@ -280,7 +280,7 @@ class Collector(Stateful):
         codes = np.array([self._codes[name] for name in names] or [], np.int64)
         rows, begin = [], 0
         for episode in waiting:
-            inside = slice(begin, begin + episode.steps)  # the last step is no transition
+            inside = slice(begin, begin + episode.steps)  # no transition begins at the last step
             begin += episode.steps + 1
             of_steps = codes[inside] if len(codes) else np.zeros(episode.steps, np.int64)
             strata = None
@@ -328,13 +328,12 @@ def conditions_in_twin(
 ) -> tuple[list[Condition], dict[str, list[str]]]:
     """Return the conditions that can be evaluated in the twin, and the `signals` the others lack.
 
-    Of a robot without a lidar that leaves out those that no log tells either.
-
-    The twin fills Restock's own signals and none of a profile's `[signals.*]`: a condition over
-    those labels logs, and is not evaluated on fresh episodes, where it would be a guess.
+    The twin fills Restock's own signals, but none of a profile's `[signals.*]`. Conditions over
+    those label only logs: on fresh episodes they would be guesses. For a robot without a lidar,
+    conditions over its scans are left out, too, as they are null in its logs.
 
     Raises:
-        ConfigError: one does not run for another reason.
+        ConfigError: a condition does not run for another reason.
     """
     steps = steps_schema().empty_table()
     needed: dict[str, list[str]] = {} if lidar else unseen(conditions)
@@ -374,10 +373,10 @@ class FreshStrata:
 
     Args:
         names: of the strata (S,), without a store's name.
-        conditions: those that can be told of fresh rows, of both kinds.
+        conditions: outcomes and exposures that can be evaluated on fresh rows.
 
-    `known` (S,) says which strata fresh rows can be in: not those of a predicate over the store's
-    columns (`where`), nor of a condition that the twin's signals do not tell.
+    `known` (S,) is whether fresh rows can be in a stratum. They cannot if it is a predicate over the
+    store's columns (`where`), or a condition that cannot be evaluated in the twin.
     """
 
     def __init__(
@@ -402,7 +401,7 @@ class FreshStrata:
 
     @classmethod
     def of(cls, panel: Panel, conditions: Sequence[Condition]) -> FreshStrata:
-        """Build it for the mixture that a panel was made by."""
+        """Build it from the mixture of a panel."""
         header = panel.header
         first = header.strata[: len(header.strata) // (1 + len(header.others))]
         return cls(header.mixture, [stratum.name for stratum in first], conditions)

@@ -1,7 +1,7 @@
 """Label the fresh rows that a run has sampled: conditions, strata and perturbations by episode.
 
 Conditions look ahead, so a row's labels are known once its episode has ended. The ring may have
-overwritten the row by then, and the record of what was sampled still needs them.
+overwritten the row by then, but the record of sampled rows still needs its labels.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from restock.arrays import Ints
 from restock.state import Stateful
 
 Entries = list[tuple[str, float]]
-WAITING, NEVER = -1, -2  # codes of a row without a condition: its episode has not ended; unknown
+WAITING, NEVER = -1, -2  # codes of rows without a condition yet, and of rows that never get one
 
 
 class EpisodeLabels(Stateful):
-    """Conditions and strata of ended episodes since the last `clear`, by the ring's key."""
+    """Conditions and strata of episodes that ended since the last `clear`, by the ring's key."""
 
     STATE: ClassVar[tuple[str, ...]] = ("_keys", "_codes", "_given_up")
 
     def __init__(self) -> None:
         self._keys: list[int] = []
-        self._codes: list[NDArray[np.int16]] = []  # (2, T) of each: conditions and strata
+        self._codes: list[NDArray[np.int16]] = []  # (2, T) per episode: conditions and strata
         self._given_up: list[int] = []  # keys
 
     def note(self, key: int, codes: NDArray[Any], strata: NDArray[Any] | None = None) -> None:
         """Keep the labels of ended episode `key`.
 
-        `codes[t]` (T,) is the condition of its step t, `strata[t]` its stratum; None: as the
-        condition.
+        `codes[t]` (T,) is the condition of its step t, `strata[t]` its stratum. `strata` None: the
+        same codes.
         """
         self._keys.append(int(key))
         both = (codes, codes if strata is None else strata)
@@ -45,7 +45,7 @@ class EpisodeLabels(Stateful):
         self._given_up.append(int(key))
 
     def clear(self) -> None:
-        """Forget the labels: rows that are drawn from now on have them."""
+        """Forget the labels: rows drawn from now on have them in the ring."""
         self._keys, self._codes = [], []
 
     def restored(self) -> None:
@@ -91,16 +91,16 @@ class FreshPerturbations(Stateful):
 
     def forget(self, kept: NDArray[np.int64]) -> None:
         """Forget episodes without a row: `kept` (n,) are the keys of the ring's rows."""
-        if len(self._of) > len(kept) + 1:  # never more than one a row
+        if len(self._of) > len(kept) + 1:  # at most one entry per row is needed
             alive = set(np.unique(kept).tolist())
             self._of = {key: entry for key, entry in self._of.items() if key in alive}
 
     def names(self, keys: NDArray[np.int64]) -> list[str | None]:
-        """Return the name in force in each of these episodes; None if it is not known."""
+        """Return the name in force in each of these episodes; None if unknown."""
         return [entry[0] if (entry := self._of.get(key)) else None for key in keys.tolist()]
 
     def values(self, keys: NDArray[np.int64]) -> list[Entries | None]:
-        """Return the values that are not nominal, as entries of a map."""
+        """Return each episode's values that are not nominal, as entries of a map."""
         return [
             values_entries(entry[1]) if (entry := self._of.get(key)) else None
             for key in keys.tolist()

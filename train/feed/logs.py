@@ -4,17 +4,16 @@
 the mixture; the probe does not. So TD error by condition and the distance between the two networks'
 values can be compared over a run and between runs, as long as their probe hashes agree.
 
-`LogFidelity` checks whether logged rows are what their labels say, and follow from one another. A
-critic's errors do not show every fault of its replay: rows whose labels are wrong, or whose next
-observations are not what followed, may be memorised like any others. Two measures of each condition
-of the logs do:
+`LogFidelity` checks whether logged rows match their labels and their next observations. A critic's
+errors do not show every fault of its replay: it can memorise rows with wrong labels or wrong next
+observations like any others. Two measures per condition of the logs show them:
 
-- *agreement*: how many of its rows a linear discriminant (Fisher 1936), trained on the conditions
-  and observations of fresh steps, assigns to it. Those of the evaluation and those of the ring
-  count, because the evaluation of a good policy may show few steps of a rare condition;
-- *unexplained*: how much of the variance of its next observations a linear model of observation
-  and action, fitted on half of the logs' rows, leaves unexplained on the other half. Above 1, the
-  mean would be a better guess.
+- *agreement*: the share of its rows that a linear discriminant (Fisher 1936), fitted to fresh steps
+  of known condition, assigns to it. Fresh steps are those of the evaluation and of the ring,
+  because the evaluation of a good policy may contain few steps of a rare condition;
+- *unexplained*: the share of the variance of its next observations that a linear model of
+  observation and action, fitted on half of the rows, leaves unexplained on the other half. Above 1,
+  the mean would be a better guess.
 """
 
 from __future__ import annotations
@@ -80,17 +79,17 @@ class Logs:
     stratum_rows: list[Ints]  # the rows of each stratum
     shares: NDArray[np.float64]  # (S,)
     weights: F32 | None  # (n,) importance weights, or None if all are 1
-    as_of_ns: int  # calendar ages are against it
+    as_of_ns: int  # reference time of ages in days
     transition_id: Ints  # (n,)
-    stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be a simulator's
+    stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be simulated time
     condition: Coded
     behaviour_policy: Coded
     behaviour_version: Coded
     episode: Coded
 
     perturbation: Coded | None = None  # of the twin; null for hardware
-    panel: Panel | None = None  # that they are from
-    planned: PlannedDraws = _UNPLANNED  # what the run will draw
+    panel: Panel | None = None  # the panel that they are from
+    planned: PlannedDraws = _UNPLANNED  # the draws that the run plans
 
     @classmethod
     def of_panel(
@@ -102,7 +101,7 @@ class Logs:
     ) -> Logs:
         """Read a panel's rows into memory (memory-mapped if it is larger than 4 GiB).
 
-        Their ages are against `as_of_ns`, when training began; None: against their newest.
+        `as_of_ns` is the reference time of their ages, when training began; None: the newest row's.
         """
         rows = np.asarray(panel.rows)
         if rows.nbytes <= _IN_MEMORY_BYTES:
@@ -143,7 +142,7 @@ class Logs:
     ) -> LoggedSampler:
         """Make the sampler of the logs: by the mixture of their panel, else by their shares.
 
-        `fresh` (S,): which strata rows of a ring beside them can be in; None: there is no ring.
+        `fresh` (S,) is whether rows of a ring can be in each stratum; None: there is no ring.
 
         Raises:
             MixtureError: see `sampler_for`.
@@ -171,7 +170,7 @@ class Logs:
 
 @dataclass(frozen=True)
 class Probe:
-    """Rows (n, W) float32, sorted by condition; `bounds[c]:bounds[c + 1]` are condition c's."""
+    """Rows (n, W) float32, sorted by condition: condition c has `bounds[c]:bounds[c + 1]`."""
 
     rows: Tensor
     conditions: list[str]
@@ -221,7 +220,7 @@ class Probe:
         return cls(picked, kept, bounds, source, digest)
 
     def measure(self, learner: Learner) -> tuple[list[dict[str, Any]], float]:
-        """Return rows for the run's `probe`, per condition, and the lag over all of it."""
+        """Return rows of the run's table `probe`, one per condition, and the lag over all rows."""
         td, q, slow = learner.td_error(self.rows.to(learner.device))
         action = self.rows[:, -3].long().to(learner.device)
         chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
@@ -247,17 +246,17 @@ def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:
     return splitmix64(key.astype(np.uint64) + np.uint64(GOLDEN))
 
 
-PROBE_ROWS = 64  # of a probe, per condition, fixed for the whole run
-ROWS = 512  # of each condition, chosen by hash
-_MIN_ROWS = 50  # of a condition, to count
+PROBE_ROWS = 64  # rows per condition of a probe, fixed for the whole run
+ROWS = 512  # rows per condition that fidelity is measured on, chosen by hash
+_MIN_ROWS = 50  # conditions with fewer rows are left out
 _SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean
-_RIDGE = 1.0  # on standardised features
+_RIDGE = 1.0  # penalty on standardised features
 
 
 class LogFidelity:
-    """Rows of each condition of a run's logs.
+    """Measures of a run's logged rows, by condition: see the top of this file.
 
-    `unexplained` holds a condition's share of variance, >= 0; conditions of few rows are left out.
+    `unexplained` is a share of variance, >= 0. Conditions with few rows are left out.
     """
 
     def __init__(self, rows: Probe, observation_size: int) -> None:
@@ -275,7 +274,7 @@ class LogFidelity:
         return cls(rows, observation_size) if rows is not None else None
 
     def agreement(self, *fresh: Probe) -> dict[str, float]:
-        """Return the share of each condition's rows that fresh steps of known condition confirm."""
+        """Return the agreement of each condition with the `fresh` steps; empty without two."""
         size = self._observation.shape[1]
         steps: dict[str, list[F64]] = {}
         for probe in fresh:
@@ -300,7 +299,7 @@ class LogFidelity:
         features = _standard(np.concatenate([self._observation, taken], axis=1))
         features = np.concatenate([features, np.ones((len(features), 1))], axis=1)
         target = _standard(next_observation)
-        fit = np.arange(len(features)) % 2 == 0  # rows of a condition are in the order of a hash
+        fit = np.arange(len(features)) % 2 == 0  # a random half, as rows are ordered by hash
         x, y = features[fit], target[fit]
         weights = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ y)
         error = (target - features @ weights) ** 2
@@ -324,7 +323,7 @@ class LogFidelity:
 def discriminant(classes: list[F64], rows: F64) -> NDArray[np.int64]:
     """Return the most likely class of each of `rows` (m, D), (m,), with equal priors.
 
-    `classes` are rows (n_k, D) of each; their covariance is taken to be the same.
+    `classes` are the rows (n_k, D) of each class, whose covariances are taken to be equal.
     """
     means = np.stack([part.mean(axis=0) for part in classes])
     within = [np.cov(part, rowvar=False) for part in classes]

@@ -1,15 +1,14 @@
-"""Make a run's twin, and choose which missions it practises next, by arm.
+"""Make a run's twin, and choose the shares of the missions that it practises next, by arm.
 
 An arm is a kind of missions (`restock.train.twin.env.episode_queue`). The rules:
 
-- natural: as `env.conditions`, `env.missions` and the floors say;
-- even: every arm alike;
-- success: an arm's weight is its rate of failures, while the agent explores. The failures and
-  successes of an arm fade by a half-life; an arm with too few episodes goes by its kind's rate, and
-  a kind with too few counts as if all failed.
+- natural: the shares that `env.conditions`, `env.missions` and the floors give;
+- even: the same share for every arm;
+- success: an arm's weight is its failure rate while the agent explores. Older episodes count less,
+  by a half-life. An arm with too few episodes has its kind's rate, and a kind with too few has 1.
 
-Weights become shares that sum to 1, none below its floor, and a share moves at most so far in an
-interval. Nothing is drawn here: the twin draws its missions from its own seed.
+Weights become shares that sum to 1. Under `success`, no share is below a floor, and none changes by
+more than a limit per interval. Nothing is drawn here: the twin draws missions from its own seed.
 """
 
 from __future__ import annotations
@@ -37,17 +36,17 @@ from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
 FLOOR = 0.05  # least share of an arm under the rule "success"
 WHERE = "practice"
-HALF_LIFE_EPISODES = 20.0  # an arm's episode that is this old counts half
+HALF_LIFE_EPISODES = 20.0  # an episode counts half after so many later ones of its arm
 MAX_CHANGE = 0.1  # of a share per interval
-INTERVAL_STEPS = 1_000  # environment steps after which shares may move
-WARMUP_EPISODES = 5  # of an arm, before its own rate is used
+INTERVAL_STEPS = 1_000  # environment steps after which shares may change
+WARMUP_EPISODES = 5  # episodes of an arm before its own rate is used
 
 
 class Practice(Stateful):
     """A counter of ended missions by arm, which sets the twin's shares at each interval's end.
 
     Raises:
-        ConfigError: the rule lacks what it needs.
+        ConfigError: the rule is "success", but the task has no goal.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("names",)
@@ -64,14 +63,14 @@ class Practice(Stateful):
         *,
         goal: bool = True,
     ) -> None:
-        """`goal`: success is defined."""
+        """`goal` is whether success is defined."""
         self.config, self._set = config, set_shares
-        # Where nothing is chosen, ordered missions count as what they are.
+        # The rule "natural" chooses nothing: ordered missions count as others of their kind.
         self.arms = unordered(arms) if config.rule == "natural" else list(arms)
         count = len(self.arms)
         self.names = [arm.name for arm in self.arms]
         self.natural: F64 = np.array([arm.share for arm in self.arms])
-        # Many arms leave less for each: half is always free to move.
+        # With many arms the floor is lower, so that floors take up at most half of all missions.
         least = FLOOR if config.rule == "success" else 0.0
         self.floor = min(least, 0.5 / max(count, 1))
         if config.rule == "success" and not goal:
@@ -80,8 +79,8 @@ class Practice(Stateful):
                 where=f"{WHERE}.rule",
                 remedy='use "even"',
             )
-        self._episodes, self._failures = np.zeros(count), np.zeros(count)  # fading
-        self._seen: Ints = np.zeros(count, np.int64)  # ended so far
+        self._episodes, self._failures = np.zeros(count), np.zeros(count)  # fading sums
+        self._seen: Ints = np.zeros(count, np.int64)  # episodes ended so far
         self._interval_episodes: Ints = np.zeros(count, np.int64)
         self._interval_successes: Ints = np.zeros(count, np.int64)
         self._closed_at = 0  # environment steps
@@ -91,7 +90,7 @@ class Practice(Stateful):
         )
         self._tell()
 
-    # -- what happens ---------------------------------------------------------------------------
+    # -- counts and shares ----------------------------------------------------------------------
 
     def note(self, episodes: Sequence[EndedEpisode]) -> None:
         """Count ended missions."""
@@ -108,9 +107,10 @@ class Practice(Stateful):
             self._interval_successes[place] += success
 
     def advance(self, steps: Mapping[str, int], *, last: bool = False) -> list[dict[str, Any]]:
-        """Return an interval's rows of the run's `practice` at its end, and set the next shares.
+        """Close an interval if it ends: return its rows of `practice`, and set the next shares.
 
-        Call while no step of the twin is out. `last`: the run ends here, in whatever interval.
+        Return no rows if it does not end. Call this while no step of the twin is under way. `last`
+        closes the open interval, because the run ends here.
         """
         env_steps = steps["env_steps"]
         due = env_steps - self._closed_at >= INTERVAL_STEPS
@@ -131,12 +131,12 @@ class Practice(Stateful):
 
     @property
     def believed(self) -> Bools:
-        """Return whether each arm has ended often enough, (K,)."""
+        """Return whether each arm has enough episodes for a rate of its own, (K,)."""
         return self._seen >= WARMUP_EPISODES
 
     @property
     def failure_rate(self) -> F64:
-        """Return each arm's failure rate over fading episodes, with Jeffreys' prior, (K,).
+        """Return each arm's failure rate over fading sums, with Jeffreys' prior, (K,).
 
         It is the kind's rate if the arm has too few episodes, and 1 if the kind has too few.
         """
@@ -193,7 +193,7 @@ class Practice(Stateful):
         ]
 
     def _place(self, episode: EndedEpisode) -> int | None:
-        """Return the number of an episode's arm; None if it belongs to none."""
+        """Return the index of an episode's arm; None if it belongs to no arm."""
         if episode.arm >= 0:
             return episode.arm
         for place, arm in enumerate(self.arms):
@@ -216,8 +216,8 @@ class Practice(Stateful):
 def with_floor(weights: F64, floor: float) -> F64:
     """Return shares (K,) in proportion to weights, none below `floor`; they sum to 1.
 
-    Those that would be below it get it, the others share the rest, evenly if they have no weight.
-    `floor` is at most 1 / K, `weights` sum to more than 0.
+    Shares that would be below the floor are set to it. The other arms divide the rest, evenly if
+    all their weights are 0. `floor` is at most 1 / K, and `weights` sum to more than 0.
     """
     held = np.zeros(len(weights), np.bool_)
     shares: F64 = np.full(len(weights), floor)
@@ -237,9 +237,9 @@ def with_floor(weights: F64, floor: float) -> F64:
 
 
 def moved(shares: F64, wanted: F64, most: float) -> F64:
-    """Move shares toward those wanted, no share by more than `most`; they still sum to 1.
+    """Move `shares` towards `wanted`, none by more than `most`; they still sum to 1.
 
-    All go the same part of their way, so what holds for both (a floor, a sum) holds for the result.
+    All move by the same fraction of their distance, so a floor or a sum that both have is kept.
     """
     farthest = float(np.abs(wanted - shares).max())
     part = 1.0 if farthest <= most else most / farthest
@@ -247,7 +247,7 @@ def moved(shares: F64, wanted: F64, most: float) -> F64:
 
 
 def unordered(arms: Sequence[MissionArm]) -> list[MissionArm]:
-    """Return the arms without those of orders, whose shares go to their kinds' own."""
+    """Return the arms without those of ordered missions, whose shares go to arms of their kind."""
     own = [arm for arm in arms if arm.order < 0]
     for order in (arm for arm in arms if arm.order >= 0):
         total = sum(arm.share for arm in own if arm.kind == order.kind)
@@ -267,10 +267,10 @@ MISSIONS = "env.missions"
 
 
 def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
-    """Read the missions that a share of the episodes follows; none if the config names none.
+    """Read the ordered missions of the config; empty if it names none.
 
     Raises:
-        ConfigError: their file cannot be read, or says something else.
+        ConfigError: the missions file cannot be read or is invalid.
     """
     missions = config.env.missions
     return read_missions(missions).missions if isinstance(missions, str) else missions or ()
@@ -280,7 +280,7 @@ def mission_arms(config: TrainConfig) -> MissionArms:
     """Make the arms of a run's missions.
 
     Raises:
-        ConfigError: an order that the floors cannot hold.
+        ConfigError: an ordered mission does not fit on the floors.
     """
     floors, ordered = open_floors(config.env.layouts), mission_orders(config)
     routes = planners(floors)
@@ -299,7 +299,7 @@ def check_missions(config: TrainConfig, profile: Profile) -> None:
     """Refuse missions that the twin cannot drive, before anything is written.
 
     Raises:
-        ConfigError: an order or arm that the floors cannot hold.
+        ConfigError: an ordered mission or an arm does not fit on the floors.
     """
     if not mission_orders(config) and config.practice == PracticeConfig():
         return
@@ -313,7 +313,7 @@ def make_twin(
     nthread: int = 1,
     layouts: str | None = None,
 ) -> Twin:
-    """Make the warehouse as training uses it, on other floors if `layouts` names them."""
+    """Make the twin of a run, on other floors if `layouts` is given; `NoTwin` if it has none."""
     if not config.env.twin:
         return NoTwin(profile.task)
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -327,7 +327,7 @@ def make_twin(
         task=profile.task,
         robot=profile.robot,
         layouts=layouts or config.env.layouts,
-        # Evaluation has its own floors and fixed episodes.
+        # Only evaluation gives `layouts`, and it drives fixed episodes.
         missions=() if layouts is not None else mission_orders(config),
         missions_share=config.env.missions_share,
         nav_command=profile.inputs.nav_command is not None,

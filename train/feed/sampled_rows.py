@@ -1,11 +1,11 @@
 """Keep rows as they were sampled, and compute the run's tables from them.
 
-The update loop only appends, in one pass of compiled code if it is built. Statistics are computed
-once an interval, one function a table, and the rows of a few audited batches are written down.
+The update loop only appends rows, in one pass of compiled code if that is built. Statistics are
+computed once per interval, by one function per table. The rows of a few batches are audited.
 
-Some conditions look ahead, so a row of the twin has its condition only once its episode has ended;
-by then it may have been drawn. An interval's fresh rows are therefore held until every one of them
-has its condition, and written after that: with it, in every table.
+Some conditions look ahead, so a fresh row gets its condition only when its episode has ended; by
+then it may have been drawn. An interval's fresh rows are therefore held until all of them have
+their condition, and only then written to the tables.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from restock.state import Stateful
 from restock.train.feed.fresh_labels import WAITING, EpisodeLabels, FreshPerturbations
 from restock.train.feed.logs import Coded, Logs
 
-_MAX_CELLS = 1 << 22  # of a dense count; wider ranges of episodes are sorted instead
+_MAX_CELLS = 1 << 22  # of a dense count; for wider ranges of episodes, rows are sorted instead
 _BATCH: dict[str, DTypeLike] = {
     **dict.fromkeys(("td", "q", "weight"), "f4"),
     "action": "i2",
     **dict.fromkeys(("reward", "discount"), "f4"),
 }
 LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: of the panel
-GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited, of logs
+GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited log rows
 FRESH: dict[str, DTypeLike] = {
     "condition": "i2",  # WAITING while its episode goes on
     "stratum": "i2",  # of the mixture; without strata, the condition
@@ -61,7 +61,7 @@ class SampledRows(Stateful):
         self._kinds = {name: np.dtype(kind) for name, kind in kinds.items()}
         self._places = {name: place for place, name in enumerate(kinds)}
         self._count = self._last = 0
-        self._held = self._made(0)  # more than there are rows
+        self._held = self._made(0)  # arrays with room for more rows
 
     def __len__(self) -> int:
         return self._count
@@ -86,7 +86,7 @@ class SampledRows(Stateful):
     def clear(self) -> None:
         """Remove all rows; columns returned earlier stay valid."""
         if self._count:
-            self._held = self._made(self._count)  # as many as the interval before
+            self._held = self._made(self._count)  # room for as many rows as before
         self._count = self._last = 0
 
     @property
@@ -139,7 +139,7 @@ def keep_rows(
     *,
     by_native: bool,
 ) -> None:
-    """Append a batch to the rows of both sources, LOGGED and FRESH; or have compiled code do it."""
+    """Append a batch's rows to `logged` and `fresh`, by compiled code if `by_native`."""
     meta, condition = ring.meta, ring.by_condition.stratum
     of_ring = (condition, ring.stratum, *(meta[name] for name in _OF_RING))
     logged_to, logged_at = logged.grow(len(log_rows))
@@ -176,8 +176,8 @@ def episode_sums(
 ) -> dict[str, NDArray[Any]]:
     """Sum rows by episode and pair, into columns episode, pair, drawn_rows, weight.
 
-    Rows of one episode are drawn together and are alike, so what a critic learnt from is only as
-    certain as its episodes are many. `restock compare` resamples these.
+    Rows of one episode are drawn together and are alike, so certainty about what a critic was fed
+    depends on the number of episodes, not of rows. `restock compare` resamples episodes.
     """
     first = int(episode.min(initial=0))
     key = (episode.astype(np.int64) - first) * pairs + pair
@@ -204,7 +204,7 @@ def row_hashes(packed: NDArray[np.float32]) -> list[str]:
 def logged_audit(rows: Arrays, logs: Logs, age_days: NDArray[np.float64], step: int) -> Columns:
     """Return columns of the run's table `audit` for logged rows of the batch of update `step`.
 
-    They could be drawn since update 0: that is their age in updates.
+    Logged rows could be drawn from update 0 on, so their age in updates is `step`.
     """
     row = rows["row"]
     return {
@@ -237,7 +237,7 @@ def fresh_audit(
     ring: FreshRing,
     perturbations: FreshPerturbations | None = None,
 ) -> Columns:
-    """Return the audit's columns of fresh rows, without the names that `add_names` adds."""
+    """Return columns of `audit` for fresh rows, without the names that `add_names` adds."""
     keys = rows["episode"]
     return {
         "source": "fresh",
@@ -262,10 +262,10 @@ def fresh_audit(
 def add_names(
     audit: Columns, conditions: Sequence[str], strata: Sequence[str], unlabelled: str
 ) -> Columns:
-    """Add names to the columns of `fresh_audit`; `unlabelled` is the stratum of the others."""
+    """Add names to the columns of `fresh_audit`; rows in no stratum get `unlabelled`."""
     names = [conditions[code] if code >= 0 else None for code in audit["condition"].tolist()]
     of_strata = audit["of_stratum"].tolist()
-    values = audit["perturbation_values"]  # a checkpoint gives back lists
+    values = audit["perturbation_values"]  # pairs are lists after a checkpoint was loaded
     columns = {
         **audit,
         "episode": [str(key) for key in audit["key"].tolist()],
@@ -287,8 +287,8 @@ def _names(coded: Coded, rows: NDArray[np.int64]) -> list[str]:
 class HeldInterval:
     """The fresh rows of a closed interval.
 
-    `rows` are columns (n,) of `FRESH`; of each audited batch there are columns in
-    `audits`. `open_rows` are the rows that the ring held without a condition as it was closed.
+    `rows` are columns (n,) of `FRESH`, `audits` are columns of each audited batch. `open_rows` are
+    the rows of the ring that had no condition yet when the interval was closed.
     """
 
     clocks: Mapping[str, int]
@@ -297,7 +297,7 @@ class HeldInterval:
     available: Ints  # (S,) labelled rows of the ring, by stratum
     open_rows: dict[str, NDArray[Any]]  # condition, stratum, episode, episode_step
     audits: Sequence[dict[str, Any]]  # columns of `audit`, with condition, key and greedy action
-    quotas: Mapping[str, NDArray[Any]] | None = None  # of the batch, as `fed` takes
+    quotas: Mapping[str, NDArray[Any]] | None = None  # of the batches, as `fed` takes them
 
     def fill(self, labels: EpisodeLabels) -> None:
         """Fill in the conditions that are known by now."""
@@ -315,8 +315,8 @@ class HeldInterval:
         return any((part["condition"] == WAITING).any() for part in parts)
 
 
-_SHORT = 1e-3  # of the rows fed: less is rounding
-_MAX_MARKS = 1 << 25  # keys that are marked in place; those of a wider range are sorted instead
+_SHORT = 1e-3  # share of the rows fed; a smaller shortfall is rounding
+_MAX_MARKS = 1 << 25  # span of keys that are marked in place; wider ranges are sorted instead
 
 
 @dataclass(frozen=True)
@@ -331,18 +331,18 @@ class SourceRows:
     rows: Mapping[str, NDArray[Any]]  # td, q, weight, action, reward, discount
     stratum: Ints
     strata: Sequence[str]
-    row: Ints  # which row of the source each was
-    available: Ints  # (S,) rows of each stratum that the source has
+    row: Ints  # its number in the source
+    available: Ints  # (S,) rows of each stratum in the source
     timings: Sequence[str | None]  # (S,)
     quota: Sequence[float | None]  # (S,)
     condition: Ints
     conditions: Sequence[str]
     episode: Ints
-    episodes: Sequence[str] | None  # their names; None: keys
+    episodes: Sequence[str] | None  # names of the codes in `episode`; None: they are keys
     policy: NDArray[Any]
     policies: Sequence[str]
-    ages: Mapping[str, F64]  # by their unit
-    greedy: GreedyRows | None  # None: the policy is not at hand
+    ages: Mapping[str, F64]  # unit -> ages
+    greedy: GreedyRows | None  # None: the policy is not available
 
     @cached_property
     def pair(self) -> Ints:
@@ -396,7 +396,7 @@ class SourceRows:
 def first_places(key: Ints) -> Ints:
     """Return the place of one row for each distinct value of `key` (n,), ordered by value.
 
-    Keys of rows are dense enough to be marked in place, which takes a thirtieth of sorting them.
+    Keys of rows are dense enough to mark them in place, in a thirtieth of the time of sorting.
     """
     first = int(key.min()) if len(key) else 0
     span = int(key.max(initial=first)) - first + 1
@@ -419,7 +419,7 @@ class GreedyRows:
 
 
 def strata(source: SourceRows, total: Ints) -> Columns:
-    """Compute the columns of `strata`; `total` (S,) are rows since the run began."""
+    """Compute the columns of `strata`; `total` (S,) counts rows drawn since the run began."""
     drawn, unique = (of.sum(axis=(1, 2)) for of in (source.drawn, source.unique))
     sums = {name: by_pair.sum(axis=1) for name, by_pair in source.sums.items()}
 
@@ -450,13 +450,13 @@ def strata(source: SourceRows, total: Ints) -> Columns:
 def fed(
     names: Sequence[str], quotas: Mapping[str, NDArray[Any]], fresh: Ints, available: Ints
 ) -> Columns:
-    """Compute the columns of `fed`: a row per stratum (S,), and one of rows in none, if any.
+    """Compute the columns of `fed`: a row per stratum (S,), and one for rows in none, if any.
 
     Args:
-        quotas: `wanted` and `natural` shares, `logged` rows drawn, and the `reason` for one that is
-            short, (S,) each.
-        fresh: (S + 1,) fresh rows drawn, last those in no stratum.
-        available: (S + 1,) rows in the ring.
+        quotas: (S,) each: `wanted` and `natural` shares, `logged` rows drawn, and the `reason` why
+            a stratum is short.
+        fresh: (S + 1,) fresh rows drawn; the last count is of rows in no stratum.
+        available: (S + 1,) rows in the ring, in the same order.
     """
     logged = np.append(quotas["logged"], 0)
     total = max(int(logged.sum() + fresh.sum()), 1)

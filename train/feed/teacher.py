@@ -3,15 +3,15 @@
 The teacher is the twin's operator, or one of yours. Besides its answers, logged rows are cloned.
 
 Logged rows are drawn by the shares of their strata, as the critic's are: a network that clones the
-majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh rows are drawn alike.
-If a teacher prefers no side, a row's mirror image is as valid as the row: half of the rows are
-drawn mirrored.
+majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh rows are drawn
+uniformly. If a teacher prefers no side, a row's mirror image is as valid as the row: half of the
+rows are drawn mirrored.
 
-The rows of named drivers are cloned, and other drivers' successes. An operator is called when the
-planner fails, so the logs hold few rows of how it drives when nothing is wrong, or beside people
-whom the planner gets past, and a clone of those rows alone is poor there. Episodes that other
-drivers brought to their goal without help fill that gap (filtered behaviour cloning, %BC in
-arXiv:2106.01345).
+The cloned rows are those of named drivers, and of other drivers' successes. An operator is called
+when the planner fails, so the logs hold few rows of the operator when nothing is wrong, or beside
+people whom the planner gets past, and a clone of the operator's rows alone is poor there. Episodes
+in which other drivers reached their goal without help fill that gap (filtered behaviour cloning,
+%BC in arXiv:2106.01345).
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ Label = NDArray[np.int16]
 class Teacher(Protocol):
     """A driver that returns its actions for N environments without driving them.
 
-    It may look at the environment itself, beyond what the observation says. It is queried once a
-    step, in order, and once before training begins. If it has `state_dict` and
-    `load_state_dict`, a run that is resumed goes on exactly as it would have.
+    It may use the environment itself, which has more than the observation. It is queried once per
+    step, in order, and once before training begins. If it has `state_dict` and `load_state_dict`, a
+    resumed run continues exactly as if it had never stopped.
     """
 
     def act(self, env: Any, observation: F32, /) -> Ints:
@@ -79,7 +79,7 @@ class OperatorTeacher(Stateful):
         Raises:
             ConfigError: the environment is not the warehouse twin.
         """
-        if not (hasattr(env, "simulation") and hasattr(env, "navigation")):  # what it looks at
+        if not (hasattr(env, "simulation") and hasattr(env, "navigation")):  # what it reads
             raise ConfigError(
                 f'teacher.source = "operator" needs the warehouse twin, but this is a'
                 f" {type(env).__name__}",
@@ -97,16 +97,16 @@ class _Called:
 
 
 class TeacherFailed(ConfigError):
-    """The teacher raised an error, or its answer was invalid."""
+    """The teacher raised an error or returned invalid actions."""
 
 
 class AskedTeacher(Stateful):
     """A teacher whose answers are checked.
 
     Args:
-        teacher: the one that is queried.
-        task: whose actions it names.
-        name: for errors: `teacher.source` as it was given.
+        teacher: the teacher to query.
+        task: the task whose actions are valid answers.
+        name: `teacher.source` as it was given, for errors.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_kept",)
@@ -118,8 +118,7 @@ class AskedTeacher(Stateful):
         """Return the teacher's action in each environment, (N,); UNKNOWN if it has no opinion.
 
         Raises:
-            TeacherFailed: it raised an error, gave no action, other than N of them, or one that
-                the task has not.
+            TeacherFailed: the teacher raised an error, or did not return N actions of the task.
         """
         with _of_the_user(f"the teacher {self._name}", self._teacher.act):
             # A copy, so that the teacher cannot change what the agent sees and the run keeps.
@@ -166,10 +165,12 @@ def open_teacher(
     """Make the teacher that a run queries in the twin; None if there is none.
 
     Args:
-        given: in place of what the config names: an object with `act`, or a function like it.
+        given: a teacher to use instead of the one that the config names: an object with `act`, or
+            such a function.
 
     Raises:
-        ConfigError: no such module or name, or nothing that can be asked.
+        ConfigError: there is no such module or name, or it has no `act` and cannot be called.
+        TeacherFailed: creating or importing the teacher raised an error.
     """
     if config.source is None or not config.asks:
         return None
@@ -194,9 +195,9 @@ def open_teacher(
 
 @contextmanager
 def _of_the_user(what: str, called: Any) -> Iterator[None]:
-    """Turn an error of the user's code into one that names its file and line.
+    """Turn an error in the user's code into a TeacherFailed that names its file and line.
 
-    So does SystemExit, which would end a run without a word.
+    This includes SystemExit, which would end the run without a message.
     """
     try:
         yield
@@ -217,7 +218,7 @@ def _raised(what: str, called: Any, error: BaseException) -> TeacherFailed:
 
 
 def _place(called: Any, error: BaseException) -> str:
-    """Return FILE:LINE of the user's innermost line in the traceback, else of the called object.
+    """Return FILE:LINE of the user's innermost line in the traceback, or of the called object.
 
     Frames of libraries and of Restock, which the user's code may call, do not count.
     """
@@ -239,7 +240,7 @@ def _place(called: Any, error: BaseException) -> str:
 
 
 def _imported(source: str) -> Any:
-    """Import what `module:name` names; modules of the working directory are found too."""
+    """Import `module:name`; modules in the working directory are found, too."""
     if source == GIVEN:
         raise ConfigError(
             "the run's teacher was passed in from Python, and none is given now",
@@ -264,8 +265,8 @@ def _imported(source: str) -> Any:
         sys.path.remove(here)
 
 
-_MEASURED = 128  # rows a condition
-_LOGS_SHARE = 0.25  # of an online batch, where a teacher is asked
+_MEASURED = 128  # rows per condition
+_LOGS_SHARE = 0.25  # share of an online batch, if a teacher is queried
 
 
 def rows_of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
@@ -279,13 +280,13 @@ def rows_of_successes(
 ) -> Bools:
     """Select the rows (n,) of episodes that reached their goal without any of `policies`.
 
-    An episode reached it where it was terminated (discount 0) with a reward above 0.
+    An episode reached its goal if it was terminated (discount 0) with a reward above 0.
     """
     well = (discount == 0.0) & (reward > 0.0)
     count = len(episode.names)
     ended = np.bincount(episode.codes[well], minlength=count) > 0
     helped = np.bincount(episode.codes[rows_of_policies(policy, policies)], minlength=count) > 0
-    ended[-1] = False  # no episode is known
+    ended[-1] = False  # the last code stands for an unknown episode
     return np.asarray((ended & ~helped)[episode.codes], np.bool_)
 
 
@@ -313,10 +314,10 @@ class Imitation(Stateful):
 
     Args:
         batch_size: M.
-        mirror: of the task, if rows are mirrored.
+        mirror: makes mirror images of the task's rows; None: rows are not mirrored.
 
     Raises:
-        ConfigError: the logs have no row of the policies that are to be cloned.
+        ConfigError: the logs have no row of the policies to clone.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_rng",)
@@ -343,13 +344,13 @@ class Imitation(Stateful):
                     *(logs.behaviour_policy, logs.episode, logs.rows.numpy(), config.policies)
                 )
             self._offline = _Drawn.of(logs, every)
-            # Answers in the agent's own states are worth more than what other drivers did.
+            # Answers in the agent's own states are worth more than other drivers' successes.
             self._online = _Drawn.of(logs, by_teacher) if config.asks else self._offline
         if not len(self._offline.rows):
             names = None if logs is None else logs.behaviour_policy.names[:-1]  # the last: unknown
             refuse_nothing_to_learn(config, names)
         self.offline_updates = (config.offline_updates or 0) if len(self._offline.rows) else 0
-        self._logged = 0  # of an online batch
+        self._logged = 0  # rows of an online batch
         if len(self._online.rows):
             self._logged = round(batch_size * _LOGS_SHARE) if config.asks else batch_size
 
@@ -363,7 +364,7 @@ class Imitation(Stateful):
         return self._gather(self._offline, self.batch_size)
 
     def draw_online(self) -> Labelled:
-        """Draw a batch (M,): its logged share, then fresh rows."""
+        """Draw a batch (M,) of logged rows, then fresh ones; all logged while the ring is empty."""
         return self._gather(self._online, self._logged if len(self.ring) else self.batch_size)
 
     def _gather(self, drawn: _Drawn, logged: int) -> Labelled:
@@ -378,7 +379,7 @@ class Imitation(Stateful):
         return Labelled(torch.from_numpy(observation), torch.from_numpy(action))
 
     def _states(self, rows: Ints, slots: Ints) -> tuple[F32, Ints]:
-        """Return observations (n, D) and actions (n,): the logs', then the teacher's answers."""
+        """Return observations (n, D) and actions (n,): logged ones, then the teacher's answers."""
         logged, fresh = len(rows), torch.from_numpy(self.ring.rows)
         packed = torch.empty(logged + len(slots), fresh.shape[1])
         if self.logs is not None and logged:
@@ -391,7 +392,7 @@ class Imitation(Stateful):
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
         """Return rows of the run's table `teacher`: the filter's effect by source and condition.
 
-        It uses up to 128 random rows per condition, of those that learning draws from.
+        Each is measured on up to 128 random rows, of those that online batches are drawn from.
         """
         rng = np.random.default_rng([self._seed, 8, learner.gradient_steps])
         groups: dict[tuple[str, str], tuple[F32, Ints]] = {}
@@ -448,8 +449,8 @@ def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, 
 def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None) -> None:
     """Raise ConfigError if the logs must have rows of the teacher's policies, but have none.
 
-    One must where the teacher is `logs`; or where they were chosen: only the default ones, of a
-    teacher that is asked, may be absent.
+    They must if no teacher is queried in the twin, or if there are logs and the config names other
+    policies than the default.
 
     Args:
         logged: names of the logs' behaviour policies; None: there are no logs.

@@ -1,17 +1,16 @@
 """Updates with the learner on a GPU: batches are drawn and recorded on the host.
 
-The samplers that a run on the CPU has draw the batches, so that a seed feeds the same rows to both;
-row numbers, a few kilobytes, go to the device, which holds the logs' rows and a mirror of the ring.
-While the device makes one block of updates, the next is drawn and the one before is recorded: the
-host waits once a block, if at all. If a draw depends on the TD errors of the batch before
-(priorities), a block has one update, and the host waits after each.
+The batches are drawn by the same samplers as on the CPU, so that a seed feeds the same rows to
+both. Only row numbers, a few kilobytes, go to the device, which holds the logs' rows and a copy of
+the ring. While the device makes one block of updates, the next block is drawn and the one before is
+recorded: the host waits once per block, if at all. If a draw depends on the TD errors of the batch
+before (priorities), a block has one update, and the host waits after each.
 
-A GPU is done with a batch of a network of this size in a fifth of a millisecond, in some seventy
-small kernels: launched one by one they take the host six times as long. So an update's kernels
-(gather, losses, gradients, Adam, the averages, the target's pull) are captured in a CUDA graph
-once. What differs between updates (row numbers, weights, rates) lies on the device for a block of
-them, and a cursor says which is next. The same operations run on the CPU, one after the other,
-where nothing can be captured.
+A GPU makes an update of such a network in a fifth of a millisecond, in some seventy small kernels;
+launching them one by one takes the host six times as long. So an update's kernels (gather, losses,
+gradients, Adam, the averages, the target's update) are captured in a CUDA graph once. The inputs
+that differ between updates (row numbers, weights, rates) are copied to the device for a whole
+block, with a cursor to the next update. On the CPU, the same operations run one after the other.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ from restock.train.dqn.network import averaging_rate
 from restock.train.feed.batches import Batches, LogTerms, ReplayBatch, drawn_ahead
 from restock.train.feed.teacher import Imitation
 
-LONGEST = 16  # updates of a block
-# A batch, its loss and its rows' action, reward and discount (B, 3), if they are at hand.
+LONGEST = 16  # most updates of a block
+# A batch, its loss, and its rows' action, reward and discount (B, 3); None: read from the batch.
 Made = tuple[ReplayBatch, Loss, Tensor | None]
 
 
@@ -52,7 +51,7 @@ class DeviceTable:
         ring.written = []
 
     def follow(self) -> None:
-        """Take over what was written into the ring since the last call."""
+        """Copy the slots that were written into the ring since the last call."""
         if not self._ring.written:
             return
         slots = torch.from_numpy(np.unique(np.concatenate(self._ring.written)))
@@ -102,12 +101,12 @@ class UpdateBlocks:
         """Make `count` updates, and yield each once the learner has counted it.
 
         Args:
-            draw: the next batch.
+            draw: draws the next batch.
             conservative: weight of the CQL term.
-            labelled: whether the behaviour network learns too.
+            labelled: whether the behaviour network learns, too.
 
         Raises:
-            MixtureError: `draw` did; the updates before it were made and given out.
+            MixtureError: `draw` raised it; the updates on all earlier batches were yielded.
         """
         longest = 1 if self.batches.needs_td else LONGEST
         waiting: list[ReplayBatch] = []
@@ -160,14 +159,14 @@ class UpdateBlocks:
             yield batch, Loss(outcome.loss[k], outcome.td[k], outcome.q[k]), outcome.tail[k]
 
 
-_WARM_UP = 3  # updates before the capture: libraries take their memory at the first calls
+_WARM_UP = 3  # updates before the capture: libraries allocate memory in their first calls
 
 
 @dataclass(frozen=True)
 class UpdateBlock:
     """The inputs of K consecutive updates, on the host."""
 
-    rows: Tensor  # (K, B) int64, of the table
+    rows: Tensor  # (K, B) int64, row numbers in the table
     weight: Tensor  # (K, B) float32
     logged: Tensor  # (K,) float32: how many of the first rows are from logs
     conservative: Tensor  # (K,) float32
@@ -212,18 +211,18 @@ class Launched:
 
 
 class CapturedUpdates:
-    """A learner's updates as a captured graph, up to `longest` consecutive ones.
+    """A learner's updates as a captured graph, in blocks of up to `longest`.
 
-    `Learner.count` is to be called for each update whose outcome was taken note of.
+    Call `Learner.count` for each update when its outcome is used.
 
     Args:
-        learner: whose parameters move.
-        table: (n, W) float32 on its device, which blocks name rows of.
+        learner: the learner whose parameters are updated.
+        table: (n, W) float32 on the learner's device; the rows of a block are rows of this table.
         batch_size: B.
-        longest: K, of a block.
-        labelled: M of the behaviour network's batches; 0: none.
-        has_conservative: whether the CQL term may come in.
-        expert: (n,) bool, where the margin term applies; None: nowhere.
+        longest: K, most updates of a block.
+        labelled: M, the behaviour network's batch size; 0: it does not learn.
+        has_conservative: whether the CQL term may have a weight above 0.
+        expert: (n,) bool, rows to which the margin term applies; None: no row.
     """
 
     def __init__(
@@ -245,7 +244,7 @@ class CapturedUpdates:
         self._cursor = torch.zeros(1, dtype=torch.int64, device=device)
         self._rows = torch.zeros(batch, dtype=torch.int64, device=device)
         self._weight = torch.ones(batch, device=device)
-        # Of each update: logged rows, weight of CQL, rates of the two averages.
+        # For each update: logged rows, weight of CQL, rates of the two averages.
         self._scalars = torch.zeros(longest, 4, device=device)
         self._labelled: Labelled | None = None
         if labelled:
@@ -260,9 +259,9 @@ class CapturedUpdates:
         self._graphs: dict[bool, torch.cuda.CUDAGraph] = {}
 
     def launch(self, block: UpdateBlock, ahead: int = 0) -> Launched:
-        """Set the device to work on the block's updates, and return before it is done.
+        """Start the block's updates on the device, and return before they are done.
 
-        `ahead` updates were launched and not counted yet.
+        `ahead` is the number of updates that were launched before and are not counted yet.
         """
         count, labels = len(block), block.labelled is not None
         if count > self.longest:
@@ -304,7 +303,7 @@ class CapturedUpdates:
         return of_block.index_select(0, self._cursor).squeeze(0)
 
     def _one(self, labels: bool) -> None:
-        """Make the update at the cursor."""
+        """Make the update at the cursor, and advance the cursor."""
         row = self._now(self._rows)
         rows = self.table.index_select(0, row)
         logged, conservative, rate, behaviour_rate = self._now(self._scalars).unbind()
@@ -328,7 +327,7 @@ class CapturedUpdates:
         self._cursor.add_(1)
 
     def _captured(self, labels: bool) -> torch.cuda.CUDAGraph:
-        """Capture an update as a graph; the parameters stay as before."""
+        """Capture an update as a graph, and restore the parameters that warming up changed."""
         moved = self.learner.moved
         before = [tensor.clone() for tensor in moved]
         self._cursor.zero_()
