@@ -375,8 +375,8 @@ class FreshStrata:
         names: of the strata (S,), without a store's name.
         conditions: outcomes and exposures that can be evaluated on fresh rows.
 
-    `known` (S,) is whether fresh rows can be in a stratum. They cannot if it is a predicate over the
-    store's columns (`where`), or a condition that cannot be evaluated in the twin.
+    `known` (S,) is whether fresh rows can be in a stratum. They cannot if it is a predicate over
+    the store's columns (`where`), or a condition that cannot be evaluated in the twin.
     """
 
     def __init__(
