@@ -1,1 +1,1 @@
-"""A store, open for reading: views, queries, audits."""
+"""Read a store: its views, queries and audits."""

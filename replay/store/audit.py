@@ -1,13 +1,13 @@
-"""Audits: queries that return offending rows, one a file, with a severity and advice.
+"""Audits: queries that return offending rows, one query per file, with a severity and advice.
 
-The header of an audit's file says what it is:
+Each file begins with a header:
 
     -- severity: error | warning | info
     -- advice: what to do about the rows it returns
     -- doc: what the rows are
-    -- needs: run | panel          (only where it looks at one; run.TABLE: that must have TABLE)
+    -- needs: run | panel          (only if it reads one; run.TABLE: a run that has this table)
 
-`$name` in the query is a threshold, from `audits.toml` or a file of the user's.
+`$name` in the query is a threshold, from `audits.toml` or a file by the user.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ WORST_FIRST: tuple[Status, ...] = ("fail", "warn", "info", "pass", "skipped")
 
 @dataclass(frozen=True)
 class Audit:
-    """One query and what it says of itself."""
+    """An audit's query and header."""
 
     name: str
     severity: Severity
@@ -57,12 +57,12 @@ class Audit:
 
     @property
     def place(self) -> str | None:
-        """Return what it looks at beside the store: "run", "panel" or None."""
+        """Return what it reads besides the store: "run", "panel" or None."""
         return self.needs.split(".")[0] if self.needs else None
 
     @property
     def query(self) -> str:
-        """Return the SQL without its header, whose words name no view."""
+        """Return the SQL without its header, so that words of the header do not create views."""
         return re.sub(r"\A(?:--.*\n)*", "", self.sql)
 
     @property
@@ -73,25 +73,25 @@ class Audit:
 
 @dataclass(frozen=True)
 class Finding:
-    """What one audit found."""
+    """The result of one audit."""
 
     audit: Audit
     status: Status
-    rows: int  # offending rows
+    rows: int  # number of offending rows
     columns: list[str]
-    sample: list[dict[str, Any]]  # the first of them
+    sample: list[dict[str, Any]]  # the first SAMPLE_ROWS of them
     thresholds: Mapping[str, float | str]
 
 
 def shipped_audits() -> list[Audit]:
-    """Return the audits that come with Restock, by name."""
+    """Return the audits that come with Restock, sorted by name."""
     return _load((files("restock.replay.store") / "audits").iterdir(), "restock")
 
 
 def load_audits(folder: str | Path | None = None) -> list[Audit]:
-    """Load the shipped audits and those of a folder; the folder's win if names are equal.
+    """Load the shipped audits and those of a folder, which replace shipped ones of the same name.
 
-    Raises ConfigError for a folder without audits, or a file whose header is not as it must be.
+    Raises ConfigError for a folder without audits, or a file with an invalid header.
     """
     by_name = {audit.name: audit for audit in shipped_audits()}
     if folder is not None:
@@ -104,9 +104,9 @@ def load_audits(folder: str | Path | None = None) -> list[Audit]:
 
 
 def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float | str]]:
-    """Load the shipped thresholds, with those of a file in their place.
+    """Load the shipped thresholds, and override them with those of a file.
 
-    Raises ConfigError for a file that is no TOML or holds anything but tables of values.
+    Raises ConfigError if the file is not TOML, or contains anything but tables of values.
     """
     shipped = (files("restock.replay.store") / "audits.toml").read_text(encoding="utf-8")
     thresholds: dict[str, dict[str, float | str]] = tomllib.loads(shipped)
@@ -125,7 +125,7 @@ def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float
 
 
 def _check_value(key: str, value: object, shipped: float | str | None, where: str) -> None:
-    """Refuse what is of another kind than the shipped threshold, and NaN: no row is above it."""
+    """Refuse values of another type than the shipped threshold, and NaN, which no row exceeds."""
     number = not isinstance(value, bool) and isinstance(value, Real) and not math.isnan(value)
     if shipped is None or (number if isinstance(shipped, int | float) else isinstance(value, str)):
         return
@@ -142,15 +142,14 @@ def run_audits(
     beside: Iterable[str] = (),
     done: Callable[[str], None] = lambda name: None,
 ) -> list[Finding]:
-    """Run audits over a connection with a store's views, worst findings first; `done` is told each.
+    """Run audits over a connection with a store's views; return findings, the worst first.
 
-    `beside` names the schemas that are there: "run", "panel". Audits that need another, or a table
-    that an older run does not have, are skipped.
+    `beside` names the other schemas of the connection: "run", "panel". Audits that need a schema or
+    table that does not exist (older runs lack some) are skipped. `done` is called with each name.
 
     Raises:
-        ConfigError: an audit does not run, a threshold is missing, or one is given that no audit
-            uses.
-        StoreError: the store has no transitions, in which no audit would find anything.
+        ConfigError: an audit's SQL fails, a threshold is missing, or no audit uses a given one.
+        StoreError: the store has no transitions, so no audit could find anything.
     """
     if is_empty(connection):
         raise StoreError(
@@ -212,7 +211,7 @@ def junit_suites(suites: Mapping[str, Sequence[Finding]], failing: Collection[st
 
 
 def _printable(text: str) -> str:
-    """Text without the characters that XML 1.0 cannot hold, not even escaped."""
+    """Replace the characters that XML 1.0 cannot contain, not even escaped."""
     return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
@@ -250,11 +249,13 @@ def _run(
 def check_thresholds(
     audits: Sequence[Audit], thresholds: Thresholds, *, others: bool = False
 ) -> None:
-    """Refuse thresholds that no audit uses. There may be `others`, of names unlike those of these.
+    """Refuse thresholds that no audit uses.
+
+    If there are `others` besides `audits`, unknown names are refused only if they look misspelt.
 
     Raises:
-        ConfigError: a name of an audit or of a threshold that there is not, or a value of another
-            kind than the shipped one's.
+        ConfigError: an unknown name of an audit or threshold, or a value of another type than the
+            shipped one.
     """
     used, shipped = {audit.name: audit.parameters for audit in audits}, load_thresholds()
     for name, table in thresholds.items():
@@ -317,26 +318,26 @@ EFFECTIVE_EPISODES = 50.0
 
 @dataclass(frozen=True)
 class Capacity:
-    """How coverage grows with capacity, and the least capacity that is enough."""
+    """How coverage grows with a buffer's capacity, and the smallest capacity that is enough."""
 
     rows: int  # of the store
-    cells: int  # condition x zone x action cells that were ever seen
-    recommended: int  # rows: the least that keep those cells and episodes
-    cells_share: float
-    effective_episodes: float  # that the rows must be worth
-    rows_for_cells: int  # the least that keep `cells_share` of the cells
-    rows_for_episodes: int | None  # … that are worth so many episodes; None: all rows are not
-    half_share: float  # of the cells, what the newest half of the rows keeps
+    cells: int  # condition x zone x action cells that the store's rows are in
+    recommended: int  # smallest number of newest rows that meets both requirements
+    cells_share: float  # required share of the cells
+    effective_episodes: float  # required number of effective episodes
+    rows_for_cells: int  # smallest number of newest rows that keeps `cells_share`
+    rows_for_episodes: int | None  # the same for `effective_episodes`; None: all rows have fewer
+    half_share: float  # share of the cells that the newest half of the rows keeps
     curve: list[dict[str, Any]]  # capacity, cells, cells_share, conditions, episodes, …
 
     @property
     def saturated(self) -> bool:
-        """Return whether the second half of the rows showed hardly anything new."""
+        """Return whether the newest half of the rows already keeps `cells_share` of the cells."""
         return self.half_share >= self.cells_share
 
     @property
     def reason(self) -> str:
-        """Return in a sentence why the capacity is so large."""
+        """Return a sentence that explains the recommended capacity."""
         cells = (
             f"{self.rows_for_cells:,} of {self.rows:,} rows keep {self.cells_share:.0%} of the"
             f" {self.cells} condition x zone x action cells ever seen"
@@ -357,14 +358,14 @@ def recommend_capacity(
     cells_share: float = CELLS_SHARE,
     effective_episodes: float = EFFECTIVE_EPISODES,
 ) -> Capacity:
-    """Return the least number of newest rows that keep the diversity of a store's tasks.
+    """Recommend a buffer's capacity: the smallest number of newest rows that keeps the diversity.
 
-    They keep `cells_share` of the condition x zone x action cells ever seen, and are worth
-    `effective_episodes`. Below the first, a first-in-first-out buffer forgets whole cells, and no
-    sampling brings them back; below the second, what it holds is a few drives.
+    These rows have `cells_share` of the condition x zone x action cells ever seen, and are worth
+    `effective_episodes`. A smaller first-in-first-out buffer forgets whole cells, which no sampling
+    brings back, or has rows of a few drives only.
 
-    Raises StoreError where there are no transitions, ConfigError for a share that is none, or for
-    a path in place of a connection.
+    Raises StoreError if there are no transitions, ConfigError for a share outside [0, 1], negative
+    effective_episodes, or a path in place of a connection.
     """
     expect("connection", connection, duckdb.DuckDBPyConnection, 'give Store("store").connection')
     if not 0 <= cells_share <= 1 or not effective_episodes >= 0:

@@ -1,6 +1,6 @@
--- How large a buffer must be, by what the newest rows of `transitions` still cover.
+-- How large a buffer must be: what the newest rows of `transitions` cover.
 
--- What a buffer of fewer rows would still cover, the newest rows kept: half of the rows, a quarter, …
+-- What a buffer of the newest rows covers, for capacities of all rows, half of them, a quarter, …
 CREATE OR REPLACE MACRO capacity_curve() AS TABLE
 WITH ranked AS (
     SELECT
@@ -40,8 +40,8 @@ FROM covered
 JOIN kept USING (capacity)
 ORDER BY capacity;
 
--- The least numbers of newest rows that keep `cells_share` of the condition x zone x action cells ever
--- seen, and that are worth `least_episodes` effective episodes; null where all rows are not.
+-- Smallest number of newest rows that has `cells_share` of the condition x zone x action cells ever seen,
+-- and smallest number worth `least_episodes` effective episodes; null if all rows are worth less.
 CREATE OR REPLACE MACRO capacity_needed(cells_share, least_episodes) AS TABLE
 WITH ranked AS (
     SELECT
@@ -58,7 +58,7 @@ WITH ranked AS (
 ), numbered AS (
     SELECT place, row_number() OVER (PARTITION BY episode_id ORDER BY place) AS of_episode
     FROM ranked
-), effective AS (  -- (sum n)^2 / sum n^2 over episodes of n rows, of the newest `place` rows
+), effective AS (  -- (sum n)^2 / sum n^2, where each episode has n of the newest `place` rows
     SELECT place, place::DOUBLE * place / sum(2 * of_episode - 1) OVER (ORDER BY place) AS episodes
     FROM numbered
 )

@@ -1,4 +1,4 @@
--- What people said of labels, one row a correction: a view over `recordings`.
+-- Corrections of labels by people, one row per correction: a view over `recordings`.
 CREATE OR REPLACE VIEW corrections AS
 SELECT
     recording_id,

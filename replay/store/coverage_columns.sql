@@ -1,5 +1,5 @@
--- The columns of `coverage_by_condition`, from `seen` and `by_episode` of each condition. Part of two
--- statements: the view that scans, and the one over summaries.
+-- Columns of `coverage_by_condition`, from `seen` and `by_episode` (one row per condition each). Included in
+-- two statements: the view that scans rows, and the view over summaries.
 SELECT
     condition,
     timing,

@@ -1,8 +1,8 @@
-"""The views and macros of a store: their SQL, and which of them a query needs.
+"""Create the views and macros that a query over a store needs.
 
-DuckDB binds a macro with all its parts when it is created, so creating all of them takes longer
-than most queries over a small store. So a store's connection gets only those that a text names, and
-those that they name in turn; its views are bound when a query uses them.
+DuckDB binds a macro with all its parts when it is created, so creating all macros takes longer than
+most queries over a small store. A store's connection therefore gets only the views and macros that
+a query names, and those that they name in turn. Its views are bound when a query uses them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from restock.replay.store.same_drives import install_same_drives
 
 HELD_CONDITIONS = "held_conditions"  # has every column of `transitions`, and `condition`
 
-# A name's ending -> its unit. Longer endings first.
+# Ending of a column's name -> unit. Longer endings first.
 UNITS = (
     ("_mps2", "m/s²"),
     ("_mps", "m/s"),
@@ -43,12 +43,12 @@ UNITS = (
 
 
 def view_docs() -> dict[str, str]:
-    """Return what each view is, by name."""
+    """Return the description of each view, by name, in the order of columns.toml."""
     return {name: table["doc"] for name, table in _read().items() if name != "shared"}
 
 
 def column_docs() -> dict[tuple[str, str], str]:
-    """Return (view, column) -> meaning where the definitions name it; `meaning` has the rest."""
+    """Return (view, column) -> meaning; ("shared", column) is for views that do not define it."""
     meanings = {
         (view, column): text
         for view, table in _read().items()
@@ -68,12 +68,12 @@ def column_docs() -> dict[tuple[str, str], str]:
 
 
 def unit(column: str) -> str:
-    """Return a column's unit, from its name's ending; "" for none."""
+    """Return a column's unit from the ending of its name, or ""."""
     return next((unit for ending, unit in UNITS if column.endswith(ending)), "")
 
 
 def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the view `columns` over the views that are there."""
+    """Create the view `columns`, which lists the views that exist and their columns."""
     docs, own_units = column_docs(), {}
     for name, own_unit, meaning, topic, path in _custom(connection):
         docs["transitions", name] = meaning or f"{path} of {topic}"
@@ -124,9 +124,9 @@ def _read() -> dict[str, dict[str, str]]:
     return tables
 
 
-# In their order: a view may use those before it.
+# In this order: a view may use earlier ones.
 VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
-FRAMES_SQL = "frames.sql"  # over stored_frames, which a store alone has
+FRAMES_SQL = "frames.sql"  # over stored_frames, which exists only on a store's own connection
 MACROS = (
     "macros.sql",
     "flawed_rows.sql",
@@ -141,13 +141,13 @@ MACROS = (
     "return_order.sql",
     "returns.sql",
 )
-SUMMARIES = "summaries.sql"  # in place of others of the same name, where manifests have summaries
-# What `Store.connection` has from the start, for those who ask it without `install_named`.
+SUMMARIES = "summaries.sql"  # replaces others of the same name if all manifests have summaries
+# What `Store.connection` has from the start, for callers that do not use `install_named`.
 COMMON = ("rows.sql", "views.sql", "labels.sql", "corrections.sql")
-# Views that are held in memory where many queries follow. Of any store, those of few rows that scan
-# many and are asked for more than once; where it has few enough rows, those that others are made
-# of, too: a table takes a tenth of the time to bind, and its columns are read once. Summaries lie
-# in a file of 166 columns for each recording until they are joined.
+# Views to copy into memory before many queries. HELD_OF_MANY: few rows from a scan of many, copied
+# in any store if several queries use them. HELD: views that others are made of, copied in stores of
+# few rows, as a table binds in a tenth of the time and its columns are read once. HELD_SUMMARIES:
+# until manifests are joined, each recording's summary is a file of 166 columns.
 HELD_OF_MANY = ("driven_episodes",)
 HELD_SUMMARIES = ("stored_summaries",)
 HELD = (
@@ -161,7 +161,7 @@ HELD = (
 FEW_ROWS = 100_000  # of about 1 kB
 FEW_SUMMARISED_ROWS = 2_000_000  # of about 50 bytes
 _INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.sql
-# A text with one of these words lists what there is.
+# A query with one of these words lists views, so that all of them must exist.
 LISTS = {
     "columns",
     "information_schema",
@@ -180,21 +180,21 @@ _VIEW = re.compile(r"^(CREATE OR REPLACE VIEW \w+) AS\b", re.MULTILINE)
 
 
 class Definitions:
-    """Views and macros of one connection to a store, made when a query names them.
+    """Views and macros of one connection to a store, created when a query names them.
 
-    They read `stored_transitions`, `stored_recordings` and `stored_ingests`, the list of ingests,
-    which spares a scan of all rows. They last as long as this object.
+    They read `stored_transitions`, `stored_recordings` and `stored_ingests` (the list of ingests,
+    which saves a scan of all rows). They are created on demand as long as this object exists.
 
     Args:
-        connection: that of a store.
-        observation_type: what observations are cast to.
-        summaries: take the common views from `stored_summaries`.
-        tables: what makes a `stored_…` when a text, or a view that one names, names it.
-        replaced: names of tables -> what makes them when a text names one, in place of views that
-            take too long to make for a list.
+        connection: the store's connection.
+        observation_type: DuckDB type that observations are cast to.
+        summaries: whether the common views read `stored_summaries` instead of rows.
+        tables: name of a `stored_…` table -> function that creates it when a query needs it.
+        replaced: names of tables -> function that creates them in place of views of these names
+            when a query names one; they take too long to create for a mere list of views.
 
-    `computed` are table macros that Python computes, in the same form; `made` are the names of the
-    views and macros that there are.
+    `computed` are tables and macros that Python computes, in the form of `replaced`. `made` are the
+    names of the views and macros created so far.
     """
 
     def __init__(
@@ -237,7 +237,7 @@ class Definitions:
         self._make(_statements(definitions(names=COMMON)))
 
     def make_all(self) -> None:
-        """Create all views and macros, and the view `columns` that lists theirs."""
+        """Create all views and macros, and the view `columns`, which lists their columns."""
         self._make(self._statements)
         for names in list(self.computed):
             self.computed.pop(names)()
@@ -258,7 +258,7 @@ class Definitions:
             self.made.update(missing)
 
     def _follow(self, name: str, order: dict[str, None], seen: set[str]) -> None:
-        """Put one after all that it names."""
+        """Append a view or macro to `order`, after all that its definition names."""
         if name in seen:
             return
         seen.add(name)
@@ -269,10 +269,7 @@ class Definitions:
         order[name] = None
 
     def hold(self, views: Sequence[str]) -> None:
-        """Copy the rows of these views into tables of the same names.
-
-        Meanwhile each view has another name.
-        """
+        """Replace these views by tables of their rows; meanwhile the views have other names."""
         self._make(views)
         for view in views:
             self._connection.execute(
@@ -283,7 +280,7 @@ class Definitions:
             self._held.append(view)
 
     def release(self) -> None:
-        """Forget the rows that are held: the tables are views again."""
+        """Drop the tables of `hold`, and give the views their names back."""
         held, self._held = self._held, []
         for view in held:
             self._connection.execute(
@@ -292,22 +289,22 @@ class Definitions:
 
 
 class Maker(Protocol):
-    """Makes tables and views of a connection when a query names them."""
+    """Creator of a connection's tables and views when a query names them."""
 
     def make(self, text: str) -> None:
-        """Make what a text names."""
+        """Create the tables and views that a query names."""
 
     def make_all(self) -> None:
-        """Make all there are."""
+        """Create all tables and views."""
 
 
-# Weakly both ways: they hold their store, and with it the connection.
+# Values are weak too: a Definitions refers to its store, and with it to the connection.
 _OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDictionary()
 _MAKERS: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Maker]] = WeakKeyDictionary()
 
 
 def make_on_demand(connection: duckdb.DuckDBPyConnection, maker: Maker) -> None:
-    """Let a maker look at each query of a connection before it runs, as long as it lives."""
+    """Register a maker to see each query of a connection before it runs, while the maker exists."""
     _MAKERS[connection] = ref(maker)
 
 
@@ -322,14 +319,14 @@ def _of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
 
 
 def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
-    """Make what a text names of a store or of recordings; a run or a panel has all it has."""
+    """Create the views that a query names, if the connection has a maker (stores, recordings)."""
     if (made := _maker(connection)) is not None:
         made.make(text)
 
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
-    """Hold views that several of these queries name in memory until the queries are done."""
+    """Keep views that many of these queries use in memory while the block runs them."""
     made = _of(connection)
     if made is None:
         yield
@@ -338,7 +335,7 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
     try:
         try:
             made.hold([*_held(connection, made), *named])
-        except duckdb.Error:  # rows that cannot be read: the queries that ask for them say so
+        except duckdb.Error:  # unreadable rows are reported by the queries that need them
             made.release()
             if was_interrupted():
                 raise
@@ -348,7 +345,7 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 
 def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
-    """Return what is held of a store of this size."""
+    """Return the views to keep in memory for a store of this size."""
     rows = stored_rows(connection)
     return [
         *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
@@ -357,28 +354,28 @@ def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]
 
 
 def stored_rows(connection: duckdb.DuckDBPyConnection) -> int:
-    """Return how many transitions its files hold."""
+    """Return the number of transitions in a store's files."""
     return connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0] or 0
 
 
 def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Return whether it is that of a store without transitions."""
+    """Return whether a connection is a store's, and the store has no transitions."""
     return connection in _OF and not stored_rows(connection)
 
 
 def is_own(connection: duckdb.DuckDBPyConnection, view: str) -> bool:
-    """Return whether a name means a store's view, and none that a query made in its place."""
+    """Return whether a name is a store's view, and not one that a query created in its place."""
     made = _of(connection)
     if made is None:
         return False
-    if view not in made.made:  # it is made when a query names it
+    if view not in made.made:  # it will be created when a query names it
         return True
     views = "SELECT 1 FROM duckdb_views() WHERE view_name = $1"
     return bool(connection.execute(views, [view]).fetchall())
 
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Make all there are; False for a connection on which nothing is made on demand."""
+    """Create all views; return False if the connection has no maker."""
     made = _maker(connection)
     if made is not None:
         made.make_all()
@@ -386,12 +383,12 @@ def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
 
 
 def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
-    """Create those of COMMON, in the schema in use, over that of one store."""
+    """Create the views of COMMON in the current schema, which must have a store's tables."""
     connection.execute("\n".join(_statements(_of_store(observation_type, COMMON)).values()))
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
-    """Return the text of these SQL files, with the type that observations are cast to."""
+    """Return the SQL of these files, which casts observations to this type."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
     whole = with_included("\n".join(text), folder)
@@ -399,7 +396,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
 
 
 def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the macro `repeated_rows`, over any `transitions`; that of a store need not scan."""
+    """Create the macro `repeated_rows` over any `transitions`; a store's needs no scan of rows."""
     if connection in _OF:
         install_named(connection, "repeated_rows")
     else:
@@ -407,7 +404,7 @@ def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the table `novelty`, over any `transitions`; that of a store may have kept it."""
+    """Create the table `novelty` over any `transitions`; a store may have it saved already."""
     if connection in _OF:
         install_named(connection, "novelty")
     else:
@@ -422,13 +419,13 @@ def _of_store(observation_type: str, names: Sequence[str]) -> str:
 
 
 def made_by(name: str) -> list[str]:
-    """Return the views and macros of one of these files."""
+    """Return the names of the views and macros that an SQL file creates."""
     return list(_statements(definitions(names=[name])))
 
 
 @cache
 def _statements(text: str) -> Mapping[str, str]:
-    """Return each view and macro that a script creates, by name."""
+    """Return the statement that creates each view and macro of a script, by name."""
     begins = [*_BEGINS.finditer(text)]
     ends = [*(one.start() for one in begins[1:]), len(text)]
     parts = ((one[1], text[one.start() : end]) for one, end in zip(begins, ends, strict=True))
@@ -437,7 +434,7 @@ def _statements(text: str) -> Mapping[str, str]:
 
 @cache
 def _named_in(statement: str) -> frozenset[str]:
-    """Return what a statement reads, calls, or has in quotes: there are macros of a view's name."""
+    """Return the names that a statement reads, calls, or passes to macros in quotes."""
     sql = re.sub(r"--.*", "", statement)
     found = re.findall(r"\b(?:FROM|JOIN)\s+(\w+)|\b(\w+)\(|'(\w+)'", sql)
     return frozenset(name for names in found for name in names)

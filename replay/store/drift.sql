@@ -1,15 +1,15 @@
 -- Drift: which robot's wheels, lidar or floor have changed? Each week of a robot is compared with its own
 -- first weeks, and with the other robots of the site in the same week.
 --
--- The steps of an episode are correlated, so no step is a sample of its own. A sample is the median
--- of a recording's episodes (so that what differs from drive to drive, payload, route or operator, is in
--- the error, too) or, where recordings are too few, one episode. Means trimmed by a tenth are compared
--- with Student's test, whose error is from how a robot's samples vary within its periods (Yuen and
--- Dixon 1973); events an hour with a quasi-Poisson score test. p is corrected over all signals, robots
--- and periods (Benjamini and Hochberg 1995).
+-- The steps of an episode are correlated, so a step is not a sample. A sample is the median of a recording's
+-- episodes, so that the error includes differences between drives (payload, route, operator). If recordings are
+-- too few, a sample is one episode. Means, with a tenth trimmed at each end, are compared with Student's test,
+-- whose error is estimated from the variation of a robot's samples within its periods (Yuen and Dixon 1973).
+-- Events per hour are compared with a quasi-Poisson score test. p is corrected over all signals, robots and
+-- periods (Benjamini and Hochberg 1995).
 
--- Two-sided p of Student's t at a whole number of degrees of freedom (Abramowitz and Stegun 26.7.3
--- and 26.7.4; at most 200, which is on the safe side). Smaller ones than 1e-15 are given as that.
+-- Two-sided p of Student's t for a whole number of degrees of freedom (Abramowitz and Stegun 26.7.3 and 26.7.4).
+-- The caller limits these to 200, which errs on the safe side. The result is at least 1e-15.
 CREATE OR REPLACE MACRO student_p(t, df) AS greatest(1e-15, CASE WHEN df % 2 = 1
     THEN 1 - (atan(abs(t) / sqrt(df)) + CASE WHEN df > 1 THEN list_sum(list_transform(
         range(0, (df - 1) // 2),
@@ -25,10 +25,10 @@ END);
 CREATE OR REPLACE MACRO student_quantile(df) AS
     1.959964 + 2.372271 / df + 2.822499 / pow(df, 2) + 2.555853 / pow(df, 3) + 1.589537 / pow(df, 4);
 
--- Every comparison. `every` is the length of a period as date_trunc has it (day, week, month, year,
--- decade); the first `reference` periods that a robot has of a signal are what its later ones are
--- compared with. Fewer than `least_episodes` episodes on a side are too few. Without `sizes`, cliffs_delta
--- and ks_distance are null: they take every value's place among the others.
+-- All comparisons. `every` is the length of a period, as a date_trunc unit (day, week, month, year, decade). A
+-- robot's later periods of a signal are compared with its first `reference` periods. Fewer than `least_episodes`
+-- episodes on either side are too few. Without `sizes`, cliffs_delta and ks_distance, which need a sort of all
+-- values, are null.
 CREATE OR REPLACE MACRO drift_by(every := 'week', reference := 2, least_episodes := 5, sizes := true) AS TABLE
 WITH valued AS (
     SELECT
@@ -75,14 +75,14 @@ WITH valued AS (
         list_stddev_samp(x) AS spread,
         coalesce((n - 1) * list_var_samp(
             list_transform(x, lambda v: least(greatest(v, low), high))
-        ), 0) AS squares -- of the values, those beyond the cut drawn in to it
+        ), 0) AS squares -- sum of squared deviations of the winsorised values
     FROM sorted
     JOIN (SELECT signal, part, compared, matters FROM drift_signals) USING (signal)
 ), means AS (
     SELECT
         * EXCLUDE (squares),
-        -- Of the mean: from how the robot's samples vary within its periods, all of them together. They
-        -- are not believed to vary by less than a tenth of what matters.
+        -- Variance of the mean, from the variation within the robot's periods, pooled over all of them. Samples
+        -- are assumed to vary by at least a tenth of the change that matters.
         greatest(
             sum(squares) FILTER (period IS NOT NULL) OVER own
                 / nullif(sum(kept - 1) FILTER (period IS NOT NULL) OVER own, 0),
@@ -266,7 +266,7 @@ WITH valued AS (
     FROM changed_rates
 ), chosen AS (
     FROM compared_all
-    -- Recordings where there are enough of them, else episodes.
+    -- Compare recordings if there are enough of them, else episodes.
     QUALIFY row_number() OVER (
         PARTITION BY against, part, signal, zone, robot, period
         ORDER BY enough DESC, (samples = 'recordings') = enough DESC
@@ -324,7 +324,7 @@ WITH valued AS (
         ) AS apart_error
     FROM judged
     WINDOW site AS (PARTITION BY against, site, part, signal, zone, period)
-), places AS ( -- of each value, by its size: among those of its period, and among the reference's
+), places AS ( -- rank of each value among the values of its period, and among those of the reference
     SELECT
         *,
         count(*) OVER (PARTITION BY robot, signal, period) AS n,
@@ -400,8 +400,8 @@ ORDER BY robot, against DESC, part, signal, zone NULLS FIRST, period;
 
 CREATE OR REPLACE VIEW drift AS FROM drift_by();
 
--- One line for each robot and signal, or condition, that has changed against its own reference; `tests`
--- is a table of what drift_by gives, `every` the length of its periods.
+-- One row for each robot and signal (or condition) that changed against the robot's own reference. `tests` names
+-- a table with the result of drift_by, `every` is the length of its periods.
 CREATE OR REPLACE MACRO drift_findings_of(tests, every := 'week') AS TABLE
 SELECT
     robot,

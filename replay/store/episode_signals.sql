@@ -1,15 +1,15 @@
--- What drift is looked for in: one value an episode of each signal (episode_signals), and how often
--- each condition began (episode_conditions). drift.sql compares them over weeks. docs/coverage.md says what
--- each signal tells.
+-- The values in which drift is searched: one per episode and signal (episode_signals), and how often each
+-- condition began (episode_conditions). drift.sql compares them week by week. docs/coverage.md explains the
+-- signals.
 
 -- The names of the profiles' own signals.
 CREATE OR REPLACE VIEW custom_signals AS
 -- include: custom_signals.sql
 ;
 
--- What is compared: the part of the robot that a signal tells of, and the least change that matters.
--- A `ratio` is compared as now / before, a `difference` as now - before, a `spread` as a difference in
--- units of the reference's standard deviation between episodes.
+-- The signals that are compared: the part of the robot that each describes, and the smallest change that
+-- matters. `ratio`: now / before; `difference`: now - before; `spread`: the difference in standard deviations
+-- between episodes of the reference.
 CREATE OR REPLACE VIEW drift_signals AS
 SELECT signal, part, compared, CAST(matters AS DOUBLE) AS matters, min_steps
 FROM (VALUES
@@ -40,8 +40,8 @@ FROM (VALUES
 UNION ALL
 SELECT signal, 'custom', 'spread', 0.8, 1 FROM custom_signals;
 
--- One value an episode of each signal, and the steps that it is from: none where those are too few.
--- Recordings without tags are taken for one robot, "untagged".
+-- One value per episode and signal, with its number of steps; no row if the steps are too few. Recordings
+-- without a robot's tag count as one robot, "untagged".
 CREATE OR REPLACE VIEW episode_signals AS
 SELECT
     coalesce(robot, 'untagged') AS robot,
@@ -59,7 +59,7 @@ JOIN (SELECT recording_id, episode_id, robot, site, logged_start_time FROM episo
     USING (recording_id, episode_id)
 WHERE measured_signals.steps >= min_steps AND (compared <> 'ratio' OR value > 0);
 
--- How each signal is distributed, between the episodes of a robot's week.
+-- Distribution of each signal over the episodes of a robot's week.
 CREATE OR REPLACE VIEW signal_weeks AS
 SELECT
     robot,
@@ -79,8 +79,8 @@ FROM episode_signals
 GROUP BY ALL
 ORDER BY robot, signal, week;
 
--- Steps and events (runs of steps) of each condition in an episode, by zone: those in which it never
--- held included. The zone null is all of them together.
+-- Steps and events (runs of steps) of each condition per episode and zone, including zones and episodes where
+-- it never held. Zone null is the whole map.
 CREATE OR REPLACE VIEW episode_conditions AS
 WITH driven AS (
     SELECT
@@ -130,7 +130,7 @@ LEFT JOIN held
     AND held.zone IS NOT DISTINCT FROM driven.zone
     AND held.condition = kinds.condition;
 
--- How often each condition began, by robot, zone (null: all together) and week.
+-- How often each condition began, by robot, zone (null: the whole map) and week.
 CREATE OR REPLACE VIEW condition_weeks AS
 SELECT
     robot,

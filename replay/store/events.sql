@@ -1,11 +1,11 @@
--- Events: each time that a condition began, until it ended, and what came of it.
+-- Events: each run of steps at which a condition holds, and how it ended.
 --
--- An event is a longest run of consecutive steps of one episode at which a condition holds, whatever
--- else holds there. It is recovered from where a later step of its episode is nominal (no condition
--- holds), or the episode reached its goal; open where neither, and the episode goes on to the end
--- of its recording (or of what is in the store); else, the episode having ended, it is not.
+-- An event is a maximal run of consecutive steps of one episode at which a condition holds, whatever else
+-- holds there. Its outcome is `recovered` if a later step of the episode is nominal (no condition holds) or
+-- the episode reached its goal. Otherwise it is `open` if the episode lasts to the end of its recording (or
+-- of its rows in the store), and `not recovered` if the episode ended before.
 
--- Which event a row is of, once for each condition that holds: joins `transitions` and `events`.
+-- The event of each row and condition that holds in it: joins `transitions` and `events`.
 CREATE OR REPLACE VIEW event_rows AS
 SELECT
     transition_id,

@@ -1,7 +1,7 @@
--- Exposures: the situations that rows were in, whatever came of them, beside their conditions. Views
--- over `recordings`, `transitions` and `episodes`.
+-- Exposures: the situations of rows, whatever the outcome. Views over `recordings`, `transitions` and
+-- `episodes`.
 
--- The exposures that are told of the store's rows, of the newest ingest.
+-- The exposures of the newest ingest.
 CREATE OR REPLACE VIEW exposures AS
 SELECT
     spec.name AS exposure,
@@ -18,13 +18,13 @@ FROM (
     FROM (SELECT * FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1)
 );
 
--- One line for each exposure that holds in a row.
+-- One row for each transition and exposure that holds in it.
 CREATE OR REPLACE VIEW held_exposures AS
 SELECT transition_id, recording_id, episode_id, unnest(exposures) AS exposure, action, zone, robot
 FROM transitions;
 
--- One line an exposure, those never met included: of all its rows and episodes, whatever came of them;
--- nulls of one that no row tells.
+-- One row per exposure, including exposures never met: all its rows and episodes, whatever the outcome. Counts
+-- are null if the exposure is unknown in all recordings.
 CREATE OR REPLACE VIEW coverage_by_exposure AS
 SELECT
     exposure,
@@ -64,9 +64,10 @@ LEFT JOIN (
 CROSS JOIN (SELECT count(*) AS all_rows, count(DISTINCT episode_id) AS all_episodes FROM transitions)
 ORDER BY episodes DESC, exposure;
 
--- Each condition against the situations that its episodes met: does it leave out what went well? One
--- line a condition and exposure that share episodes. `situation` 1 is the exposure that most sets the
--- condition's episodes apart: of those that half of them met or more, the one that others meet least.
+-- Each condition compared with the situations that its episodes met: does a stratum of the condition leave out
+-- episodes that went well? One row per condition and exposure that share episodes. `situation` 1 is the
+-- condition's situation: among the exposures that at least half of its episodes met, the one that other
+-- episodes meet least.
 CREATE OR REPLACE VIEW success_by_exposure AS
 WITH met AS (
     SELECT DISTINCT exposure, episode_id FROM held_exposures
@@ -120,7 +121,7 @@ SELECT
     met_share,
     left_out_episodes,
     left_out_success_share,
-    -- Of the two shares' difference, in standard errors where there were none.
+    -- The difference of the two shares, in its standard errors under the assumption of equal shares.
     (left_out_success_share - success_share) / nullif(sqrt(
         (episodes * success_share + left_out_episodes * left_out_success_share)
         / (episodes + left_out_episodes)

@@ -1,5 +1,4 @@
--- Rows with values that none may have, from the rows. Where manifests name them (summaries.sql),
--- nothing is scanned.
+-- Rows with invalid values, by a scan of all rows. summaries.sql reads them from manifests instead.
 CREATE OR REPLACE VIEW flawed_rows AS
 -- include: flawed_rows.sql
 ;

@@ -1,7 +1,7 @@
--- A fleet's weeks and robots: what was driven under which condition, and what happened, cells never
--- seen included. An episode is of the week in which it began, by log time: counts add up over weeks.
+-- Weeks and robots of a fleet: what was driven in which condition, and what happened, including cells never
+-- seen. An episode counts for the week in which it began, by log time, so counts can be added up over weeks.
 
--- One row a robot, week and condition.
+-- One row per robot, week and condition.
 CREATE OR REPLACE VIEW coverage_by_week AS
 WITH of_episode AS (
     SELECT
@@ -79,7 +79,7 @@ FROM cells
 GROUP BY robot, week, condition
 ORDER BY robot, week, condition;
 
--- One row a robot and condition.
+-- One row per robot and condition.
 CREATE OR REPLACE VIEW coverage_by_robot AS
 SELECT
     robot,

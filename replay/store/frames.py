@@ -1,4 +1,4 @@
-"""Frames of cameras for rows of a store: kept as they were recorded, decoded when asked.
+"""Read camera frames for rows of a store. Frames are stored as recorded, and decoded on demand.
 
 images = [frame.image() for frame in camera_frames(store, "FROM transitions LIMIT 8", "front")]
 """
@@ -18,14 +18,14 @@ from restock.ingest.steps.cameras import ImageLayout, ImageProblem, pixels
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
-BATCH_BYTES = 32 << 20  # of images that are in memory together
+BATCH_BYTES = 32 << 20  # of frames that are in memory together
 _LAYOUT = ("encoding", "width", "height", "channels", "bits", "row_bytes", "big_endian")
 _OWN = ("topic", "log_time_ns", "stamp_ns", "size_bytes", "sha256", "data")
 
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """The frame in force at a transition's step, and where it comes from."""
+    """The camera frame in force at a transition's step, and its source."""
 
     transition_id: int
     recording_id: str
@@ -36,7 +36,7 @@ class CameraFrame:
     stamp_ns: int  # when it was taken, on the recording's alignment clock
     age_s: float  # at the step
     size_bytes: int
-    sha256: str  # of the bytes as the recording has them
+    sha256: str  # of the bytes as recorded
     source_file: str
     data: bytes
     layout: ImageLayout
@@ -45,7 +45,7 @@ class CameraFrame:
         """Decode the pixels, (H, W) or (H, W, C): RGB or RGBA; uint8, uint16 or float32.
 
         Raises:
-            StoreError: its bytes are not those that were recorded, or are no image.
+            StoreError: its bytes differ from the recorded ones, or are not an image.
         """
         where = f"frame {self.frame_index} of {self.topic}, recording {self.recording_id}"
         if hashlib.sha256(self.data).hexdigest() != self.sha256:
@@ -69,16 +69,16 @@ def camera_frames(
 ) -> Iterator[CameraFrame]:
     """Yield the frames in force at the steps of some rows, by recording, step and camera.
 
-    A row at which no frame is in force gives none. Some dozens of frames are in memory at a time.
+    Rows without a frame in force are left out. About BATCH_BYTES of frames are in memory at a time.
 
     Args:
         store: an open store.
-        rows: SQL over its views that gives `transition_id`, or such ids.
+        rows: SQL over its views with a column `transition_id`, or such ids.
         camera: its name in the profile; None: every camera.
 
     Raises:
         StoreError: the store has no such camera.
-        QueryError: a query that does not run, or gives no transition_id.
+        QueryError: the query fails, or has no column transition_id.
     """
     have = cameras_of(store)
     if camera is not None and camera not in have:
@@ -115,7 +115,7 @@ def camera_frames(
 
 
 def cameras_of(store: Store) -> list[str]:
-    """Return the cameras that a store has frames of."""
+    """Return the names of the cameras that a store has frames of."""
     rows = store.sql("SELECT DISTINCT camera FROM frames ORDER BY ALL").fetchall()
     return [str(name) for (name,) in rows]
 

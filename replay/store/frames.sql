@@ -1,4 +1,4 @@
--- Frames of cameras, over stored_frames (the files that manifests name).
+-- Camera frames, over stored_frames (the frame files that manifests name).
 
 CREATE OR REPLACE VIEW frames AS
 SELECT
@@ -7,7 +7,7 @@ SELECT
     make_timestamp(stamp_ns // 1000) AS stamp_time
 FROM stored_frames;
 
--- The last frame received at each transition's step, where it is not too old.
+-- The last frame of each camera received at a transition's step, if it is not too old.
 CREATE OR REPLACE VIEW transition_frames AS
 SELECT
     steps.transition_id,

@@ -1,7 +1,7 @@
--- How good the labels are, where a simulator knew the true conditions: views over `recordings` and
--- `transitions`.
+-- Quality of labels, in recordings where a simulator recorded the true conditions: views over `recordings`
+-- and `transitions`.
 
--- Each recording's scores, by step and by event.
+-- Scores of each recording, by step and by event.
 CREATE OR REPLACE VIEW label_scores AS
 SELECT
     scores.recording_id,
@@ -42,7 +42,7 @@ LEFT JOIN (
 ) AS counts ON scores.recording_id = counts.recording_id AND scores.condition = counts.condition
 ORDER BY recording_id, condition;
 
--- The same over all recordings: counts are added up, not ratios.
+-- Scores over all recordings, from the sums of their counts.
 CREATE OR REPLACE VIEW pooled_label_scores AS
 SELECT
     condition,
@@ -58,7 +58,7 @@ FROM label_scores
 GROUP BY condition
 ORDER BY condition;
 
--- Of the rows whose probability is about p, is it true in a share of p? By tenths of probability.
+-- Calibration: of rows with a probability near p, a share of about p should be true. By tenths of probability.
 CREATE OR REPLACE VIEW label_reliability AS
 SELECT
     condition,

@@ -1,6 +1,6 @@
--- Table macros: questions with parameters. FROM cells_below(100);
+-- Table macros, for example: FROM cells_below(100);
 
--- Condition x action cells with fewer than `minimum` rows, empty ones included.
+-- Condition x action cells with fewer than `minimum` rows, including empty cells.
 CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
 SELECT condition, action, action_name, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
 FROM (SELECT condition FROM conditions UNION SELECT condition FROM held_conditions)
@@ -11,7 +11,7 @@ ANTI JOIN untold_conditions USING (condition)
 WHERE coalesce(rows, 0) < minimum
 ORDER BY condition, action;
 
--- Age of the rows of each condition at a moment, in days.
+-- Age of each condition's rows at a moment, in days.
 CREATE OR REPLACE MACRO ages_at(moment) AS TABLE
 SELECT
     condition,
@@ -23,7 +23,7 @@ FROM held_conditions
 GROUP BY condition
 ORDER BY rows_held DESC, condition;
 
--- Rows whose observation and action are the same as another's after rounding.
+-- Groups of rows with the same action and, after rounding, the same observation.
 CREATE OR REPLACE MACRO near_duplicates(decimals) AS TABLE
 SELECT
     min(transition_id) AS transition_id,
@@ -42,9 +42,8 @@ FROM transitions
 WHERE episode_id = id
 ORDER BY step_index;
 
--- Each episode with the one condition that best says what it was about: of those that held for at
--- least `min_steps` steps, the one that held longest (of several, the first by name); else nominal. The
--- true condition, where known.
+-- The kind of each episode: the condition that held longest (if equally long, the first by name) among those
+-- that held for at least `min_steps` steps, else nominal. True conditions are used in rows that have them.
 CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
 WITH held AS (
     SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind

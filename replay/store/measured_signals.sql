@@ -1,7 +1,7 @@
--- What drift is looked for in, from the rows. Where manifests keep it (summaries.sql), nothing is
--- scanned.
+-- The values in which drift is searched, by a scan of all rows. summaries.sql reads them from manifests
+-- instead.
 
--- One value an episode of each signal.
+-- One value per episode and signal.
 CREATE OR REPLACE VIEW measured_signals AS
 (
     -- include: measured_signals.sql
@@ -11,12 +11,12 @@ UNION ALL BY NAME
     -- include: measured_custom_signals.sql
 );
 
--- Steps of each episode by zone.
+-- Steps per episode and zone.
 CREATE OR REPLACE VIEW zone_steps AS
 -- include: zone_steps.sql
 ;
 
--- Steps and events of each condition, by episode and zone.
+-- Steps and events per episode, zone and condition.
 CREATE OR REPLACE VIEW condition_steps AS
 -- include: condition_steps.sql
 ;

@@ -1,10 +1,10 @@
-"""Novelty: how far an observation is from those of other episodes. It finds what no rule names.
+"""Novelty: how far an observation is from those of other episodes. It finds what no rule describes.
 
-A row's novelty is the mean distance from its observation, as the task scales it, to the NEAREST of
-REFERENCE rows of the task, without those of the row's own episode. The reference is drawn by ids,
-so neither files nor threads change it. Because it is bounded, the cost grows with the rows alone,
-and the nearest are always the same part of all driving: what is rare stays strange, however many
-rows a store has of it.
+The novelty of a row is the mean distance of its observation (scaled by the task) to the NEAREST
+observations among REFERENCE rows of the task, without rows of its own episode. The reference rows
+are drawn by hashes of their ids, so files and threads do not change them. As their number is fixed,
+the cost is linear in the rows of the store, and what is rare in the store stays novel, however many
+rows of it there are.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from restock.replay.store.parquet_views import passed_in
 if TYPE_CHECKING:
     from restock.replay.store.store import Store
 
-REFERENCE = 2_000  # rows of each task that others are compared with
-NEAREST = 10  # of them
-NOVEL_SHARE = 0.01  # of a task's rows are `novel`, those of the largest novelty
-QUICK_ROWS = 100_000  # measured within seconds
-KEPT = "novelty.parquet"  # in a store: the table `novelty` of the files that it names
+REFERENCE = 2_000  # reference rows per task
+NEAREST = 10  # nearest reference rows, whose mean distance is the novelty
+NOVEL_SHARE = 0.01  # share of a task's rows that are `novel`: those with the largest novelty
+QUICK_ROWS = 100_000  # up to so many rows, measuring takes seconds
+KEPT = "novelty.parquet"  # in a store: the table `novelty`; its metadata has a hash of the files
 T = TypeVar("T", pa.Table, pa.RecordBatch)
 _BATCH_ROWS = 65_536
-_AT_A_TIME = 512  # rows that are compared
-_ENTRIES = 3  # of an observation that are named as what is strange about it
+_AT_A_TIME = 512  # rows compared at a time
+_ENTRIES = 3  # observation entries that are reported as unusual
 _COLUMNS = "task_hash, episode_id, transition_id, observation"
-# The order of `hash` may change with DuckDB's version.
+# md5, because DuckDB's `hash` may change with its version.
 _REFERENCE = f"""
     SELECT {_COLUMNS}
     FROM transitions
@@ -84,11 +84,11 @@ _NOVEL_ROWS = """
 
 @dataclass(frozen=True)
 class Reference:
-    """R rows of one task that others are compared with."""
+    """R reference rows of one task."""
 
     observation: F32  # (R, D)
     episodes: pa.Array  # ids
-    episode: Ints  # (R,) index into them
+    episode: Ints  # (R,) index into `episodes`
 
     @classmethod
     def of(cls, rows: pa.Table) -> Reference:
@@ -96,9 +96,9 @@ class Reference:
         return cls(_observations(rows), coded.dictionary, coded.indices.to_numpy())
 
     def compare(self, observation: F32, episode_id: pa.Array) -> tuple[Ints, F32]:
-        """Return the nearest rows of other episodes, (N, NEAREST), and the novelty, (N,).
+        """Return the nearest reference rows of other episodes, (N, NEAREST), and the novelty, (N,).
 
-        The novelty is NaN if there are not so many.
+        The novelty is NaN if other episodes have fewer than NEAREST reference rows.
         """
         near = np.zeros((len(observation), NEAREST), np.int64)
         novelty = np.full(len(observation), np.nan, np.float32)
@@ -110,11 +110,11 @@ class Reference:
         square = np.square(self.observation).sum(axis=1)
         for begin in range(0, len(observation), _AT_A_TIME):
             part = slice(begin, begin + _AT_A_TIME)
-            # Squared distances, but for a number of each row: (n, R).
+            # Squared distances, less the observation's own square, which orders them alike: (n, R).
             distance = square - 2 * (observation[part] @ self.observation.T)
             distance[own[part, None] == self.episode] = np.inf
             found = np.argpartition(distance, NEAREST - 1, axis=1)[:, :NEAREST]
-            found.sort(axis=1)  # the sum must not depend on how they were found
+            found.sort(axis=1)  # a fixed order, so that the sum is always the same
             gap = observation[part, None] - self.observation[found]
             near[part] = found
             novelty[part] = np.linalg.norm(gap, axis=2).mean(axis=1)
@@ -124,7 +124,7 @@ class Reference:
 
 
 def read_novelty(connection: duckdb.DuckDBPyConnection) -> pa.Table:
-    """Return `transition_id`, `novelty` and `novel` of each of the connection's `transitions`."""
+    """Measure the novelty of a connection's `transitions`: transition_id, novelty and novel."""
     references = _read_references(connection)
     measured = [_MEASURED.empty_table()]
     rows = connection.sql(f"SELECT {_COLUMNS} FROM transitions").to_arrow_reader(_BATCH_ROWS)
@@ -132,7 +132,7 @@ def read_novelty(connection: duckdb.DuckDBPyConnection) -> pa.Table:
         for number, (task, reference) in enumerate(references.items()):
             part = _of_task(batch, task)
             _, novelty = reference.compare(_observations(part), part["episode_id"])
-            # A copy: any column of DuckDB's batch holds all of it, observations too.
+            # A copy: a column of DuckDB's batch would keep the whole batch in memory.
             ids = part["transition_id"].to_numpy().copy()
             known = pa.array(novelty, from_pandas=True)  # NaN is null
             arrays = [pa.repeat(pa.scalar(number, pa.int16()), len(ids)), pa.array(ids), known]
@@ -142,9 +142,9 @@ def read_novelty(connection: duckdb.DuckDBPyConnection) -> pa.Table:
 
 
 def kept_novelty(store: Store) -> pa.Table:
-    """Return what `read_novelty` does, from the store if it was measured of the same files.
+    """Return the table of `read_novelty`, from the store if it was measured for the same files.
 
-    Else measure it, and keep it in the store if that can be written.
+    Otherwise measure it and save it in the store, if the store can be written.
     """
     if _is_kept(store):
         return store.path.read(KEPT)
@@ -155,7 +155,7 @@ def kept_novelty(store: Store) -> pa.Table:
 
 
 def at_hand(store: Store) -> bool:
-    """Return whether the novelty of its rows was measured, or is within seconds."""
+    """Return whether the novelty of a store's rows was measured, or can be within seconds."""
     return stored_rows(store.bare) <= QUICK_ROWS or _is_kept(store)
 
 
@@ -171,10 +171,10 @@ def _mark(store: Store) -> dict[bytes, bytes]:
 
 
 def strangest(store: Store, limit: int = 20) -> list[dict[str, Any]]:
-    """Return the rows of the largest novelty, at most one an episode, the strangest first.
+    """Return the rows with the largest novelty, at most one per episode, in descending order.
 
-    `strange` names the entries of the observation that are furthest from the nearest rows, each
-    with its value and their mean.
+    `strange` lists the observation entries that differ most from the nearest reference rows, each
+    with its value and the mean of these rows.
     """
     rows = store.sql(
         "SELECT transition_id::VARCHAR AS row, round(novelty::DOUBLE, 2) AS novelty, '' AS strange,"
@@ -201,16 +201,16 @@ def strangest(store: Store, limit: int = 20) -> list[dict[str, Any]]:
 
 
 def novel_rows(store: Store) -> dict[str, Any]:
-    """Return a line for the novel rows, as `coverage_by_condition` has one for each condition.
+    """Return a row for the novel rows, like those of `coverage_by_condition` for each condition.
 
-    `nominal_rows` are those of them in which no condition holds.
+    `nominal_rows` counts the novel rows in which no condition holds.
     """
     (line,) = store.sql(_NOVEL_ROWS).to_arrow_table().to_pylist()
     return dict(line)
 
 
 def novel_rows_said(found: Mapping[str, Any]) -> str:
-    """Say what a line of `novel_rows` means."""
+    """Return a sentence that explains the result of `novel_rows`."""
     return (
         f"Novel are the {NOVEL_SHARE:.0%} of the rows whose observations are furthest from those of"
         f" other episodes: {found['nominal_rows']:,} of {found['rows_held']:,} hold no condition."

@@ -1,6 +1,6 @@
-"""Views over Parquet files and Arrow tables on a DuckDB connection.
+"""Create views over Parquet files and Arrow tables on a DuckDB connection.
 
-DuckDB's errors about damaged files of a store become errors that say what to do.
+DuckDB's errors about damaged files of a store become errors with a remedy.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from restock.ingest.task.schema import DOCUMENTS
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
-# A file of a store, as DuckDB quotes it.
+# A file of a store in DuckDB's error messages.
 _FILE = re.compile(
     rf"""["'](?P<store>[^"']+)/(?P<file>(?:{TRANSITIONS}|{RECORDINGS}|{FRAMES})/[^"']+\.parquet)["']"""
 )
-# Of some damage DuckDB does not say in which file it is.
+# Errors by which DuckDB reports damage without naming the file.
 _NAMELESS = re.compile(
     r"TProtocolException|[Dd]ecompress|[Tt]hrift|[Pp]arquet (?:file|page|reader)"
 )
@@ -75,7 +75,7 @@ def read_parquet(
     file is opened.
 
     Raises:
-        StoreError: one of them is missing or damaged.
+        StoreError: a file is missing or damaged.
     """
     try:
         if kinds is None:
@@ -97,9 +97,9 @@ def parquet_view(
     *,
     schema: str | None = None,
 ) -> str:
-    """Return the statement that creates such a view.
+    """Return the statement that creates a view over Parquet files, of unknown columns.
 
-    Each query that names the view opens every file to find out its columns.
+    Each query that names the view opens every file to find its columns.
     """
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
     listed = ", ".join(map(literal, files))
@@ -114,10 +114,10 @@ def _view_of_known(
     *,
     schema: str,
 ) -> None:
-    """Create a view of columns of these types.
+    """Create a view over Parquet files with the column types `kinds`.
 
-    Files and types are variables of the connection. If they were part of the view, each query that
-    names it would parse them again.
+    Files and types become variables of the connection. As part of the view, they would be parsed
+    again by each query that names it.
     """
     fields = ", ".join(
         f"{literal(column)}: {{name: {literal(column)}, type: {literal(kind)},"
@@ -134,9 +134,9 @@ def _view_of_known(
 
 
 def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | None:
-    """Translate a query's error if its cause is a damaged or missing file; else return None.
+    """Return a StoreError if a query failed because of a damaged or missing file, else None.
 
-    `where` is the store to name if DuckDB does not name the file.
+    The error names the store `where` if DuckDB does not name the file.
     """
     text = str(error)
     if isinstance(error, _OTHER):
@@ -162,39 +162,39 @@ def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | Non
 
 
 def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
-    """Return the columns of an Arrow schema with DuckDB's types."""
+    """Return the DuckDB type of each column of an Arrow schema."""
     with passed_in(connection, columns_of_schema=schema.empty_table()):
         rows = connection.sql("DESCRIBE columns_of_schema").fetchall()
     return {str(row[0]): str(row[1]) for row in rows}
 
 
 def literal(value: object) -> str:
-    """Return a value as a text in SQL; None as NULL."""
+    """Return a value as a string literal of SQL; None as NULL."""
     return "NULL" if value is None else "'" + str(value).replace("'", "''") + "'"
 
 
 _TEXT = pa.dictionary(pa.int32(), pa.string())
-FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
+FEW_FILES = 64  # up to so many, reading one by one is faster than importing Arrow's data sets
 
 
 @dataclass(frozen=True)
 class StoredTable:
-    """The files of one table at the version that is open, and what is read of them."""
+    """The files of one table of a store, and the columns to read from them."""
 
     place: Location
     view: str
     table: str
-    schema: pa.Schema
-    paths: Sequence[str]  # in the table
+    schema: pa.Schema  # columns to read
+    paths: Sequence[str]  # relative to the table
 
     @cached_property
     def addresses(self) -> list[str]:
-        """Return the files' names as DuckDB's readers report them."""
+        """Return the full paths or addresses of the files."""
         folder = self.place.table(self.table)
         return [f"{folder}/{path}" for path in self.paths]
 
     def present(self, connection: duckdb.DuckDBPyConnection, *, schema: str = "main") -> None:
-        """Create the view; files on S3 are read at each query.
+        """Create the view over the files, which are read at each query (on S3 by Arrow).
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -226,7 +226,7 @@ class StoredTable:
             ) from error
 
     def row_groups(self, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Yield the rows in parts: of these columns, as `Location.row_groups` names them.
+        """Yield the rows of each row group, with columns as for `Location.row_groups`.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -252,7 +252,7 @@ class StoredTable:
         return dataset.FileSystemDataset(fragments, self.schema, parquet, self.place.files)
 
     def _read_each(self) -> pa.Table:
-        """Read the manifests file by file; a text that many recordings share is kept once."""
+        """Read the manifests file by file, with texts that many recordings share stored once."""
         schema = pa.schema(
             [field.with_type(_TEXT) if field.name in DOCUMENTS else field for field in self.schema]
         )
@@ -271,9 +271,9 @@ class StoredTable:
 def manifest_tables(
     place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
 ) -> tuple[StoredTable, StoredTable]:
-    """Return two tables of these transition files' manifests: without summaries, and summaries.
+    """Return the manifests of these transition files as two tables with different columns.
 
-    They are `stored_recordings` and `stored_summaries`.
+    These are `stored_recordings`, without the summaries, and `stored_summaries`.
     """
     paths = _manifests(place, recordings, held)
     columns = pa.schema(recordings.schema().to_arrow())
@@ -292,7 +292,7 @@ def register(
     *,
     schema: str = "main",
 ) -> None:
-    """Create a view of an Arrow table or data set in a schema that exists."""
+    """Create a view over an Arrow table or data set in an existing schema."""
     name = view if schema == "main" else f"{schema}_{view}"
     connection.register(name, rows)
     if name != view:
@@ -300,10 +300,10 @@ def register(
 
 
 def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
-    """Return the files of the manifests of these rows, those of an older version included.
+    """Return the manifest files of these transition files, also for rows of an older version.
 
-    A manifest is removed from `recordings` when its rows are replaced. A reader of the earlier rows
-    (of a version, or between the writer's two commits) finds it by its name.
+    A manifest is removed from `recordings` when its rows are replaced. A reader of the old rows (at
+    an older version, or between the writer's two commits) still finds it by its file name.
     """
     wanted = {one.ingest_id: one for file in held for one in file.ingests}
     active = [

@@ -1,4 +1,4 @@
-"""Queries: read-only, with errors worth reading."""
+"""Run read-only SQL queries, and turn DuckDB's errors into errors with a remedy."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from restock.replay.store.parquet_views import damage
 
 T = TypeVar("T")
 
-# A table of DuckDB's own that is spelled a little like what was asked for: never what was meant.
+# DuckDB suggests its internal tables for a misspelt name; they are never what was meant.
 _OWN_TABLE = re.compile(
     r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information|stored_\d+)_[^"]*"\?'
 )
 ZONED = "TIMESTAMP WITH TIME ZONE"
-# Statements that leave files as they are; CREATE makes tables and macros in memory.
+# Statements that change no files; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "CREATE", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
 _WITHOUT_ROWS = {"CREATE", "SET", "VARIABLE_SET"}
-# ANALYZE runs what it explains.
+# The beginning of an EXPLAIN. EXPLAIN ANALYZE also runs the statement.
 _GAP = r"(?:\s|--[^\n]*\n|/\*.*?\*/)*"
 _EXPLAIN = re.compile(
     rf"{_GAP}EXPLAIN\b{_GAP}(?:ANALYZE\b)?{_GAP}(?:\([^()]*\))?", re.IGNORECASE | re.DOTALL
 )
-# A PIVOT whose columns are the data's is several statements to DuckDB; so is a COPY of one.
+# A PIVOT with columns from data is a MULTI statement in DuckDB; so is a COPY of such a PIVOT.
 _PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
 
 
@@ -45,14 +45,14 @@ def query(
     alone: bool = False,
     only_select: bool = False,
 ) -> duckdb.DuckDBPyRelation:
-    """Run one query, the last of several statements.
+    """Run all statements of a text, and return the rows of the last one.
 
-    Set `alone` if nothing else uses the connection afterwards. Then a last statement that returns
-    no rows is refused. With `only_select`, so is any statement that is not a SELECT.
+    Set `alone` if nothing else uses the connection afterwards: then a last statement without rows
+    is refused. With `only_select`, every statement that is not a SELECT is refused.
 
     Raises:
         StoreError: a file of the store is damaged or missing.
-        QueryError: DuckDB refused it, it is no query, or it would write.
+        QueryError: DuckDB refused a statement, there is none, or one would write.
     """
     if _COUNT.fullmatch(text) and is_own(connection, "transitions"):
         text = _COUNTED
@@ -101,7 +101,7 @@ def query(
 def _reads(
     connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement, allowed: Collection[str]
 ) -> bool:
-    """Return whether a statement leaves files and the store's views as they are."""
+    """Return whether a statement is allowed: it changes neither files nor the store's views."""
     if statement.type.name != "EXPLAIN":
         return statement.type.name in allowed or _pivots(statement)
     explained = _EXPLAIN.sub("", statement.query, count=1)
@@ -121,8 +121,8 @@ def _pivots(statement: duckdb.Statement) -> bool:
 def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
     """Return whether the query joins tables by commas.
 
-    In their written order some tables would be cross joined, so DuckDB must choose the order, from
-    here on in this connection.
+    In the written order, such tables could become a cross join. So the caller lets DuckDB choose
+    the order of joins, for this and all later queries of the connection.
     """
     tree = connection.execute("SELECT json_serialize_sql($1::VARCHAR)", [text]).fetchall()[0][0]
     return '"ref_type":"CROSS"' in tree
@@ -131,8 +131,8 @@ def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
 def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
     """Run the job; if a table is not found, create all views of the store and run it again.
 
-    A query may build a view's name from parts. For a misspelt name DuckDB then suggests the nearest
-    one.
+    This serves queries that build a view's name from parts, and DuckDB's suggestions for misspelt
+    names.
     """
     try:
         return job()
@@ -142,7 +142,7 @@ def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
         return job()
 
 
-# `SELECT count(*) FROM transitions`, alone: Delta's log has the answer.
+# `SELECT count(*) FROM transitions`, and nothing else: answered from Delta's log.
 _COUNT = re.compile(r"\s*select\s+count\(\s*\*?\s*\)\s+from\s+transitions\s*;?\s*", re.IGNORECASE)
 _COUNTED = (
     'SELECT CAST(coalesce(sum("rows"), 0) AS BIGINT) AS "count_star()"'
@@ -159,12 +159,12 @@ def fetch(
     alone: bool = False,
     only_select: bool = False,
 ) -> tuple[list[str], list[tuple[Any, ...]], int]:
-    """Return column names, the first `at_most` rows and the number of rows; Ctrl-C stops it.
+    """Return column names, the first `at_most` rows, and the number of all rows. Ctrl-C stops it.
 
-    Of several columns of a name, as a join gives, the later ones are `name_1`, `name_2`, …
+    If several columns have the same name, as after a join, later ones become `name_1`, `name_2`, …
 
     Raises:
-        QueryError: as `query` does, also for what goes wrong while it runs.
+        QueryError: as `query` does, also for errors while the query runs.
         KeyboardInterrupt: the query was stopped.
     """
 
@@ -186,7 +186,7 @@ def fetch(
 def write_parquet(
     connection: duckdb.DuckDBPyConnection, text: str, path: Path, *, where: str
 ) -> None:
-    """Write the rows of a query to a Parquet file, as they come.
+    """Write the rows of a query to a Parquet file, without collecting them in memory.
 
     Raises:
         QueryError: as `fetch` does.
@@ -203,7 +203,7 @@ def write_parquet(
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Make column names distinct as DuckDB does for a table of these columns."""
+    """Make column names distinct, in the way DuckDB does when it creates a table."""
     given: list[str] = []
     for name in names:
         free = (f"{name}_{number}" for number in count(1))
@@ -217,7 +217,8 @@ def found(
 ) -> tuple[list[str], list[tuple[Any, ...]]]:
     """Return column names and rows of a query with `$name` parameters; times as in `values`.
 
-    It is bound once: over many views that takes longer than to run it over a small store.
+    The query is bound only once: for many views, binding takes longer than running it on a small
+    store.
     """
     connection.execute(text, given)
     columns = connection.description or []
@@ -229,13 +230,13 @@ def found(
 def rows_of(
     connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
 ) -> list[dict[str, Any]]:
-    """Return the rows of a query by column, as `found` does."""
+    """Return the rows of a query as dictionaries, like `found` otherwise."""
     columns, rows = found(connection, text, given)
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
-    """Return the rows of a relation; times with a zone as text in UTC."""
+    """Return the rows of a relation, with times that have a time zone as text in UTC."""
     if ZONED not in map(str, relation.types):
         return relation.fetchall()
     columns = [
@@ -250,12 +251,12 @@ def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
 
 
 def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
-    """Run a job on a thread of its own: DuckDB does not look for Ctrl-C while it works."""
+    """Run a job in its own thread, so that Ctrl-C can interrupt DuckDB while it works."""
     begins, given_up = Lock(), False
 
     def run() -> T:
         with begins:
-            if given_up:  # before it began: nobody waits for it
+            if given_up:  # interrupted before the job began: nobody waits for its result
                 raise CancelledError
             return job()
 
@@ -265,14 +266,14 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
         except KeyboardInterrupt:
             given_up = True
             connection.interrupt()
-            with begins:  # the connection is free again, even where the thread was just starting
+            with begins:  # wait until the connection is free, even if the thread was just starting
                 raise
 
 
 def _translated(
     error: duckdb.Error, where: str, connection: duckdb.DuckDBPyConnection
 ) -> QueryError | StoreError:
-    """Turn DuckDB's error into one about the query, or about a file that it could not read."""
+    """Turn DuckDB's error into one about the query, or about a file that it failed to read."""
     remedy = hint(error)
     if (near := _nearest(error, connection)) and remedy:
         remedy = f"the nearest names are {near}; {remedy}"
@@ -284,7 +285,7 @@ _NO_TABLE = re.compile(r"Table with name (.+?) does not exist!")
 
 
 def _nearest(error: duckdb.Error, connection: duckdb.DuckDBPyConnection) -> str:
-    """Return the names that are most like that of a missing table, as SQL writes them, or ""."""
+    """Return the view names closest to a missing table's name, quoted for SQL if needed, or ""."""
     missing = _NO_TABLE.search(str(error))
     if not isinstance(error, duckdb.CatalogException) or not missing:
         return ""
@@ -296,13 +297,13 @@ def _nearest(error: duckdb.Error, connection: duckdb.DuckDBPyConnection) -> str:
 
 
 def _message(error: duckdb.Error) -> str:
-    """Return DuckDB's message, or that of a Python function without DuckDB's words around it."""
+    """Return DuckDB's message; for an error in a Python function, only that function's message."""
     text = _OWN_TABLE.sub("", str(error)).strip().expandtabs(4)
     _, of_python, cause = text.partition("occurred while executing the UDF: ")
     return cause.partition(": ")[2] if of_python else text
 
 
-# `WHERE condition = …` of `transitions`, which has none: a row can hold several.
+# Error of `WHERE condition = …`: `transitions` has no such column, as a row can hold several.
 _NO_CONDITION = re.compile(r'column(?: named)? "condition"', re.IGNORECASE)
 OF_CONDITIONS = (
     "a row can hold several conditions: `FROM held_conditions WHERE condition = '…'` has every row"
@@ -312,7 +313,7 @@ OF_CONDITIONS = (
 
 
 def hint(error: duckdb.Error) -> str | None:
-    """Return what to ask instead, if a name was not found."""
+    """Return what to query instead if a name was not found, else None."""
     if isinstance(error, duckdb.BinderException) and _NO_CONDITION.search(str(error)):
         return OF_CONDITIONS
     if isinstance(error, duckdb.CatalogException | duckdb.BinderException):

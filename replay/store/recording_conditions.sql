@@ -1,5 +1,4 @@
--- What each recording has of each cell, from the rows. Where manifests keep it (summaries.sql), nothing is
--- scanned.
+-- Counts per recording and cell, by a scan of all rows. summaries.sql reads them from manifests instead.
 CREATE OR REPLACE VIEW recording_cells AS
 SELECT recording_id, primary_condition AS condition, action, behaviour_policy, count(*) AS rows
 FROM transitions

@@ -1,15 +1,15 @@
--- Rows of a recording that are those of another one under other ids: a bag and a part of it, a copy
--- cut otherwise, or a drive that was replayed and recorded again.
+-- Rows that are also in another recording under another id: a bag and a part of it, a differently cut copy,
+-- or a drive that was replayed and recorded again.
 --
--- They are found by content (shared_rows). Of two recordings one constant shift between their stamps is
--- taken out, and matches within half a control period of it count. What looks the same more than
--- once in a recording (a robot that stands still) proves nothing and is left aside. Each row
--- is given with the one of the first recording, by id, that has it.
+-- Rows are matched by content (shared_rows). For two recordings, the median shift between stamps is computed,
+-- and matches within half a control period of it count. Content that occurs more than once in a recording (a
+-- robot that stands still) proves nothing and is ignored. Each row is returned with the matching row of the
+-- first recording, by id, that has its content.
 CREATE OR REPLACE MACRO repeated_rows(min_rows) AS TABLE
 WITH marked AS MATERIALIZED (
     SELECT *, min(recording_id) OVER (PARTITION BY content) AS first_recording FROM shared_rows
 ), enough AS (
-    -- Where two recordings have few contents in common, no row of theirs is read.
+    -- Pairs of recordings with enough contents in common; rows of other recordings are not read.
     FROM (
         SELECT recording_id, first_recording, count(*) AS alike
         FROM marked
@@ -57,12 +57,12 @@ SELECT matches.*, shift_ns
 FROM matches
 JOIN shifts USING (recording_id, same_as)
 LEFT JOIN periods USING (recording_id)
--- An episode of one step has no period: a tenth of a second.
+-- Episodes of one step have no period: assume a tenth of a second.
 WHERE abs(later_ns - shift_ns) <= coalesce(period_ns, 0.1e9) / 2
 QUALIFY count(*) OVER (PARTITION BY recording_id, same_as) >= min_rows
 ORDER BY matches.transition_id;
 
--- Each row of them, the first ones too: rows of one `step` are the same step under several ids.
+-- All rows that are repeated, including the first ones: rows of one `step` are the same step under several ids.
 CREATE OR REPLACE MACRO same_steps() AS TABLE
 SELECT transition_id, same_as_transition_id AS step FROM repeated_rows(1)
 UNION

@@ -1,11 +1,11 @@
--- Does the reward want what is measured? Macros over a table of driven episodes, named by `source`
--- (`driven_episodes` of a store, see returns.sql, or of a run, see run_returns.sql):
+-- Does more success earn more return? Macros over the table of driven episodes that `source` names
+-- (`driven_episodes` of a store, see returns.sql, or of a run, see run_returns.sql), with the columns
 --
---     mission (null: every driver had missions of its own), driver, handed_over, condition, outcome,
+--     mission (null: each driver had its own missions), driver, handed_over, condition, outcome,
 --     success, return, discounted_return
 
--- Student's t at .975, by its expansion in the normal quantile (Abramowitz and Stegun 26.7.5), within
--- 1 %; null below 2 degrees of freedom: the spread of one or two episodes says nothing.
+-- The .975 quantile of Student's t, by its expansion in the normal quantile (Abramowitz and Stegun 26.7.5),
+-- within 1 %; null below 2 degrees of freedom, as the spread of one or two episodes means nothing.
 CREATE OR REPLACE MACRO student_t_975(freedom) AS CASE
     WHEN freedom >= 2 THEN 1.96
         + 2.3723 / freedom
@@ -14,7 +14,7 @@ CREATE OR REPLACE MACRO student_t_975(freedom) AS CASE
         + 1.5895 / pow(freedom, 4)
 END;
 
--- One row a condition and driver, and one an outcome of those (`all` is every outcome).
+-- One row per condition, driver and outcome, and one per condition and driver with outcome `all`.
 CREATE OR REPLACE MACRO returns_of(source) AS TABLE
 SELECT
     condition,
@@ -32,10 +32,10 @@ FROM query_table(source)
 GROUP BY GROUPING SETS ((condition, driver), (condition, driver, outcome))
 ORDER BY condition, driver, outcome <> 'all', outcome;
 
--- One row a condition and pair of drivers: by how much the one with more success has more of it, and
--- how much more it earns, each with its 95 % interval (of earnings null below three episodes of
--- either). Episodes of the same missions are compared mission by mission. Episodes in which control
--- was handed over count for no driver: the operator is called to the harder ones.
+-- One row per condition and pair of drivers: how much more success the more successful driver has, and how
+-- much more return, each with a 95 % interval (null for the return if a driver has fewer than three episodes).
+-- Drivers with the same missions are compared mission by mission. Episodes in which control was handed over
+-- count for no driver, because operators are called to the harder episodes.
 CREATE OR REPLACE MACRO return_order(source, min_episodes, same_success) AS TABLE
 WITH driven AS (
     SELECT condition, driver, mission, success::INTEGER AS success, discounted_return AS earned
@@ -48,7 +48,7 @@ WITH driven AS (
         count(*) AS n,
         avg(success) AS success,
         avg(earned) AS earned,
-        var_samp(earned) / count(*) AS earned_error, -- its mean's variance
+        var_samp(earned) / count(*) AS earned_error, -- variance of the mean
         -- Wilson's interval: its centre and half width, z = 1.96.
         (avg(success) + 1.9208 / count(*)) / (1 + 3.8416 / count(*)) AS centre,
         1.96 / (1 + 3.8416 / count(*))
@@ -75,7 +75,7 @@ WITH driven AS (
     SELECT
         condition, more, less, n AS episodes, n AS episodes_less,
         success, success_less, earned, earned_less,
-        -- Of paired shares: Agresti and Min, with half an episode added to each of the four cells.
+        -- Interval for paired shares: Agresti and Min, with half an episode added to each of the four cells.
         (only_more - only_less) / (n + 2) AS success_middle,
         1.96 * sqrt(only_more + only_less + 1 - pow(only_more - only_less, 2) / (n + 2)) / (n + 2) AS success_below,
         success_below AS success_above,
@@ -85,11 +85,11 @@ WITH driven AS (
     SELECT
         a.condition, a.driver, b.driver, a.n, b.n,
         a.success, b.success, a.earned, b.earned,
-        -- Of two shares: Newcombe, from the two intervals of Wilson.
+        -- Interval for the difference of two independent shares: Newcombe, from two Wilson intervals.
         a.success - b.success,
         sqrt(pow(a.success - (a.centre - a.half), 2) + pow(b.centre + b.half - b.success, 2)),
         sqrt(pow(a.centre + a.half - a.success, 2) + pow(b.success - (b.centre - b.half), 2)),
-        -- Welch's; where neither varies it has no degrees of freedom.
+        -- Welch's interval, which has no degrees of freedom if neither return varies.
         CASE
             WHEN least(a.n, b.n) < 3 THEN NULL
             WHEN a.earned_error + b.earned_error = 0 THEN 0
@@ -139,7 +139,7 @@ SELECT
 FROM intervals
 ORDER BY condition, driver, other;
 
--- The pairs that too few episodes tell apart; one row that says so where there is no pair at all.
+-- The pairs of drivers that too few episodes leave undecided; if there are no pairs, one row that says so.
 CREATE OR REPLACE MACRO undetermined_order(source, min_episodes, same_success) AS TABLE
 WITH pairs AS (FROM return_order(source, min_episodes, same_success))
 SELECT condition, driver, other, why, episodes, other_episodes, more_success, more_return

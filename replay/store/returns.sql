@@ -1,7 +1,7 @@
--- What drivers earned: discounted and undiscounted return of a store's episodes, by driver (behaviour
--- policies with their versions), condition and outcome.
+-- Discounted and undiscounted returns of a store's episodes, by driver (behaviour policies with their
+-- versions), condition and outcome.
 
--- Whole episodes only: what is missing of the others was earned, too, and nobody knows how much.
+-- Complete episodes only: the return of an episode with missing steps is unknown.
 CREATE OR REPLACE MACRO discounted_episodes(discount) AS TABLE
 SELECT
     episodes.episode_id AS episode_id,
@@ -45,8 +45,8 @@ JOIN (
 ) USING (task_hash)
 WHERE first_step = 0 AND missing_steps = 0 AND (ended_by IS NOT NULL OR steps >= time_limit);
 
--- At the discount that training has by default.
+-- With the default discount of training.
 CREATE OR REPLACE VIEW driven_episodes AS FROM discounted_episodes(0.99);
 
--- One row a condition, driver and outcome; outcome 'all' is all of them together.
+-- One row per condition, driver and outcome; outcome 'all' is all outcomes together.
 CREATE OR REPLACE VIEW returns AS FROM returns_of('driven_episodes');

@@ -1,8 +1,8 @@
--- The two tables of a store as views, over stored_transitions and stored_recordings (its Parquet as
--- it lies, or that of several stores): all other views are of these.
+-- The views `recordings` and `transitions`, over stored_recordings and stored_transitions (the Parquet files
+-- of one or several stores). All other views read these two.
 
--- A recording's manifest row is committed before its transitions: an ingest that was cut between
--- the two is in stored_recordings and in no view.
+-- A recording's manifest row is committed before its transitions. An ingest that was killed in between has a
+-- row in stored_recordings, but is in no view.
 CREATE OR REPLACE VIEW recordings AS
 SELECT
     *,
@@ -18,9 +18,9 @@ SELECT
 FROM stored_recordings
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
--- Stamps can be a simulator's, which begin at zero: logged_ns is the same moment by log time. What the
--- Parquet calls `condition` is one label a row, by priority: a filter on it would leave out the rows that
--- hold the condition beside one of higher priority, so here its name says what it is.
+-- Stamps may be a simulator's, which begin at zero: logged_ns is the same moment in log time. The Parquet
+-- column `condition` has only the condition of highest priority, so a filter on it would miss rows that also
+-- hold one of higher priority. The view therefore calls it `primary_condition`.
 CREATE OR REPLACE VIEW transitions AS
 SELECT
     stored.* EXCLUDE (logged_ns)

@@ -1,5 +1,5 @@
--- What drivers earned in a run's evaluations (`restock eval`, all on the same missions), in the columns
--- that return_order.sql takes. `{schema}` is the run's. The discount is the run's own.
+-- Returns of drivers in a run's evaluations (`restock eval`, all drivers on the same missions), with the
+-- columns that return_order.sql reads. `{schema}` is the run's schema. Returns have the run's discount.
 CREATE OR REPLACE VIEW "{schema}".driven_episodes AS
 SELECT
     concat_ws('/', layouts, layout, perturbation, to_json(perturbation_values), condition, episode_seed) AS mission,

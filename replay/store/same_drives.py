@@ -1,7 +1,7 @@
-"""Recordings that hold the same rows or the same drive, from what manifests and views keep of them.
+"""Find recordings that have the same rows, or are of the same drive.
 
-Rows are compared by a number of their contents, drives by what the robot did: commands and wheel
-speeds, step by step.
+Rows are compared by hashes of their contents, which manifests store. Drives are compared by the
+commands and wheel speeds of each step.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 
-SHARED = ("shared_rows", "repeated_rows", "same_steps")  # the view, and what is made of it
-CONTENT, ROWS = "distinctive_rows.content", "distinctive_rows"  # of the manifests
-MARKED = 1 << 14  # numbers at a time
+SHARED = ("shared_rows", "repeated_rows", "same_steps")  # the view, and macros that use it
+CONTENT, ROWS = "distinctive_rows.content", "distinctive_rows"  # columns of the manifests
+MARKED = 1 << 14  # numbers processed at a time
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 _MIN_BITS, _MAX_BITS = 10, 34
 
@@ -30,10 +30,10 @@ def install_shared_rows(
     recordings: Mapping[str, str],
     rows: int,
 ) -> None:
-    """Put a table in place of the connection's view `shared_rows`.
+    """Replace the connection's view `shared_rows` by a table computed from manifests.
 
-    `manifests` reads these columns of them, from the beginning each time; `recordings` names the
-    recording of each ingest whose rows count, and `rows` how many these have.
+    `manifests(columns)` reads columns of all manifests, and is called twice. `recordings` maps each
+    ingest whose rows count to its recording; `rows` is the number of their rows.
     """
     observed = MetTwice(rows)
     for _, _, each in _of_ingests(manifests(("ingest_id", CONTENT)), recordings):
@@ -53,7 +53,7 @@ def install_shared_rows(
     kept = occurs_again(found["content"])
     recording = _named(names, found.pop("recording")[kept])
     shared = {"recording_id": recording} | {name: values[kept] for name, values in found.items()}
-    # A table of its own: joins must know that it is the small side.
+    # A DuckDB table, so that joins know that it is the small side.
     connection.register("found_shared_rows", pa.table(shared))
     connection.execute(
         "CREATE TABLE stored_shared_rows AS FROM found_shared_rows;"
@@ -63,18 +63,18 @@ def install_shared_rows(
 
 
 class MetTwice:
-    """Set of the numbers, out of up to `count`, that occur more than once, as a hash filter.
+    """Hash filter that finds which of up to `count` numbers occur more than once.
 
-    First `add` all numbers, then ask for each again. It takes at least four bytes a number, mostly
-    more, and does not store the numbers. Up to a quarter of the numbers that occur once are
-    reported, too; none that occurs again is missed.
+    First `add` all numbers, then call `maybe` with each. The filter takes four to eight bytes per
+    number, and does not store the numbers. It reports all numbers that occur more than once, and up
+    to a quarter of those that occur once.
     """
 
     def __init__(self, count: int) -> None:
         bits = min(max(int(4 * count).bit_length(), _MIN_BITS), _MAX_BITS)
         self._shift = np.uint64(64 - bits)
-        self._marks = np.zeros(1 << bits, np.uint8)  # bit 0: met, bit 1: met again
-        self._last = np.zeros(MARKED << 4, np.int32)  # by a place's low bits, who was last there
+        self._marks = np.zeros(1 << bits, np.uint8)  # per place, bit 0: seen, bit 1: seen again
+        self._last = np.zeros(MARKED << 4, np.int32)  # low bits of a place -> last index there
 
     def add(self, values: NDArray[np.integer]) -> None:
         """Mark these 64-bit numbers, (n,)."""
@@ -83,7 +83,7 @@ class MetTwice:
             number = np.arange(len(part), dtype=np.int32)
             low = place & (len(self._last) - 1)
             self._last[low] = number
-            # Of two of a stretch at one place, one at least is not the last there.
+            # If two numbers of a part share a place, at least one of them is not the last there.
             again = self._marks[place].astype(np.bool_) | (self._last[low] != number)
             self._marks[place] |= 1
             self._marks[place[again]] = 3
@@ -111,9 +111,9 @@ def occurs_again(values: Ints) -> Bools:
 def _of_ingests(
     manifests: Iterable[pa.Table], recordings: Mapping[str, str]
 ) -> Iterator[tuple[list[str], Ints, pa.StructArray]]:
-    """Yield recordings and their distinctive rows (n,), with the recording's place of each, (n,).
+    """Yield, per batch, recording ids, each row's index into them (n,), and distinctive rows (n,).
 
-    Ingests that are not current are left out.
+    Rows of ingests that are not in `recordings` are left out.
     """
     for table in manifests:
         for part in table.combine_chunks().to_batches():
@@ -130,7 +130,7 @@ def _of_ingests(
 
 
 def _named(names: Sequence[str], which: Ints) -> pa.DictionaryArray:
-    """Return names by their places, without `take`: pyarrow.compute is slow to import."""
+    """Return names by index, without `take`, as pyarrow.compute is slow to import."""
     return pa.DictionaryArray.from_arrays(pa.array(which, pa.int32()), pa.array(names, pa.string()))
 
 
@@ -141,9 +141,9 @@ def _stretches(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
 
 N = TypeVar("N", bound=np.generic)
 MIN_ROWS = 2
-MIN_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share less are not told
-WITHIN_NS = 100_000_000  # of the shift
-FEW = 5  # recordings of one content, up to which all pairs are compared
+MIN_SHARE = 0.1  # share of the smaller recording's distinctive rows that a reported pair has
+WITHIN_NS = 100_000_000  # largest distance from a pair's shift
+FEW = 5  # up to so many recordings with one content, all their pairs are compared
 _BATCH_ROWS = 100_000
 _NAMED = "SELECT DISTINCT recording_id, hash(recording_id) FROM transitions"
 _MOVING = """
@@ -165,8 +165,8 @@ _MOVING = """
 class MovingRows:
     """Rows in which the robot moves, in any order."""
 
-    names: list[str]  # of recordings, (R,) ascending
-    recording: NDArray[np.int32]  # (N,) index into them
+    names: list[str]  # ids of recordings, (R,) ascending
+    recording: NDArray[np.int32]  # (N,) index into `names`
     content: NDArray[np.uint64]  # (N,) hash of command and wheel speeds
     stamp_ns: Ints  # (N,)
 
@@ -179,16 +179,17 @@ def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
 def same_drives(rows: MovingRows) -> pa.Table:
     """Find pairs of recordings that share MIN_ROWS distinctive rows, and MIN_SHARE of them.
 
-    Columns: `recording_id`, `same_as` (the later name), `rows` of both within WITHIN_NS of the
-    shift, `share` of the distinctive rows of the smaller one, and `later_s`, the shift. A content
-    of more than FEW recordings is compared with the first of them only: pairs grow with the square.
+    Columns: `recording_id`, `same_as` (the id that sorts later), `rows` that match within WITHIN_NS
+    of the shift, their `share` of the smaller one's distinctive rows, and `later_s`, the shift. If
+    a content is in more than FEW recordings, only pairs with the first are compared, as the number
+    of all pairs grows with the square.
     """
     recording, content, stamp, distinctive = _distinctive(rows)
     first, second = (np.concatenate(parts) for parts in zip(*_pairs(content), strict=True))
     count = max(len(rows.names), 1)
     pair = recording[first].astype(np.int64) * count + recording[second]
     later = stamp[second] - stamp[first]
-    # By chance two recordings share little: only pairs that share enough are gone on with.
+    # Many pairs share a few rows by chance: drop them before sorting.
     keys, each = np.unique(pair, return_counts=True)
     least = np.maximum(MIN_SHARE * _smaller(keys, count, distinctive), MIN_ROWS)
     kept = np.isin(pair, keys[each >= least])
@@ -220,7 +221,7 @@ def _moving_rows(connection: duckdb.DuckDBPyConnection) -> MovingRows:
     for batch in connection.sql(_MOVING).to_arrow_reader(_BATCH_ROWS):
         numbers = batch.column("recording").to_numpy()
         recording.append(order[np.searchsorted(hashes, numbers, sorter=order)])
-        # Copies: any column of DuckDB's batch holds all of it.
+        # Copies: a column of DuckDB's batch would keep the whole batch in memory.
         content.append(batch.column("content").to_numpy().copy())
         stamp.append(batch.column("stamp_ns").to_numpy().copy())
     return MovingRows(
@@ -241,10 +242,10 @@ def _joined(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
 def _distinctive(
     rows: MovingRows,
 ) -> tuple[NDArray[np.int32], NDArray[np.uint64], Ints, Ints]:
-    """Find rows whose content occurs once in their recording and maybe in another one, too.
+    """Find rows whose content occurs once in their recording, and possibly in other recordings.
 
-    Return their recording, content and stamp (M,), sorted by content and recording. Also return,
-    for each recording (R,), the number of rows whose content occurs in it just once.
+    Return their recording, content and stamp (M,), sorted by content and recording. Also return
+    the number of rows per recording (R,) whose content occurs only once in it.
     """
     observed = MetTwice(len(rows.content))
     observed.add(rows.content)
@@ -265,7 +266,7 @@ def _distinctive(
 
 
 def _pairs(content: NDArray[np.uint64]) -> Iterator[tuple[Ints, Ints]]:
-    """Return the places of two rows with equal content (M,); `content` is ascending."""
+    """Yield pairs of indices of rows with equal content; `content` (M,) is ascending."""
     begins = np.flatnonzero(np.concatenate([[True], content[1:] != content[:-1]]))
     begins = begins if len(content) else np.empty(0, np.int64)
     size = np.diff(begins, append=len(content))
@@ -279,7 +280,7 @@ def _pairs(content: NDArray[np.uint64]) -> Iterator[tuple[Ints, Ints]]:
 
 
 def _ranges(begin: Ints, length: Ints) -> Ints:
-    """begin, begin + 1, … of each, one after the other."""
+    """Concatenate the ranges begin, begin + 1, … of these lengths."""
     ends = np.cumsum(length)
     places: Ints = np.repeat(begin - (ends - length), length)
     places += np.arange(len(places))

@@ -1,10 +1,9 @@
--- Rows that look like no other of their recording, and like one of another recording: by content (task,
--- action, observation and pose, rounded to a thousandth), not by stamp, as each ingest estimates its own
--- clock. From the rows; where manifests have the content of theirs (same_drives.py), nothing is read but
--- that.
+-- Rows whose content is unique in their recording and also in another recording. The content is a hash of task,
+-- action, observation and pose, rounded to a thousandth; stamps do not count, as each ingest estimates its own
+-- clock. This view scans the rows; if manifests have the hashes, same_drives.py reads only those.
 CREATE OR REPLACE VIEW shared_rows AS
 WITH places AS (
-    -- Few rows pass this, and only theirs are read whole.
+    -- Places in several recordings. Few rows are at such a place, and only those are read whole.
     SELECT hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) AS place
     FROM transitions
     GROUP BY ALL

@@ -1,9 +1,9 @@
-"""A store, open for reading: DuckDB over the Parquet of one version of its Delta tables.
+"""A store open for reading: DuckDB over the Parquet files of one version of its Delta tables.
 
-The views of `views.sql` and the macros of `macros.sql` are there; queries are read-only. DuckDB
-reads a folder's files itself; those on S3 it reads through Arrow, which skips the columns and row
-groups that a query does not ask for. Columns, files and counts of rows are those of Delta's log, so
-that no file of transitions is looked at before a query needs it; manifests are held in memory.
+Queries are read-only, and can use the views of `views.sql` and the macros of `macros.sql`. DuckDB
+reads the files of a local folder itself. It reads files on S3 through Arrow, which skips columns
+and row groups that a query does not need. Columns, files and row counts come from Delta's log, so
+no file of transitions is opened before a query needs it. Manifests are in memory.
 """
 
 from __future__ import annotations
@@ -59,19 +59,20 @@ from restock.replay.store.parquet_views import (
 from restock.replay.store.query import query
 from restock.replay.store.same_drives import SHARED, install_shared_rows
 
-# Joins are done as they are written, the right side in memory: of files whose columns are told
-# DuckDB takes every scan for one row, and would hold all transitions to look up their recordings.
+# With these optimizers disabled, joins run as written, with the right side in memory. DuckDB
+# estimates one row for each scan of files with given columns, so it would choose to hold all
+# transitions in memory to look up their recordings.
 AS_WRITTEN = "join_order,build_side_probe_side"
-# DuckDB takes a negative limit, "none" or "null" for none at all, and fails at random with zero.
+# DuckDB reads a negative limit, "none" or "null" as no limit, and fails at random with zero.
 _UNLIMITED_OR_ZERO = re.compile(r"\s*(?:-|none\b|null\b|[0.]+\s*[a-z%])", re.IGNORECASE)
-MEMORY_LIMIT = "RESTOCK_MEMORY_LIMIT"  # in the environment
+MEMORY_LIMIT = "RESTOCK_MEMORY_LIMIT"  # environment variable
 _MEMORY_REMEDY = f'write it like "4GB" or "512MB" ({MEMORY_LIMIT})'
 MAX_CLOSES = 500  # tries, .01 s apart
 T = TypeVar("T")
 
 
 class StoredProfile(NamedTuple):
-    """A profile as the manifests of its recordings keep it."""
+    """A profile as stored in the manifests of its recordings."""
 
     name: str
     hash: str
@@ -82,20 +83,21 @@ class Store:
     """A store at one version. Close it, or use it as a context manager.
 
     Args:
-        path: the store's directory, or `s3://bucket/prefix`; `store@12` and `store@2026-11-01` are
+        path: the store's directory, or `s3://bucket/prefix`; `store@12` and `store@2026-11-01` open
             a version of it.
-        version: of its transitions table, a number or the moment whose newest it was; default that
-            of the path, or the newest.
-        memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default RESTOCK_MEMORY_LIMIT of
-            the environment, or DuckDB's own (80 %).
+        version: number of a version of `transitions`, or a time, for the newest version at that
+            time. Default: the version in the path, or the newest.
+        memory_limit: how much memory DuckDB may use, e.g. "4GB". Default: RESTOCK_MEMORY_LIMIT from
+            the environment, or DuckDB's own limit (80 %).
 
-    `version` is of the transitions table, `files` the Parquet files of each table, `bare` the
-    connection with those views only that a query has named, `changed_by_others` the ingests whose
-    rows another tool may have changed: while there are any, no summary is used.
+    `version` is the number of the open version, `files` has the Parquet files of each table, `bare`
+    is a connection with only the views that queries have named so far, and `changed_by_others` has
+    the ingests whose rows another tool may have changed. If there are any, no summaries are used.
 
     Raises:
-        StoreError: nothing there, not a store, no such version, or it cannot be reached.
-        ArgumentError: a version of another kind.
+        StoreError: there is nothing at the path, it is not a store, it has no such version, or it
+            cannot be reached.
+        ArgumentError: the version is neither a number nor a time.
     """
 
     @interrupts_raised
@@ -115,7 +117,7 @@ class Store:
         recordings = self.path.open_table(RECORDINGS)
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
-        self._asking = threading.RLock()  # a query is several calls: none comes between them
+        self._asking = threading.RLock()  # held during the several calls of a query
         self.bare = duckdb.connect(
             config={
                 "temp_directory": self._spill.name,
@@ -140,7 +142,7 @@ class Store:
             self.changed_by_others = self._count_changed(held)
             self._present_manifests(self.bare, "main")
             self._frames().present(self.bare)
-            if version is not None:  # its files may be gone
+            if version is not None:  # fail now if files of the old version are gone
                 self._present_rows(self.bare, "main")
                 query(self.bare, "FROM stored_transitions LIMIT 0", where=str(self.path))
         except StoreError as error:
@@ -154,7 +156,7 @@ class Store:
             ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
-        # Called with a query's text before it runs, to report early what fails as rows are fetched.
+        # Called with each query's text before it runs, to report errors before rows are fetched.
         self.checks: list[Callable[[str], None]] = []
         summaries = self._has_summaries()
         self._definitions = Definitions(
@@ -181,14 +183,15 @@ class Store:
     @property
     @interrupts_raised
     def connection(self) -> duckdb.DuckDBPyConnection:
-        """Return a connection with the common views; `install_named` adds the other ones."""
+        """Return a connection with the common views; `install_named` adds other views."""
         self._definitions.make_common()
         return self.bare
 
     def verify(self) -> None:
-        """Verify the page checksums of the files that queries read; DuckDB does not.
+        """Verify the page checksums of the files that queries read, as DuckDB does not.
 
-        A file is read whole once and again when its size or time changed: see `verified.json`.
+        Each file is read whole once, and again if its size or write time changes: `verified.json`
+        in the store lists the files that passed.
 
         Raises:
             StoreError: a file is damaged or missing, or the place cannot be reached.
@@ -197,13 +200,13 @@ class Store:
             raise damaged_error(self.path, damaged)
 
     def unverified(self) -> int:
-        """Return how many of those files `verify` would read."""
+        """Return the number of files that `verify` would read."""
         return unverified_files(self.path, self._paths())
 
     def close(self) -> None:
         """Close the connection and remove its temporary files.
 
-        An interrupt may leave a thread behind that still queries: it is ended first.
+        If an interrupt has left a thread that still runs a query, that query is stopped first.
         """
         for left in reversed(range(MAX_CLOSES)):
             try:
@@ -221,8 +224,8 @@ class Store:
         """Return the result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
 
         Raises:
-            QueryError: DuckDB's message; the query would write; or another thread still reads the
-                result of an earlier query.
+            QueryError: DuckDB refuses the query, the query would write, or another thread still
+                reads the result of an earlier query.
         """
         try:
             with self._asking:
@@ -240,11 +243,11 @@ class Store:
             ) from error
 
     def coverage(self) -> duckdb.DuckDBPyRelation:
-        """Return how many rows, episodes and recordings hold each condition."""
+        """Return the number of rows, episodes and recordings of each condition, and more."""
         return self.sql("FROM coverage_by_condition")
 
     def show(self) -> None:
-        """Print its coverage."""
+        """Print the coverage."""
         self.coverage().show()
 
     def add_tables(self, names: tuple[str, ...], install: Callable[[Store], None]) -> None:
@@ -252,9 +255,9 @@ class Store:
         self._definitions.computed[names] = partial(install, self)
 
     def conditions(self) -> tuple[Condition, ...]:
-        """Return the conditions that labelled the store's rows, of the newest ingest.
+        """Return the conditions of the newest ingest, by which the store's rows were labelled.
 
-        Only what the table keeps of them: name, timing, priority and SQL.
+        They have only the fields that manifests store, such as name, timing, priority and SQL.
         """
         rows = self.sql(
             "SELECT conditions_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
@@ -264,12 +267,12 @@ class Store:
         return tuple(self._decode(rows[0][0], list[Condition], "conditions"))
 
     def priority(self) -> list[str]:
-        """Return the names of the conditions by priority, the highest first and nominal last."""
+        """Return the names of the conditions in order of priority, with `nominal` last."""
         held = sorted(self.conditions(), key=lambda condition: (condition.priority, condition.name))
         return [*(condition.name for condition in held), NOMINAL]
 
     def exposures(self) -> tuple[Condition, ...]:
-        """Return the exposures of the newest ingest; older stores have none."""
+        """Return the exposures of the newest ingest; ingests of older versions have none."""
         rows = self.sql(
             "SELECT exposures_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
@@ -277,7 +280,7 @@ class Store:
         return tuple(msgspec.structs.replace(one, kind="exposure") for one in found)
 
     def profile_name(self, task_hash: str) -> str:
-        """Return the name of the profile that last read rows of a task; "" if none did."""
+        """Return the name of the newest profile that rows of a task were ingested with, or ""."""
         self._definitions.make("recordings")
         profiles = profiles_of(self.bare, task_hash)
         return profiles[0].name if profiles else ""
@@ -289,7 +292,7 @@ class Store:
     def task_json(self, task_hash: str | None = None) -> str:
         """Return the task of the store's rows as JSON.
 
-        Raises StoreError where the rows are of several tasks and none, or no such, is named.
+        Raises StoreError if the store has no such task, or has several and `task_hash` is None.
         """
         if task_hash is None and len(self._tasks) == 1:
             return next(iter(self._tasks.values()))
@@ -309,9 +312,9 @@ class Store:
         return self._decode(self.task_json(task_hash), Task, "task")
 
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
-        """Yield the id of each recording with a table of its episodes' ends, one row each.
+        """Yield recording ids with a table of the last steps of their episodes, one row each.
 
-        Without `recordings` these are all recordings.
+        An empty `recordings` means all recordings.
         """
         held = [
             Ingest(one["recording_id"], one["ingest_id"], one["rows"])
@@ -321,9 +324,9 @@ class Store:
         yield from StoreReader(self.path).ends(held)
 
     def _decode(self, text: str, kind: type[T], name: str) -> T:
-        """Return what a manifest keeps as JSON.
+        """Decode JSON from a manifest.
 
-        Raises StoreError where another Restock wrote it, or it is damaged.
+        Raises StoreError if another version of Restock wrote it, or it is damaged.
         """
         try:
             return msgspec.json.decode(text, type=kind, strict=False)
@@ -343,9 +346,9 @@ class Store:
         return dict(rows)
 
     def _observation_type(self) -> str:
-        """Make lists fixed-size if all tasks agree on the size: DuckDB reads Delta's as FLOAT[].
+        """Return `FLOAT[size]` if all tasks have observations of one size, else `FLOAT[]`.
 
-        The size of another version's observation is not known.
+        The size is unknown for tasks of another version of Restock.
         """
         tasks = {name: self._decode(text, Task, "task") for name, text in self._tasks.items()}
         sizes = {
@@ -355,11 +358,11 @@ class Store:
         return f"FLOAT[{size}]" if size else "FLOAT[]"
 
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """Create this store's common views in a schema of another connection, beside other stores.
+        """Create this store's common views in a new schema of a connection to several stores.
 
-        The connection's joins are done as they are written from here on.
+        From then on, the connection runs joins as written.
 
-        Raises StoreError where a file is missing or damaged.
+        Raises StoreError if a file is missing or damaged.
         """
         connection.execute(f"SET disabled_optimizers = '{AS_WRITTEN}'")
         connection.execute(f'CREATE SCHEMA "{schema}"; USE "{schema}"')
@@ -371,9 +374,9 @@ class Store:
             connection.execute("USE main")
 
     def _count_changed(self, held: Sequence[StoredFile]) -> list[str]:
-        """Return the ingests whose rows other tools may have changed since the manifest.
+        """Return the ingests whose rows other tools may have changed since ingest.
 
-        Their manifests get the number of rows in Delta's log.
+        Also update the number of transitions in their manifests to the rows that the files have.
         """
         ids, place = self._manifests["ingest_id"], self._manifests.column_names.index("transitions")
         written = dict(zip(ids.to_pylist(), self._manifests[place].to_pylist(), strict=True))
@@ -385,20 +388,20 @@ class Store:
         return sorted(changed)
 
     def _has_summaries(self) -> bool:
-        """Return whether the summaries are of the rows: other tools changed none."""
+        """Return whether each ingest has a manifest, and no other tool has changed rows."""
         manifests = set(self._manifests["ingest_id"].to_pylist())
         held = self._ingests["ingest_id"].to_pylist()
         return bool(held) and not self.changed_by_others and manifests.issuperset(held)
 
     def _install_shared_rows(self) -> None:
-        """Make `shared_rows` from what the manifests keep, in place of the view over rows."""
+        """Replace the view `shared_rows`, which scans rows, by a table computed from manifests."""
         held = self._ingests.to_pylist()
         recordings = {one["ingest_id"]: one["recording_id"] for one in held}
         rows = sum(one["rows"] for one in held)
         install_shared_rows(self.bare, self._summaries.row_groups, recordings, rows)
 
     def _install_novelty(self) -> None:
-        """Put what is measured, now or when a query first asked, in place of the view `novelty`."""
+        """Replace the view `novelty`, which is all null, by a table of measured values."""
         from restock.replay.store.novelty import kept_novelty  # pyarrow.compute is slow to import
 
         try:
@@ -412,12 +415,12 @@ class Store:
         self.bare.unregister("found_novelty")
 
     def _present_manifests(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """Make `stored_ingests`, what the files hold, and `stored_recordings`, in memory."""
+        """Create `stored_ingests` (the ingests in each file) and `stored_recordings`, in memory."""
         register(connection, "stored_ingests", self._ingests, schema=schema)
         register(connection, self._recordings.view, self._manifests, schema=schema)
 
     def _present_rows(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """Make `stored_transitions`; on S3 it is read at each query."""
+        """Create the view `stored_transitions`."""
         try:
             self._transitions.present(connection, schema=schema)
         except StoreError as error:
@@ -425,12 +428,12 @@ class Store:
             raise (isinstance(cause, duckdb.Error) and damage(cause)) or error from error
 
     def _paths(self) -> list[str]:
-        """Return the files of rows and manifests, by their paths in the store."""
+        """Return the files of rows and manifests, as paths relative to the store."""
         tables = (self._transitions, self._recordings)
         return [f"{table.table}/{path}" for table in tables for path in table.paths]
 
     def _frames(self) -> StoredTable:
-        """Return the frames of cameras that the manifests of its rows name."""
+        """Return the table of the camera frames that the manifests of its rows name."""
         files = frame_files(self._manifests)
         if files:
             import pyarrow.compute as pc  # slow to import
@@ -443,9 +446,9 @@ class Store:
 def set_memory_limit(
     connection: duckdb.DuckDBPyConnection, limit: str | None = None, *, where: object
 ) -> None:
-    """Bound what DuckDB holds in memory; without a limit, by RESTOCK_MEMORY_LIMIT if it is set.
+    """Limit DuckDB's memory to `limit`, or to RESTOCK_MEMORY_LIMIT if that is set.
 
-    Raises StoreError where it is not a size.
+    Raises StoreError if the limit is not a size.
     """
     limit = limit or os.environ.get(MEMORY_LIMIT)
     if not limit:
@@ -465,7 +468,7 @@ def set_memory_limit(
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
-    """Return the profiles that read rows of a task, the newest ingest's first.
+    """Return the profiles that rows of a task were ingested with, by newest ingest first.
 
     The connection must have a view `recordings`.
     """
@@ -480,7 +483,7 @@ def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[S
 
 
 def corrected_versions(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
-    """Return the versions of labels that people corrected.
+    """Return the versions of labels that contain corrections by people.
 
     The connection must have a view `recordings`.
     """
@@ -507,16 +510,16 @@ def _expect(place: Location) -> None:
     raise place.absent()
 
 
-# Written by any newer DuckDB, a file of this version is read by DuckDB 1.4 and later.
+# DuckDB 1.4 and later can read files of this version, which all newer DuckDBs can write.
 STORAGE_VERSION = "v1.4.0"
 
 
 def init_script(store: Store) -> str:
     """Return SQL that creates the store's views and macros, for `duckdb -init FILE`.
 
-    Paths are absolute, and of the version that is open: write it again after an ingest.
+    It names the files of the open version by absolute paths: write it again after an ingest.
     """
-    beside = set(made_by(FRAMES_SQL))  # their files are none of the tables
+    beside = set(made_by(FRAMES_SQL))  # left out: their files belong to no Delta table
     columns = ", ".join(
         "(" + ", ".join(literal(value) for value in row) + ")"
         for row in store.sql("FROM columns").fetchall()
@@ -538,9 +541,9 @@ def init_script(store: Store) -> str:
 
 
 def export_views(store: Store, out: str | Path) -> Path:
-    """Write `out`: an init file (.sql), or a database of views (.duckdb).
+    """Write a store's views to `out`, an init file (.sql) or a database of views (.duckdb).
 
-    Raises StoreError for another ending, a file that already exists, or an empty store.
+    Raises StoreError for other endings, an existing file, an empty store, or a store on S3.
     """
     out = Path(out)
     if out.suffix not in (".sql", ".duckdb"):

@@ -1,6 +1,5 @@
--- The common views over what each manifest keeps of its recording (`stored_summaries`, made by
--- ingest/store/summary.sql), in place of those of views.sql and macros.sql, which scan the rows. Only where
--- every recording of the store has a summary.
+-- The common views from the summaries in manifests (`stored_summaries`, made by ingest/store/summary.sql). They
+-- replace those of views.sql and macros.sql, which scan the rows, if every recording of the store has a summary.
 
 CREATE OR REPLACE VIEW episodes AS
 SELECT
@@ -187,7 +186,7 @@ ANTI JOIN untold_conditions USING (condition)
 WHERE coalesce(rows, 0) < minimum
 ORDER BY condition, action;
 
--- Where rows know their true condition they are read; of a fleet's logs, none does.
+-- Rows are read only if they have a true condition; rows of a fleet's logs have none.
 CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
 WITH told AS (
     SELECT DISTINCT episode_id FROM transitions WHERE true_condition IS NOT NULL

@@ -1,15 +1,15 @@
 -- The views of a store, over its `recordings` and `transitions` (rows.sql).
--- Every column is documented in columns.toml (those of `transitions` in ingest/schema.py), and a
--- test holds that.
+-- columns.toml documents every column (those of `transitions` and `recordings`: ingest/task/schema.py), which
+-- a test checks.
 
--- The discrete actions of each task, from the definition the recordings carry.
+-- The discrete actions of each task, from the task in the manifests.
 CREATE OR REPLACE VIEW actions AS
 SELECT
     task_hash,
     action,
     speed_mps,
     yaw_rate_radps,
-    -- As restock.ingest.task.task names it, e.g. drive 0.8 left 0.7.
+    -- The same name as in restock.ingest.task.task, e.g. drive 0.8 left 0.7.
     CASE
         WHEN speed_mps = 0 AND yaw_rate_radps = 0 THEN 'stop'
         WHEN speed_mps = 0 THEN concat('turn ', turn)
@@ -50,7 +50,7 @@ FROM (
     )
 );
 
--- The conditions that labelled the store, of the newest ingest, and nominal: none of them holds.
+-- The conditions of the newest ingest, by which the store was labelled, and `nominal`: none of them holds.
 CREATE OR REPLACE VIEW conditions AS
 SELECT
     spec.name AS condition,
@@ -71,8 +71,8 @@ UNION ALL
 SELECT 'nominal', 'pre', 1000, 'none of the others', labels_version
 FROM (SELECT * FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1);
 
--- What a recording's rows do not tell: neither that it holds nor that it does not. One line a
--- recording and condition (or exposure).
+-- Conditions (or exposures) that are unknown in a recording: its rows show neither that they hold nor that they
+-- do not. One row per recording and condition.
 CREATE OR REPLACE VIEW unknown_conditions AS
 SELECT
     recording_id,
@@ -87,7 +87,7 @@ FROM (
     FROM recordings
 );
 
--- Those that no recording's rows tell: of them nothing is counted, not even 0.
+-- Conditions that are unknown in all recordings: their counts are null, not 0.
 CREATE OR REPLACE VIEW untold_conditions AS
 SELECT condition, kind
 FROM (
@@ -98,7 +98,7 @@ FROM (
 CROSS JOIN (SELECT count(*) AS all_recordings FROM recordings)
 WHERE recordings = all_recordings;
 
--- Measured in Python when a query names it (novelty.py): another DuckDB has nulls.
+-- Python replaces this view by measured values when a query names it (novelty.py); other DuckDBs have nulls.
 CREATE OR REPLACE VIEW novelty AS
 SELECT transition_id, CAST(NULL AS FLOAT) AS novelty, CAST(NULL AS BOOLEAN) AS novel
 FROM transitions;
@@ -142,7 +142,7 @@ FROM (
 JOIN (SELECT recording_id, robot, site, firmware, map, shift, tags FROM recordings)
     USING (recording_id);
 
--- `transitions` with one line for each condition that holds in a row, or one line, nominal, if none does.
+-- `transitions` with one row for each condition that holds in a transition, or one row, nominal, if none holds.
 CREATE OR REPLACE VIEW held_conditions AS
 SELECT *, unnest(conditions) AS condition
 FROM transitions
@@ -151,8 +151,8 @@ SELECT *, primary_condition AS condition
 FROM transitions
 WHERE coalesce(len(conditions), 0) < 1;
 
--- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them. A
--- condition that no row tells has one line, of nulls.
+-- Each cell that was seen; missing_cells has the others, which GROUP BY cannot show. A condition that is unknown
+-- in all recordings has one row of nulls.
 CREATE OR REPLACE VIEW coverage AS
 SELECT
     condition,
@@ -184,7 +184,7 @@ FROM untold_conditions
 WHERE kind = 'outcome' AND condition NOT IN (SELECT condition FROM held_conditions)
 ORDER BY condition, action, zone, behaviour_policy;
 
--- One line a condition, those never seen included; one that no row tells has nulls.
+-- One row per condition, including conditions never seen; nulls if it is unknown in all recordings.
 CREATE OR REPLACE VIEW coverage_by_condition AS
 WITH seen AS (
     SELECT
@@ -215,7 +215,7 @@ WITH seen AS (
 -- include: coverage_columns.sql
 ;
 
--- One line a perturbation of the twin; null is hardware, or a simulator that did not say.
+-- One row per perturbation of the twin; null: hardware, or a simulator that did not record it.
 CREATE OR REPLACE VIEW coverage_by_perturbation AS
 SELECT
     perturbation,
@@ -232,7 +232,7 @@ JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
 GROUP BY perturbation
 ORDER BY rows DESC, perturbation;
 
--- How far each field of a perturbation reached, over the episodes in which it was not nominal.
+-- Range of each field of a perturbation, over the rows in which the field differed from the nominal twin.
 CREATE OR REPLACE VIEW perturbation_ranges AS
 SELECT
     perturbation,
@@ -252,7 +252,7 @@ FROM (
 GROUP BY perturbation, field
 ORDER BY perturbation, field;
 
--- Condition x action cells without a single row in which that condition holds; cells_below(n) for those with fewer than n.
+-- Condition x action cells without a row in which the condition holds; cells_below(n) has those with fewer than n.
 CREATE OR REPLACE VIEW missing_cells AS
 SELECT condition, action, action_name, speed_mps, yaw_rate_radps
 FROM (SELECT condition FROM conditions UNION SELECT condition FROM held_conditions)
@@ -277,7 +277,7 @@ FROM held_conditions
 GROUP BY condition
 ORDER BY rows_held DESC, condition;
 
--- Calendar age today; ages_at(when) for another day.
+-- Age of each condition's rows today; use ages_at(moment) for another day.
 CREATE OR REPLACE VIEW ages AS
 SELECT
     condition,
@@ -291,7 +291,7 @@ FROM held_conditions
 GROUP BY condition
 ORDER BY rows_held DESC, condition;
 
--- Which conditions hold at the same time: a row can have several, and one of them wins.
+-- Pairs of conditions that hold at the same time: a row can hold several.
 CREATE OR REPLACE VIEW label_overlap AS
 WITH held AS (SELECT transition_id, condition FROM held_conditions WHERE condition <> 'nominal'),
 counts AS (SELECT condition, count(*) AS n FROM held GROUP BY condition)
@@ -306,7 +306,7 @@ JOIN counts ON counts.condition = a.condition
 GROUP BY a.condition, b.condition
 ORDER BY condition, other;
 
--- Definitions in use: more than one line means that rows were made or labelled in different ways.
+-- Definitions in use: more than one row means that rows were made or labelled in different ways.
 CREATE OR REPLACE VIEW versions AS
 SELECT
     task_hash,
@@ -319,13 +319,13 @@ FROM transitions
 GROUP BY task_hash, labels_version, profile_hash, restock_version
 ORDER BY rows DESC;
 
--- What an ingest left out, and why.
+-- Ticks that ingest left out, and why.
 CREATE OR REPLACE VIEW drops AS
 SELECT recording_id, source_file, dropped.reason AS reason, dropped.count AS count
 FROM (SELECT recording_id, source_file, unnest(drops) AS dropped FROM recordings)
 ORDER BY recording_id, source_file, reason, count;
 
--- Topics of each recording: expected against decoded messages.
+-- Topics of each recording, with the numbers of expected and decoded messages.
 CREATE OR REPLACE VIEW topics AS
 SELECT
     recording_id,

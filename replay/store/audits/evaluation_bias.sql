@@ -16,6 +16,6 @@ SELECT condition, share, coalesce(share_in_logs, 0) AS share_in_logs, success_sh
 FROM evaluated
 LEFT JOIN deployed USING (condition)
 WHERE share > $max_ratio * coalesce(share_in_logs, 0)
-    -- Easier than the evaluation as a whole: it is this that makes the mean look better.
+    -- Only a condition that is easier than the mean of the evaluation makes this mean look better.
     AND success_share > (SELECT sum(share * success_share) FROM evaluated)
 ORDER BY share DESC

@@ -13,7 +13,7 @@ FROM (
     FROM run.sampled_episodes
     GROUP BY source, stratum, episode
 )
-WHERE stratum <> 'unlabelled'  -- of fresh rows: no stratum, but episodes that have not ended
+WHERE stratum <> 'unlabelled'  -- not a stratum, but fresh rows of episodes that have not ended
 GROUP BY source, stratum
 HAVING sum(drawn) ^ 2 / sum(drawn ^ 2) < $min_effective_episodes
 ORDER BY effective_episodes, source, stratum

@@ -16,7 +16,7 @@ WITH kinds AS (
         behaviour_policy,
         sum(episodes) AS episodes,
         sum(success_share * episodes) / sum(episodes) AS success_share,
-        -- As the fleet meets the kinds of episode that this policy drove at all.
+        -- Weighted by the fleet's frequency of each kind, over the kinds that this policy drove.
         sum(success_share * share) / sum(share) AS success_share_in_fleet_mix,
         sum(share) AS kinds_driven_share
     FROM by_kind
@@ -25,7 +25,7 @@ WITH kinds AS (
 )
 FROM by_policy
 WHERE success_share - success_share_in_fleet_mix > $max_bias
-    -- It never drove the kinds that cost the fleet its failures.
+    -- It did not drive the kinds in which the fleet failed.
     OR (
         kinds_driven_share < $min_kinds_share
         AND success_share - (SELECT avg(success::INTEGER) FROM kinds) > $max_bias

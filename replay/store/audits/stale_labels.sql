@@ -9,7 +9,7 @@ SELECT recordings.recording_id, recordings.source_file, recordings.labels_versio
 FROM recordings
 JOIN newest USING (profile)
 WHERE
-    -- Of the rules alone: corrections stand behind a plus, and are each recording's own.
+    -- Compare the rules only: corrections follow a plus sign, and differ from recording to recording.
     split_part(recordings.labels_version, '+', 1) <> split_part(newest.labels_version, '+', 1)
     OR recordings.profile_hash <> newest.profile_hash
 ORDER BY recordings.source_file

@@ -13,7 +13,7 @@ WITH doubted AS (
     )
     GROUP BY condition
 ), held AS (
-    -- Nothing is read where nothing is in doubt.
+    -- Without uncertain rows, nothing is read here.
     SELECT condition, count(*) AS rows
     FROM (SELECT unnest(conditions) AS condition FROM transitions WHERE uncertain IS NOT NULL)
     WHERE condition IN (SELECT condition FROM doubted)

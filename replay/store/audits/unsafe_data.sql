@@ -2,7 +2,7 @@
 -- advice: Leave out these episodes with the mixture's `where`, or keep them in a stratum of their own with a cap.
 -- doc: Behaviour policies with a bump in too many of their steps.
 WITH bumps AS (
-    -- Pressed at the start of a step, or what ended the episode.
+    -- Steps that start with the bumper pressed, and bumps that ended an episode.
     SELECT behaviour_policy, count(*) AS bumped, count(DISTINCT episode_id) AS episodes
     FROM (
         SELECT behaviour_policy, episode_id, bumped
