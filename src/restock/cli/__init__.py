@@ -1,9 +1,9 @@
-"""The front door: `restock VERB …`. One module a verb; each is imported only when it is called.
+"""The command line: `restock VERB …`. A verb's module is imported only when the verb is called.
 
-A verb or job is a dataclass, `IngestCommand` for `restock ingest`: its docstring is the help, its
-fields are the flags, and `run()` does the work and returns an exit code. stdout is data, stderr is
-progress and messages. Both also work if they are not UTF-8, on a full disk, or closed by their
-reader.
+A verb or job is a dataclass, such as `IngestCommand` for `restock ingest`: its docstring is the
+help text, its fields are the options, and `run()` does the work and returns the exit code. Data go
+to stdout, progress and messages to stderr. Both may be in an encoding other than UTF-8, on a full
+disk, or closed by their reader.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, NoReturn, TextIO, cast
 from restock.errors import ConfigError, ExitCode, RestockError
 from restock.process import hidden, kill_as_interrupt, was_interrupted, when_imported
 
-# verb -> what it does, in the order of the work
+# Verb -> summary for `restock --help`, in the order in which one uses them.
 VERBS = {
     "demo": "all of the below, on sample_logs/",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
@@ -43,7 +43,7 @@ VERBS = {
     "store": "label a store again, remove recordings, join its files, or verify them",
     "twin": "drive a simulated robot and log it, or fit the twin to a robot's logs",
 }
-# verb -> its jobs, each with its own options, and what they do
+# Verb -> its jobs (subcommands with options of their own) and their summaries.
 JOBS = {
     "coverage": {
         "gaps": "what is missing, and which missions would fill it?",
@@ -65,7 +65,7 @@ JOBS = {
         "gap": "measure how far the twin is from the logs",
     },
 }
-# folder -> the verbs and jobs whose modules it holds
+# Folder -> the verbs and jobs whose modules are in it.
 FOLDERS = {
     "data": ("info", "profile", "ingest", "sql", "audit", "mix", "export"),
     "fleet": (
@@ -80,14 +80,14 @@ FOLDERS = {
     "twin": tuple(f"twin {job}" for job in JOBS["twin"]),
     "start": ("start", "demo"),
 }
-# folders of verbs that multiply no large matrices
+# Folders of verbs that do not multiply large matrices: BLAS gets one thread.
 ONE_THREAD_OF_BLAS = ("data", "fleet")
-# jobs that are in the module of their verb; the others have their own
+# Jobs that are defined in the module of their verb; other jobs have their own module.
 WITH_THEIR_VERB = {
     *("coverage gaps", "coverage drift"),
     *("store compact", "store remove", "store verify"),
 }
-PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # goes on working if nobody reads it
+PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # go on if stdout is closed
 FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
 
 
@@ -109,7 +109,7 @@ usage, bad input, a file that cannot be read or written, 3 written but data was 
 
 
 def _usage_of_jobs(verb: str) -> str:
-    """Return the text of `restock VERB --help` for a verb that has nothing but jobs."""
+    """Return the text of `restock VERB --help` for a verb that consists of jobs alone."""
     return f"""usage: restock {verb} JOB [--help] …
 
 {VERBS[verb][0].upper()}{VERBS[verb][1:]}.
@@ -142,21 +142,21 @@ def run_mcp(argv: Sequence[str] | None = None) -> int:
 
 
 def _guarded(run: Callable[[list[str]], int], args: list[str]) -> int:
-    """Run a command line, and say in one message what goes wrong."""
+    """Run a command line; print an error as one message and return its exit code."""
     substitute_what_cannot_be_shown()
     try:
         with kill_as_interrupt():
             code = run(args)
-        sys.stdout.flush()  # here, so that a reader that went away is no error
+        sys.stdout.flush()  # here, so that BrokenPipeError is handled below
         return code
     except KeyboardInterrupt:
         return _interrupted()
     except BrokenPipeError:
-        # The reader of stdout went away (`| head`): do not complain, here or at exit.
+        # The reader of stdout has closed it (`| head`): no message, neither here nor at exit.
         drop(sys.stdout)
         return int(ExitCode.OK)
     except Exception as error:  # noqa: BLE001  (the one place that maps unforeseen errors)
-        if was_interrupted():  # a library reports it as an error of its own
+        if was_interrupted():  # a library may turn an interrupt into another error
             return _interrupted()
         from restock.cli.failures import as_restock_error
 
@@ -175,13 +175,13 @@ def _dispatch(args: list[str]) -> int:
         sys.stdout.write(f"restock {__version__}\nnative code {native.state()}\n")
         return int(ExitCode.OK)
     name, prog, rest = _named(args)
-    if name in JOBS and name not in FOLDER_OF:  # a verb that has nothing but jobs
+    if name in JOBS and name not in FOLDER_OF:  # a verb that consists of jobs alone
         return _say_jobs(name, rest)
     return _run(name, prog, rest)
 
 
 def _named(args: list[str]) -> tuple[str, str, list[str]]:
-    """Return the name of the command, what help calls it, and its arguments."""
+    """Return the name of the command, its name in help texts, and its arguments."""
     verb, rest = args[0], args[1:]
     if verb not in VERBS:
         _refuse_verb(verb)
@@ -232,7 +232,7 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
 
         try:
             parsed = parse(command, prog, rest)
-        except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
+        except SystemExit as stop:  # tyro has printed help (0) or an error (2)
             return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     if any(not arg or (arg.startswith("--") and arg.endswith("=")) for arg in rest):
         refuse_empty_paths(parsed)
@@ -253,7 +253,7 @@ def _refuse_removed_options(name: str, prog: str, rest: list[str]) -> None:
 
 
 def command_of(name: str) -> type[Any]:
-    """Return the dataclass that is the command line of a verb or a job, such as `store label`."""
+    """Return the dataclass that defines a verb or a job, such as `store label`."""
     words = name.split()
     verb, last = words[0], words[-1]
     folder = f"{FOLDER_OF[name]}." if name in FOLDER_OF else ""
@@ -264,10 +264,11 @@ def command_of(name: str) -> type[Any]:
 
 
 def _settle_pandas() -> None:
-    """Keep Arrow from importing pandas, which takes half the time of a short command.
+    """Keep Arrow from importing pandas, which would take half the time of a short command.
 
-    Arrow looks for pandas at the first list that it gets. No command makes pandas objects, so it
-    looks now, and finds none. A library that needs pandas (Stable-Baselines3) imports it as usual.
+    Arrow tries to import pandas once, when it first converts a list. That first conversion is done
+    here, with pandas hidden, because no command makes pandas objects. Libraries that need pandas
+    (Stable-Baselines3) can still import it.
     """
     import pyarrow as pa
 
@@ -276,18 +277,18 @@ def _settle_pandas() -> None:
 
 
 def _start_no_blas_threads() -> None:
-    """Let NumPy's OpenBLAS start one thread, unless the environment sets a number.
+    """Let NumPy's OpenBLAS start only one thread, unless the environment sets a number.
 
-    By default it starts one for each core while it is imported, and they wait in a loop: a tenth of
-    the CPU time of a short command on two cores. With one thread, results do not depend on the
-    number of cores.
+    By default it starts one thread for each core when it is imported, and the threads busy-wait:
+    that is a tenth of the CPU time of a short command on two cores. With one thread, results do not
+    depend on the number of cores.
     """
     if "numpy" not in sys.modules:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _without_ros(args: list[str]) -> list[str]:
-    """Return the arguments before `--ros-args`; rclpy reads the others itself."""
+    """Return the arguments before `--ros-args`; rclpy parses the rest."""
     return args[: args.index("--ros-args")] if "--ros-args" in args else args
 
 
@@ -303,15 +304,15 @@ def _complain(message: str) -> None:
 
 
 def substitute_what_cannot_be_shown() -> None:
-    """Replace characters that a terminal or pipe cannot show, instead of failing."""
+    """Replace characters that the encoding of stdout or stderr lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            with suppress(OSError):  # a stream that became a pipe under Python's eyes
+            with suppress(OSError):  # the file descriptor was replaced by a pipe
                 stream.reconfigure(errors=SUBSTITUTED)
 
 
 def _substituted(error: UnicodeError) -> tuple[str, int]:
-    """Replace lines and dots by ASCII, and other characters by their numbers, as JSON does."""
+    """Replace dashes, dots and arrows by ASCII, and other characters by escapes as in JSON."""
     import json
 
     if not isinstance(error, UnicodeEncodeError):
@@ -327,10 +328,10 @@ codecs.register_error(SUBSTITUTED, _substituted)
 
 @contextmanager
 def work_goes_on() -> Iterator[None]:
-    """Let the block finish its work even if stdout's reader goes away (`| head`).
+    """Let the block finish its work even if the reader of stdout closes it (`| head`).
 
     Raises:
-        ConfigError: at the end, where stdout could not be written for another reason.
+        ConfigError: after the block, if stdout could not be written for another reason.
     """
     patient = _Patient(sys.stdout)
     sys.stdout = cast(TextIO, patient)
@@ -347,7 +348,7 @@ def work_goes_on() -> Iterator[None]:
 
 
 class _Patient:
-    """A stream that drops what it is given once it cannot be written."""
+    """A stream that discards all output after the first error."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -377,7 +378,7 @@ class _Patient:
 
 
 def drop(stream: TextIO) -> None:
-    """Let what is still buffered, and all that follows, go nowhere."""
+    """Redirect a stream to the null device, with what it still buffers."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

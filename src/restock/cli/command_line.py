@@ -1,4 +1,4 @@
-"""A verb's dataclass as its command line: what tyro is given to parse, and to explain."""
+"""Parse the command line of a verb's dataclass with tyro, and print its help."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ import tyro
 from restock.cli.words import Positional, Repeated, declared
 
 _PREPARED: list[type[Any]] = []
-MAX_PROSE = 100  # columns of a line of prose
-MIN_COLUMNS = 30  # columns: in a few, tyro lays its boxes out without end
+MAX_PROSE = 100  # columns; help texts are wrapped at this width or the terminal's
+MIN_COLUMNS = 30  # in narrower terminals, tyro's layout does not terminate
 _MARKS = {Positional: tyro.conf.Positional, Repeated: tyro.conf.UseAppendAction}
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
 def prepared(command: type[Any]) -> type[Any]:
-    """Return the dataclass with types of which tyro makes plain help, and each option's text.
+    """Return the dataclass with annotations that make tyro's help plain, and with help texts.
 
-    `X | None` becomes `Optional[X]`, whose values tyro checks itself; for `X | None` it imports
-    typeguard, and with that asyncio. An optional option shows what it takes, not `{None}|STR`, and
-    shows no default that says nothing.
+    `X | None` becomes `Optional[X]`, because tyro would import typeguard and asyncio for the
+    former. The help shows an optional option as `STR`, not as `{None}|STR`, and no default that
+    has no meaning for the user.
     """
     if command not in _PREPARED:
         _PREPARED.append(command)
@@ -44,7 +44,7 @@ def prepared(command: type[Any]) -> type[Any]:
 
 
 def _texts(command: type[Any]) -> dict[str, str]:
-    """Return the text below each field in one line, without the source's line breaks."""
+    """Return the docstring below each field, joined to one line."""
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(command))).body
     assert isinstance(tree, ast.ClassDef)
     texts = {}
@@ -59,10 +59,10 @@ def _texts(command: type[Any]) -> dict[str, str]:
 
 
 def _prepared(hint: Any, default: Any) -> Any:
-    """Return a type with tyro's marks of what it is declared to be, and its hint on the default."""
+    """Return a field's type annotated for tyro: metavar, choices, whether to show its default."""
     kind, optional, how = declared(hint)
     choices: Any = Literal[how.choices] if how.choices else None
-    if optional and typing.get_origin(kind) is Literal:  # of which tyro would list None, too
+    if optional and typing.get_origin(kind) is Literal:  # else tyro lists None among the choices
         choices = kind
     shown = choices or optional or kind in _METAVARS
     silent = default in (None, ()) or isinstance(default, bool) or typing.get_origin(kind) is tuple
@@ -86,7 +86,7 @@ def _metavar(kind: Any) -> str:
 
 
 def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
-    """Parse a command line with tyro, which exits after printing its help or its complaint."""
+    """Parse a command line with tyro, which prints help and errors, and then exits."""
     command = prepared(command)
     columns = shutil.get_terminal_size().columns
     if columns < MIN_COLUMNS:
@@ -94,7 +94,7 @@ def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
     help_asked = bool({"-h", "--help"} & set(words))
     if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
         tyro._experimental_options["ansi_codes"] = False
-    if help_asked:  # tyro would not wrap it
+    if help_asked:  # printed here, because tyro does not wrap it
         sys.stdout.write(_wrapped(command.__doc__ or "", min(columns, MAX_PROSE)) + "\n\n")
     return tyro.cli(
         command,
@@ -102,12 +102,12 @@ def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
         description="",
         args=words,
         use_underscores=False,
-        config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
+        config=(tyro.conf.FlagCreatePairsOff,),  # --json without --no-json
     )
 
 
 def _wrapped(text: str, columns: int) -> str:
-    """Wrap each paragraph of a docstring; examples, which are indented, stay."""
+    """Wrap each paragraph of a docstring, except examples, which are indented."""
     wrapper = textwrap.TextWrapper(columns, break_on_hyphens=False, break_long_words=False)
     parts = text.split("\n\n")
     return "\n\n".join(part if part.startswith(" ") else wrapper.fill(part) for part in parts)

@@ -1,8 +1,8 @@
-"""Unforeseen errors as a message and exit code 2, without a traceback.
+"""Convert exceptions that nobody foresaw to a message and exit code 2, without a traceback.
 
-Files are damaged, disks are full and folders are missing in more ways than the readers can check.
-This module turns errors of libraries into messages that say what, where and what to do.
-`RESTOCK_TRACEBACK=1` prints the traceback as well, for those who develop Restock.
+Damaged files, full disks and missing folders cause more errors than the readers can check for. This
+module converts exceptions of libraries to messages that say what is wrong, where, and what to do.
+`RESTOCK_TRACEBACK=1` also prints the traceback.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = (
     f"{_CHECK}; `restock store compact STORE --drop-damaged --dry-run` looks for one in a store"
 )
-NEEDS_TRAIN = ("learning", "twin", "start")  # folders of verbs; `train` brings `pages`, too
+# Folders of verbs that need the extra `train`, which includes `pages`.
+NEEDS_TRAIN = ("learning", "twin", "start")
 _GL = "MUJOCO_GL"
 _NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
-# package of an exception -> what to do
+# Package that defines an exception -> remedy.
 _REMEDIES = {
     "duckdb": _OF_A_STORE,
     "_duckdb": _OF_A_STORE,
@@ -36,7 +37,7 @@ _REMEDIES = {
 
 
 def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
-    """Turn any exception into a RestockError; print its traceback if the environment asks."""
+    """Convert an exception to a RestockError; print its traceback if RESTOCK_TRACEBACK is set."""
     print_traceback(error)
     where = f"restock {' '.join(args)}"
 
@@ -49,7 +50,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             "free some memory, or use a machine with more: DuckDB may take 80 % of it, or as much"
             " as RESTOCK_MEMORY_LIMIT in the environment says",
         )
-    if isinstance(error, StoreError) and error.where is None:  # raised where only rows were known
+    if isinstance(error, StoreError) and error.where is None:  # raised by code that has only rows
         return StoreError(error.what, where=where, remedy=error.remedy)
     if isinstance(error, RestockError):
         return error
@@ -72,7 +73,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             names = (" ".join(args[:2]), *args[:1])
             learns = any(FOLDER_OF.get(name) in NEEDS_TRAIN for name in names)
             return not_installed(missing, where, "train" if learns else EXTRAS[missing])
-    if _in_gl(error):  # raised while MuJoCo is imported, by any verb that needs the twin
+    if _in_gl(error):  # raised by importing MuJoCo, so by any verb that uses the twin
         what = f"MuJoCo cannot use {os.environ[_GL]!r}: {first_line(error)}"
         return known(what, _NO_GL, f"{_GL} in the environment")
     kind = type(error)
@@ -84,7 +85,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
         )
     if package in _REMEDIES or isinstance(error, OSError | UnicodeDecodeError):
         return known(first_line(error), _REMEDIES.get(package, _CHECK))
-    return known(  # our own mistake, or that of a library
+    return known(  # a bug in Restock or in a library
         f"an unexpected {kind.__name__}: {first_line(error)}",
         f"{_at(error)}{TRACEBACK}=1 shows the traceback; if the files are whole, this is a bug:"
         " please report it",
@@ -92,16 +93,16 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
 
 
 def _out_of_memory(error: BaseException | None) -> str:
-    """Return DuckDB's message if it ran out of memory, even inside other errors, or ""."""
+    """Return DuckDB's message if the error or one of its causes is out of memory; else ""."""
     while error is not None:
-        if type(error).__name__ == "OutOfMemoryException":  # its package need not be imported
+        if type(error).__name__ == "OutOfMemoryException":  # by name: no need to import duckdb
             return first_line(error)
         error = error.__cause__
     return ""
 
 
 def _undecoded(error: UnicodeEncodeError) -> bool:
-    """Return whether the error is about bytes of a path that Python could not decode."""
+    """Return whether all characters that cannot be encoded are undecoded bytes of a path."""
     return all(map(is_undecoded, error.object[error.start : error.end]))
 
 
@@ -114,7 +115,7 @@ def _in_gl(error: Exception) -> bool:
 
 
 def _at(error: Exception) -> str:
-    """Return the innermost line of Restock in the error's traceback."""
+    """Return the innermost module and line of Restock in the error's traceback, for a message."""
     lines = [
         f"in {frame.f_globals.get('__name__')}:{number}; "
         for frame, number in traceback.walk_tb(error.__traceback__)

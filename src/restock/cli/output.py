@@ -1,4 +1,4 @@
-"""Printing: tables on a terminal, the same rows as JSON or CSV for programs, progress on stderr."""
+"""Print tables for people, the same rows as JSON or CSV for programs, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from restock.replay.store.store import Store
 
 Row = Mapping[str, Any]
-PIPE_WIDTH = 120  # columns of a table in a file or a pipe: longer cells are wrapped, never cut
-GAP = 3  # columns between two columns of a table
-MAX_CELL = 40  # columns of a cell of a query's table on a terminal
-SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, to be searched
-# A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
+PIPE_WIDTH = 120  # characters a line of a table in a file or a pipe; longer cells are wrapped
+GAP = 3  # spaces between the columns of a table
+MAX_CELL = 40  # characters of a cell in a query's table on a terminal; longer cells are cut
+SHORT = 24  # characters; cells up to this length are not wrapped in a file or a pipe (for grep)
+# A cell that consists of one of these words -> its style on a terminal, unless NO_COLOR is set.
 _STYLES = {
     **dict.fromkeys(("fail", "failed", "wrong", "worse", "untrusted", "reversed"), "bold red"),
     **dict.fromkeys(("not allowed", "different"), "bold red"),
@@ -40,8 +40,8 @@ _STYLES = {
 
 @cache
 def _console_type() -> type[Console]:
-    """Return rich's console, changed to leave a closed pipe to `cli.main` (rich: exit 1)."""
-    from rich.console import Console  # slow to import, and a count needs none
+    """Return a Console of rich that leaves a closed pipe to `cli.main`; rich exits 1."""
+    from rich.console import Console  # slow to import
 
     class PipedConsole(Console):
         def on_broken_pipe(self) -> None:
@@ -51,7 +51,7 @@ def _console_type() -> type[Console]:
 
 
 def stdout() -> Console:
-    """Return the console for data, which wraps prose only on a terminal."""
+    """Return the console for data. It wraps text only on a terminal."""
     console = _console_type()
     if sys.stdout.isatty():
         return console(file=sys.stdout, highlight=False)
@@ -61,7 +61,7 @@ def stdout() -> Console:
 
 
 def table_width() -> int:
-    """Return the columns of a table: the terminal's, or those of a file or a pipe."""
+    """Return the width of tables in characters: the terminal's, or PIPE_WIDTH elsewhere."""
     return stdout().width if sys.stdout.isatty() else PIPE_WIDTH
 
 
@@ -71,7 +71,7 @@ def stderr() -> Console:
 
 
 def say(message: str) -> None:
-    """Print one line of progress to stderr, without markup: it may hold a path or a command."""
+    """Print a line to stderr, without rich's markup: it may contain a path or a command."""
     stderr().print(visible(message, keep="\n"), markup=False, emoji=False, soft_wrap=True)
 
 
@@ -95,7 +95,7 @@ def say_unverified(store: Store) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value that JSON can hold: NaN becomes null, NumPy scalars become numbers."""
+    """Convert a value for JSON: NaN becomes null, NumPy scalars become numbers."""
     if hasattr(value, "item") and not hasattr(value, "__len__"):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -106,7 +106,7 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, Decimal):  # which a script would compare as text
+    if isinstance(value, Decimal):  # as text, scripts would compare it wrongly
         return int(value) if value == value.to_integral_value() else float(value)
     if isinstance(value, bytes):
         return value.hex()
@@ -132,7 +132,7 @@ def print_csv(rows: Sequence[Row], columns: Sequence[str], file: TextIO | None =
 
 
 def print_skipped(reasons: Mapping[str, str | None]) -> None:
-    """Print in sentences why topics' messages were skipped."""
+    """Print a line for each reason why messages were skipped, with its topics."""
     topics: dict[str, list[str]] = {}
     for topic, reason in reasons.items():
         if reason:
@@ -144,11 +144,11 @@ def print_skipped(reasons: Mapping[str, str | None]) -> None:
 def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:
-    """Print a table under its title, with numbers to the right.
+    """Print a table with a title; numbers are right-aligned.
 
-    As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe words and
-    cells up to SHORT are not: if columns leave too little room, the table is wider. Words that say
-    how something is (fail, pass) are coloured on a terminal.
+    The table is as wide as the terminal, or PIPE_WIDTH; longer cells are wrapped. In a file or a
+    pipe, words and cells of up to SHORT characters are never wrapped, so the table may be wider.
+    On a terminal, words such as `fail` and `pass` are coloured.
     """
     names = list(columns if columns is not None else rows[0] if rows else ())
     if not sys.stdout.isatty() and _fits(rows, names):
@@ -170,14 +170,14 @@ def print_table(
         table.add_column(name, justify=justify, overflow="fold", min_width=width)
     for row in rows:
         table.add_row(*(_styled(cell(row[name])) for name in names))
-    if title is not None:  # rich's own would be wrapped to the table's width
+    if title is not None:  # printed here, because rich would wrap it to the table's width
         style, lines = _STYLES.get(title.split(":")[0], "table.title"), [visible(title)]
         if not piped:
             lines = _wrapped(lines[0], console.width)
         console.print("\n".join(lines), style=style, markup=False, soft_wrap=True)
     with console.capture() as captured:
         console.print(table, soft_wrap=False, crop=not piped)
-    # rich pads every line to the table's width; a pipe has no use for that.
+    # rich pads every line to the table's width; in a file or a pipe the padding is removed.
     lines = captured.get().splitlines()
     text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
     sys.stdout.write(text.strip("\n") + "\n")
@@ -190,7 +190,7 @@ def print_parted(
     key: Sequence[str],
     title: str | None = None,
 ) -> None:
-    """Print a table, split into several with the columns of `key` if it is too wide."""
+    """Print a table; if it is too wide, as several tables, each with the columns of `key`."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     for place, group in enumerate(_grouped(rows, names, key, table_width())):
         if place:
@@ -199,7 +199,7 @@ def print_parted(
 
 
 def print_sections(sections: Iterable[Any], *, folded: bool = False) -> None:
-    """Print the tables of a page's sections (None: it has none), and those that it folds."""
+    """Print the tables of a page's sections, with `folded` also those that the page folds."""
     for section in filter(None, sections):
         title: str | None = section.title
         for table in section.tables:
@@ -211,7 +211,7 @@ def print_sections(sections: Iterable[Any], *, folded: bool = False) -> None:
 def _grouped(
     rows: Sequence[Row], names: Sequence[str], key: Sequence[str], width: int
 ) -> list[list[str]]:
-    """Split columns into tables that fit into a width, each with the columns of `key`."""
+    """Split columns into groups that fit into a width, each with the columns of `key`."""
     least = {name: _least_width(rows, name) + GAP for name in names}
     groups: list[list[str]] = []
     for name in (name for name in names if name not in key):
@@ -222,7 +222,7 @@ def _grouped(
 
 
 def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
-    """Return the least width of a column in which no word, number or `short` cell is cut."""
+    """Return the width a column needs so that no word, number or cell up to `short` is cut."""
     from rich.cells import cell_len
 
     texts = [cell(row[name]).replace(r"\[", "[") for row in rows]
@@ -232,9 +232,9 @@ def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
 
 
 def _fitted(least: Sequence[int], width: int) -> tuple[int, Sequence[int | None]]:
-    """Return how far apart the columns of a terminal's table stand, and their least widths.
+    """Return the gap between columns of a table on a terminal, and the minimum widths of columns.
 
-    If words do not fit even then, rich cuts them as it must.
+    If words do not fit even with a gap of one, there are no minimum widths, and rich cuts words.
     """
     for apart in range(GAP, 0, -1):
         if sum(least) + apart * (len(least) - 1) + 2 <= width:
@@ -247,7 +247,7 @@ def _numeric(rows: Sequence[Row], name: str) -> bool:
 
 
 def print_wrapped(text: str) -> None:
-    """Print a paragraph after an empty line, wrapped to the width of tables."""
+    """Print an empty line and a paragraph that is wrapped to the width of tables."""
     lines = _wrapped(text, table_width())
     stdout().print("\n".join(["", *lines]), markup=False, soft_wrap=True)
 
@@ -257,7 +257,7 @@ def _wrapped(text: str, columns: int) -> list[str]:
 
 
 def reported(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
-    """Return the columns in which any row has a value."""
+    """Return the columns that are not empty in all rows."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     return [name for name in names if any(row[name] not in (None, "") for row in rows)]
 
@@ -268,7 +268,7 @@ def _styled(text: str) -> str:
 
 
 def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
-    """Return whether every row fits on one line of PIPE_WIDTH, so that rich is not needed."""
+    """Return whether every row fits on a line of PIPE_WIDTH, so that rich need not be imported."""
     if not rows or any("\n" in name for name in names):
         return False
     total = 1 - 3
@@ -281,9 +281,9 @@ def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
 
 
 def print_plain(rows: Sequence[Row], columns: Sequence[str], *, values: bool = False) -> None:
-    """Print a table for files and pipes: one line for each row, however wide.
+    """Print a table with one line a row, however long, for files and pipes.
 
-    With `values` of a query, NULL is shown, and no column is padded beyond PIPE_WIDTH.
+    With `values` (the rows of a query), NULL is shown, and no column is padded beyond PIPE_WIDTH.
     """
     numeric = [_numeric(rows, name) for name in columns]
     text = value_text if values else (lambda value: cell(value).replace(r"\[", "["))
@@ -305,9 +305,9 @@ def print_plain(rows: Sequence[Row], columns: Sequence[str], *, values: bool = F
 
 
 def print_elided(rows: Sequence[Row], columns: Sequence[str]) -> int:
-    """Print a query's rows on a terminal, a line each; return how many columns were left out.
+    """Print the rows of a query on a terminal, one line each; return the number of hidden columns.
 
-    Cells are cut at MAX_CELL. If columns do not fit even then, those in the middle are left out.
+    Cells are cut at MAX_CELL. If the columns do not fit even then, those in the middle are hidden.
     """
     from rich.cells import cell_len, set_cell_size
 
@@ -317,7 +317,7 @@ def print_elided(rows: Sequence[Row], columns: Sequence[str]) -> int:
     widths = [min(max(map(cell_len, column)), MAX_CELL) for column in zip(*lines, strict=True)]
     room, first, last = table_width(), len(columns), len(columns)
     if sum(widths) + GAP * (len(widths) - 1) > room:
-        room, first = room - 1, 0  # "…" stands for what is left out
+        room, first = room - 1, 0  # "…" stands for the hidden columns
         while first < last:
             at_left = first <= len(columns) - last  # from both ends in turn
             room -= widths[first if at_left else last - 1] + GAP
@@ -338,7 +338,7 @@ def print_elided(rows: Sequence[Row], columns: Sequence[str]) -> int:
 
 
 def print_records(rows: Sequence[Row], columns: Sequence[str]) -> None:
-    """Print a query's rows one below the other, a line for each column."""
+    """Print the rows of a query as records: one line for each column of each row."""
     width = max([len(visible(name)) for name in columns], default=0)
     for number, row in enumerate(rows, start=1):
         sys.stdout.write(f"row {number}\n")
@@ -348,7 +348,7 @@ def print_records(rows: Sequence[Row], columns: Sequence[str]) -> None:
 
 
 def value_text(value: Any) -> str:
-    """Return a value of a query's row: NULL in words, lists in [], structs in {}."""
+    """Format a value of a query's row: NULL, lists in [], structs in {}."""
     if value is None:
         return "NULL"
     if isinstance(value, list | tuple):
@@ -360,13 +360,13 @@ def value_text(value: Any) -> str:
 
 
 def cell(value: Any) -> str:
-    """Return a value as a table shows it."""
+    """Format a value for a table."""
     if value is None:
         return ""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        # Large ones in full, as ids and sums are read: not 1.235e+06.
+        # Large numbers (ids, sums) in full, not as 1.235e+06.
         return f"{value:,.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
     if isinstance(value, int):
         return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
@@ -383,7 +383,7 @@ CLOCK_COLUMNS = ["log - stamp s", "clock"]
 
 
 def clock_cells(clock: Row | None) -> dict[str, str]:
-    """Return how far log time is ahead of a topic's stamps, and what is odd about them."""
+    """Return the cells of CLOCK_COLUMNS: log time minus stamps of a topic, and its clock faults."""
     from restock.ingest.steps.clocks import odd
 
     offset = None if clock is None else clock["offset_ns"]
@@ -392,26 +392,26 @@ def clock_cells(clock: Row | None) -> dict[str, str]:
 
 
 class Advance:
-    """Moves a progress bar, and says how far the part at hand is; or nothing, without a bar."""
+    """A function that advances a progress bar and shows a note; it does nothing without a bar."""
 
     def __init__(self, bar: Progress | None = None, task: TaskID | None = None) -> None:
         self._bar, self._task = bar, task
 
     def __call__(self, amount: float = 1.0, note: str = "") -> None:
-        """Advance the whole."""
+        """Advance the bar by `amount`, and show `note`."""
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, advance=amount, note=cell(visible(note)))
 
     def part(self, doing: str, done: float, whole: float) -> None:
-        """Show how far the part at hand is."""
+        """Show the progress of the current part as a note, in percent."""
         self(0.0, f"{doing} {done / whole:.0%}" if whole else doing)
 
 
 @contextmanager
 def progress(description: str, total: float | None) -> Iterator[Advance]:
-    """Show a progress bar on a terminal, nothing elsewhere; yield the function that advances it.
+    """Show a progress bar on a terminal, and nothing elsewhere; yield the function to advance it.
 
-    Without a total it shows activity and the elapsed time.
+    If `total` is None, the bar shows activity and the elapsed time.
     """
     if not sys.stderr.isatty():
         yield Advance()
@@ -434,7 +434,7 @@ def progress(description: str, total: float | None) -> Iterator[Advance]:
         TextColumn("{task.fields[note]}"),
         console=stderr(),
         transient=True,
-        redirect_stdout=sys.stdout.isatty(),  # in a file it is data, whatever stderr shows
+        redirect_stdout=sys.stdout.isatty(),  # data that go to a file are not touched
     )
     with bar:
         yield Advance(bar, bar.add_task(cell(visible(description)), total=total, note=""))

@@ -1,6 +1,7 @@
-"""A verb's fields as words of its command line, and the parsing of plain lines.
+"""Declare the options of verbs, and parse simple command lines without tyro.
 
-tyro takes a fifth of the time of a short command: it is only asked for help and complaints.
+tyro takes a fifth of the time of a short command, so it is used only for help, for errors, and for
+lines that `parse_plain` does not handle.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ C = TypeVar("C")
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """An option; by default help shows its field's name and type."""
+    """An option. By default its name and metavar are those of the field's name and type."""
 
     metavar: str | None = None
     name: str | None = None
@@ -27,7 +28,7 @@ class Option:
 
 
 class Positional(Option):
-    """A field whose words are known by their place."""
+    """A positional argument."""
 
 
 class Repeated(Option):
@@ -35,10 +36,10 @@ class Repeated(Option):
 
 
 def parse_plain(command: type[C], words: Sequence[str]) -> C | None:
-    """Return the command of a plain line; None if tyro has to parse it or to complain.
+    """Parse a simple command line; return None if tyro has to parse it or to report an error.
 
-    In a plain line no word is short for another, values begin with no dash unless after "=", and
-    all positional words are side by side.
+    In a simple line, options are not abbreviated, values begin with a dash only after "=", and all
+    positional arguments are next to each other.
     """
     hints = typing.get_type_hints(command, include_extras=True)
     fields: dict[str, tuple[Any, Option]] = {}
@@ -77,12 +78,12 @@ def parse_plain(command: type[C], words: Sequence[str]) -> C | None:
     try:
         values |= {name: _value(*fields[name], texts) for name, texts in given.items()}
         return None if left else command(**values)
-    except (TypeError, ValueError):  # a required one is missing, or a text is no such value
+    except (TypeError, ValueError):  # a required argument is missing, or a value is invalid
         return None
 
 
 def declared(hint: Any) -> tuple[Any, bool, Option]:
-    """Return a field's type, whether it may also be None, and what it is on the command line."""
+    """Return the type of a field, whether it may be None, and its declaration as an option."""
     annotated = typing.get_origin(hint) is typing.Annotated
     kind, *extras = typing.get_args(hint) if annotated else (hint,)
     how = next((one for one in extras if isinstance(one, Option)), Option())
@@ -96,7 +97,7 @@ def _several(kind: Any) -> bool:
 
 
 def _value(kind: Any, how: Option, texts: Sequence[str]) -> Any:
-    """Return the value of a field; raise ValueError if the texts are none, or say None."""
+    """Convert words to the value of a field; raise ValueError if they are invalid, or `None`."""
     if _several(kind):
         return typing.get_origin(kind)(_value(typing.get_args(kind)[0], how, [t]) for t in texts)
     choices = typing.get_args(kind) if typing.get_origin(kind) is Literal else how.choices
@@ -107,10 +108,10 @@ def _value(kind: Any, how: Option, texts: Sequence[str]) -> Any:
 
 
 def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> None:
-    """Refuse options that would do nothing: those of these fields whose value is not the default.
+    """Refuse options that would have no effect in this use of the command.
 
     Raises:
-        ConfigError: one was given.
+        ConfigError: one of the fields in `names` does not have its default value.
     """
     for field in dataclasses.fields(command):
         if field.name in names and getattr(command, field.name) != field.default:
@@ -121,10 +122,10 @@ def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> No
 
 
 def refuse_empty_paths(command: Any) -> None:
-    """Refuse paths that were given as an empty word: Python takes that for the working directory.
+    """Refuse empty paths, which Python would take for the working directory.
 
     Raises:
-        ConfigError: there is one; names the option or the argument.
+        ConfigError: a path is empty; `where` is the option or argument.
     """
     for field in dataclasses.fields(command):
         value = getattr(command, field.name)
