@@ -1,4 +1,4 @@
-"""Recordings to labelled transitions: MCAP files and ROS 2 bags in, rows of a store out."""
+"""Ingest: turns recordings (MCAP files, bags) into labelled transitions, the rows of a store."""
 
 from __future__ import annotations
 

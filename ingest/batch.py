@@ -1,10 +1,10 @@
-"""Several recordings: one after the other, or in several processes.
+"""Ingest of several recordings, one after the other or in several worker processes.
 
-If a process dies (killed, or out of memory), the recording it was reading fails by name; another
-process replaces it. The processes write files. This process commits them, several at once, so that
-a fleet's recordings are not two commits each. Processes are forked from a server that has imported
-what they need once: forking this process, with its threads, would not be safe. The server imports
-in parallel with this process.
+If a worker dies (killed, or out of memory), the error names the recording it was reading, and a new
+worker replaces it. The workers write files and this process commits them, several recordings at
+once: otherwise each recording would take two commits. Workers are forked from a server process,
+because forking this process, which has threads, would not be safe. The server imports the libraries
+once, in parallel with this process.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ Result = tuple[Path, Union["IngestResult", RestockError]]
 A = TypeVar("A")
 T = TypeVar("T")
 D = TypeVar("D")
-# Of short recordings that are labelled together: how many, and how large they are together.
+# Limits of the short recordings that are labelled together: their number and total size.
 BUNDLE, BUNDLE_BYTES = 16, 64 << 20
-PATIENCE_S = 10  # for a worker that was told to stop, before it is killed
+PATIENCE_S = 10  # a worker that was asked to stop is killed after this time
 AGAIN = "run it again: recordings that are already in the store are skipped"
 
 
 @dataclass(frozen=True)
 class IngestJob:
-    """Instructions for every recording. `store` None is a dry run."""
+    """The options of an ingest, the same for all its recordings. `store` None is a dry run."""
 
     profile: Profile
     store: str | Path | None
     force: bool = False
     salvage: bool = False
     definitions: str | None = None
-    repeated: OnRepeat = "keep"  # a recording that is in the store under another id
-    tags: Mapping[str, str] = field(default_factory=dict)  # of every recording
+    repeated: OnRepeat = "keep"  # for a drive that is in the store under another recording id
+    tags: Mapping[str, str] = field(default_factory=dict)  # given to every recording
 
     @cached_property
     def writer(self) -> StoreWriter | None:
-        """Return the store for writing; `replace` makes a job that has read nothing of it yet."""
+        """Return the store's writer; `dataclasses.replace(job)` makes a job with a new writer."""
         from restock.ingest.store.writer import StoreWriter
 
         return StoreWriter(self.store) if self.store is not None else None
@@ -71,7 +71,7 @@ class IngestJob:
         watch: Watch | None = None,
         settle: Callable[[str], None] = lambda recording_id: None,
     ) -> Prepared | RestockError:
-        """Read one recording and write its files; an error is returned: the others go on."""
+        """Read one recording and write its files; return an error, so that the others go on."""
         from restock.ingest.pipeline import preparing
 
         try:
@@ -81,9 +81,9 @@ class IngestJob:
             return error
         except MemoryError:
             return out_of_memory(path)
-        except Exception as error:  # noqa: BLE001  (a defect costs its recording, not all of them)
+        except Exception as error:  # noqa: BLE001  (a bug must fail one recording, not all)
             print_traceback(error)
-            if isinstance(error, OSError) and error.strerror:  # a disk's or a network's, not ours
+            if isinstance(error, OSError) and error.strerror:  # of a disk or a network, not a bug
                 return RecordingError(
                     f"cannot be read or written: {error.strerror}",
                     where=str(path if error.filename is None else error.filename),
@@ -102,9 +102,10 @@ class IngestJob:
     def prepare_several(
         self, paths: Sequence[Path], **more: Any
     ) -> Iterator[tuple[int, Prepared | RestockError]]:
-        """Yield what `prepare` returns of each path, with its place, as it comes.
+        """Prepare recordings together; yield the index and result of each when it is done.
 
-        Short recordings are labelled together. What cannot be done so is done alone.
+        Their labels and summaries are computed together. A recording for which that fails is
+        prepared again alone.
         """
         from restock.ingest.pipeline import Prepared, preparing
 
@@ -113,11 +114,11 @@ class IngestJob:
 
         def settle_first(recording_id: str) -> None:
             if recording_id in ids:
-                raise LookupError  # after the other one: it may be the same
+                raise LookupError  # the same recording again: prepare it alone, after the first
             settle(recording_id)
             ids.add(recording_id)
 
-        with suppress(Exception):  # `prepare` says what is wrong with which
+        with suppress(Exception):  # `prepare` finds the recording and the error
             how = {**self.options, **more, "settle": settle_first}
             works = [preparing(path, self.profile, **how) for path in paths if len(paths) > 1]
             for place, one in in_step(works):
@@ -128,12 +129,12 @@ class IngestJob:
             yield place, self.prepare(path, **more)
 
     def prepare_list(self, paths: Sequence[Path]) -> list[Prepared | RestockError]:
-        """Return what `prepare` returns of each path."""
+        """Return the result of `prepare` for each path, in the order of `paths`."""
         return [one for _, one in sorted(self.prepare_several(paths), key=itemgetter(0))]
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return what `preparing` is told of every recording."""
+        """Return the arguments of `preparing` that are the same for every recording."""
         names = ("force", "salvage", "definitions", "repeated", "tags")
         return {"store": self.writer, **{name: getattr(self, name) for name in names}}
 
@@ -145,17 +146,17 @@ def ingest_all(
     workers: int = 1,
     watch: Watch | None = None,
 ) -> Iterator[Result]:
-    """Yield each recording's outcome or error, in the order of `paths`, after its commit.
+    """Ingest recordings; yield each path with its result or error, in order, after its commit.
 
-    One worker reads a recording and writes its files. This process commits the files of some
-    seconds together, so the store is the same as with one worker. `watch` gets the progress of a
-    recording if they are read one after the other. If the caller stops early, uncommitted
-    recordings are not kept.
+    A worker reads a recording and writes its files. This process commits the files of a few
+    seconds together, so the store is the same as with one worker. `watch` is called with the
+    progress within a recording, but only with one worker. If the caller stops early, recordings
+    that are not yet committed are discarded.
     """
     from restock.ingest.pipeline import CommitGroup
 
     taken = [Path(path) for path in paths]
-    here = replace(job)  # others get the job without what its writer has read
+    here = replace(job)  # has its own writer: workers get `job` without what a writer has read
     group = CommitGroup(here.writer)
     some = min(workers, len(taken))
     if some > 1:
@@ -183,7 +184,7 @@ def ingest_all(
 def _one_by_one(
     job: IngestJob, paths: Sequence[Path], group: CommitGroup, watch: Watch | None
 ) -> Generator[tuple[int, Prepared | RestockError]]:
-    """Prepare one recording after the other, and commit what waits while a long one is read."""
+    """Prepare the recordings in this process, and commit waiting ones while a long one is read."""
 
     def watched(what: str, done: int, of: int) -> None:
         group.commit_if_due()
@@ -199,7 +200,10 @@ def _one_by_one(
 def _by_workers(
     job: IngestJob, paths: Sequence[Path], workers: int, group: CommitGroup
 ) -> Generator[tuple[int, Prepared | RestockError] | None]:
-    """Prepare recordings in several processes; those of one that died are read again alone."""
+    """Prepare the recordings in several processes.
+
+    If a process dies, each recording of its bundle is read again in a bundle of its own.
+    """
 
     def died(bundle: Sequence[Path], code: int) -> list[Prepared | RestockError]:
         return [_died(path, code) for path in bundle if len(bundle) == 1]
@@ -220,7 +224,7 @@ def _by_workers(
 
 
 def _bundles(paths: Sequence[Path], most: int) -> list[list[int]]:
-    """Put together the places of up to `most` short recordings that follow each other."""
+    """Group the indices of consecutive recordings: up to `most`, and up to BUNDLE_BYTES in all."""
     bundles: list[list[int]] = []
     whole = 0
     for place, path in enumerate(paths):
@@ -253,7 +257,7 @@ def _died(path: Path, code: int) -> RecordingError:
 class _Worker(Generic[T]):
     process: BaseProcess
     pipe: Connection
-    at_hand: int | None = None  # place of its recording
+    at_hand: int | None = None  # index of the recording it works on
 
 
 def side_by_side(
@@ -264,18 +268,19 @@ def side_by_side(
     died: Callable[[A, int], D],
     patience_s: Callable[[], float | None] = lambda: None,
 ) -> Generator[tuple[int, T | D] | None]:
-    """Yield what `work` returns for each path, or several, with their place, as it comes.
+    """Call `work` on each element in worker processes; yield its index and result when it is done.
 
-    A path whose process died gives `died(path, exit code)`. Yields None if nothing came for
-    `patience_s()` seconds, which is evaluated at each wait. The largest recordings begin first, so
-    that none of them runs alone at the end. If the caller or Ctrl-C stops early, all work ends.
+    An element is a path or a sequence of paths. If its process died, the result is `died(element,
+    exit code)`. Yields None if no result came for `patience_s()` seconds, evaluated at each wait.
+    The largest recordings begin first, so that none of them runs alone at the end. If the caller or
+    Ctrl-C stops early, all workers end.
     """
     ahead = deque(sorted(range(len(paths)), key=lambda place: -_size(paths[place])))
     pool: list[_Worker[T]] = []
     context = _context()
 
     def begin(worker: _Worker[T]) -> None:
-        """Give the worker its next recording, or end it."""
+        """Give the worker the next recording, or end it if none is left."""
         worker.at_hand = ahead.popleft() if ahead else None
         if worker.at_hand is None:
             worker.pipe.close()
@@ -320,14 +325,14 @@ def side_by_side(
 
 
 def warm_up() -> None:
-    """Let the server of processes import what they need, while this process does."""
+    """Start the fork server, which imports the libraries while this process does."""
     if isinstance(_context(), ForkServerContext):
         forkserver.ensure_running()
 
 
 def _serve(pipe: Connection, work: Callable[[A], T]) -> None:
-    """Run a worker: one recording after the other, until none is left or the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
+    """Run a worker: call `work` on what arrives, until the parent closes the pipe or is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
     signal.signal(signal.SIGTERM, _stop)
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -340,12 +345,12 @@ def _serve(pipe: Connection, work: Callable[[A], T]) -> None:
 
 
 def _stop(*_: object) -> None:
-    """Stop as Ctrl-C would: between two steps of the work, which then cleans up."""
+    """Handle SIGTERM like Ctrl-C: raise KeyboardInterrupt, so that the work cleans up."""
     raise KeyboardInterrupt
 
 
 def _end_with(parent: int) -> None:
-    """End when the parent has: its results are no longer read."""
+    """End this process when its parent ends, as nobody reads its results any more."""
     wait([parent])
     os._exit(1)
 
@@ -360,7 +365,7 @@ def _context() -> ForkServerContext | SpawnContext:
 
 
 def _size(path: object) -> int:
-    """Return the bytes of recordings, summed over a folder's files; 0 if it is gone."""
+    """Return the size in bytes of a file, a folder or a sequence of them; 0 if it is gone."""
     if not isinstance(path, Path):
         return sum(map(_size, path if isinstance(path, Sequence) else ()))
     files = path.rglob("*") if path.is_dir() else [path]

@@ -1,11 +1,11 @@
-"""Ingest of a recording, end to end: columns, steps, episodes, labels, rows, and the commit.
+"""Ingest of one recording: read columns, make steps, episodes, labels and rows, and commit them.
 
     profile = load_profile("warehouse_amr")
     outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
 
-A recording is visible only after its commit, so a killed process loses only those that waited: the
-same command reads them again. The first recording is committed at once; after that, those of
-GROUP_S seconds together, or as soon as MAX_WAITING wait.
+A recording is visible only after its commit. A killed process therefore loses only the recordings
+that waited for theirs, and the same command reads those again. The first recording is committed at
+once. Later ones are committed together every GROUP_S seconds, or as soon as MAX_WAITING wait.
 """
 
 from __future__ import annotations
@@ -71,37 +71,37 @@ OnRepeat = Literal["keep", "refuse", "replace"]
 
 @dataclass(frozen=True)
 class IngestResult:
-    """Outcome of one recording: the counts of its manifest, and its notes."""
+    """The outcome of ingesting one recording: its manifest, counts and notes."""
 
     path: str
     status: Status
     manifest: dict[str, Any]  # the row of `recordings`, as plain values
-    messages: dict[str, int] = field(default_factory=dict)  # of used topics; and of unused ones
-    conditions: dict[str, int] = field(default_factory=dict)  # transitions a label holds on
-    named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
-    exposures: dict[str, int] = field(default_factory=dict)  # transitions an exposure holds on
+    messages: dict[str, int] = field(default_factory=dict)  # expected, decoded and unused ones
+    conditions: dict[str, int] = field(default_factory=dict)  # transitions on which a label holds
+    named: dict[str, int] = field(default_factory=dict)  # transitions with it as their `condition`
+    exposures: dict[str, int] = field(default_factory=dict)  # transitions in this exposure
     scores: list[LabelScore] = field(default_factory=list)
-    endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
-    lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
-    contradictions: list[str] = field(default_factory=list)  # of topics; kept in the rows
+    endings: dict[str, int] = field(default_factory=dict)  # number of episodes by how they ended
+    lost_messages: list[str] = field(default_factory=list)  # lost messages or bytes, and why
+    contradictions: list[str] = field(default_factory=list)  # between topics; the rows keep them
     notes: list[str] = field(default_factory=list)
-    version: int | None = None  # of the store's transitions, where they were written
-    repeats: RepeatedDrive | None = None  # one in the store with largely the same rows
+    version: int | None = None  # of the table `transitions`, if this was committed
+    repeats: RepeatedDrive | None = None  # a stored recording with largely the same rows
 
     @property
     def lossy(self) -> bool:
-        """Return whether data of the topics used was lost, or contradicts itself."""
+        """Return whether data of the used topics was lost or is contradictory."""
         return bool(self.lost_messages or self.contradictions)
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A recording that was read, and what is left to do: its commit, unless there is none."""
+    """A recording that was read and whose files are written, ready to commit."""
 
-    result: IngestResult  # as it is once it is committed
-    staged: Staged | None = None
-    repeated: OnRepeat | None = None  # None: not looked for
-    period_s: float = 0.0  # its control period
+    result: IngestResult  # its version and `repeats` are filled in by the commit
+    staged: Staged | None = None  # None: nothing to commit
+    repeated: OnRepeat | None = None  # None: do not look for the same drive in the store
+    period_s: float = 0.0  # control period
 
 
 @interrupts_raised
@@ -119,18 +119,18 @@ def ingest(
 ) -> IngestResult:
     """Read one recording and write its transitions to the store (None: a dry run).
 
-    A recording is skipped if this profile, these conditions and this software have already put it
-    into the store, unless `force`. `repeated` decides about a recording whose rows are largely
-    those of another one in the store (a part of it, a copy): it is kept and reported, refused, or
-    replaces a part of itself. `tags` say whose drive it is and override the recording's own; ""
-    removes a tag. If only tags or the profile's [robot] are new, the stored rows are written again
-    with them: the status is "tagged". `watch` gets the progress: what is being done, how much of it
-    is done, and of how much.
+    A recording is skipped if it is in the store, written by this software with the same profile and
+    conditions, unless `force`. `repeated` decides what happens if most of its rows are also in
+    another stored recording (a copy, or a part of the same drive): "keep" keeps both and reports
+    it, "refuse" raises, "replace" removes the other one if it is a part of this one and raises if
+    this one holds no more. `tags` (robot, site, …) override the recording's own; "" removes a tag.
+    If only tags or the profile's [robot] are new, the stored rows are written again with them, and
+    the status is "tagged". `watch` is called with the activity, how much is done, and the total.
 
     Raises:
-        RecordingError: no recording, damaged (unless `salvage`), not of this profile, it gives
-            no transition, its sources contradict each other about a tag, or it is repeated and to
-            be refused. The store is as it was.
+        RecordingError: it is not a recording, is damaged (unless `salvage`), does not fit the
+            profile, gives no transition, has sources that contradict each other about a tag, or is
+            refused as a repeated drive. The store is unchanged.
         StoreError: the store cannot be written.
     """
     how: dict[str, Any] = {"store": store, "force": force, "salvage": salvage, "watch": watch}
@@ -157,10 +157,10 @@ def preparing(
     watch: Watch | None = None,
     settle: Callable[[str], None] = lambda recording_id: None,
 ) -> Work[Prepared]:
-    """Prepare a recording in step with others, whose labels and summaries are made with its own.
+    """Prepare a recording in step with others, so that labels and summaries are computed together.
 
-    `settle(recording_id)` is called before the recording is looked up in the store, which does not
-    show recordings that wait for their commit.
+    `settle(recording_id)` is called before the recording is looked up in the store, so that the
+    caller can first commit a waiting recording with this id.
     """
     file = before = None
     if store is not None and not force:
@@ -205,7 +205,7 @@ def preparing(
 
 
 def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
-    """Return whether the rows of this manifest were made by the same definitions."""
+    """Return whether the rows of this manifest were made with the profile's current definitions."""
     by_rules = {**before, "labels_version": rules_of(before["labels_version"])}
     return all(by_rules[name] == value for name, value in definitions(profile).items())
 
@@ -216,15 +216,15 @@ def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
     return stored is not None and stored.robot != profile.robot
 
 
-@lru_cache(maxsize=64)  # which many recordings share
+@lru_cache(maxsize=64)  # many recordings share a profile
 def _stored_profile(text: str) -> Profile | None:
-    with suppress(ConfigError):  # as another version wrote it
+    with suppress(ConfigError):  # another version of Restock wrote it
         return parse_profile(text, where="profile_toml")
     return None
 
 
 def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> Staged:
-    """Write a recording's rows again with what is `new` in its manifest."""
+    """Stage a stored recording's rows again, with the `new` values in its manifest."""
     ingest_id = uuid.uuid4().hex[:16]
     manifest = {**before, "ingest_id": ingest_id, **new}
     rows = store.rows(before["recording_id"], before["ingest_id"])
@@ -234,7 +234,7 @@ def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) 
 
 
 class _Ingest:
-    """The stages over one open recording."""
+    """Runs the stages of ingest on one open recording."""
 
     def __init__(
         self,
@@ -253,7 +253,7 @@ class _Ingest:
     def run(self, store: StoreWriter | None) -> Work[Prepared]:
         profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
-        # The next stages need to know which topics had messages, not their values: free those.
+        # The next stages need to know which topics had messages, not their values: free the values.
         columns = {name: column.times(0, 1) for name, column in columns.items()}
         watch, ticks = self.recording.watch, len(steps)
         episodes = split(profile.task, steps)
@@ -322,7 +322,7 @@ class _Ingest:
         table: pa.Table,
         kept: Sequence[KeptFrames],
     ) -> Staged:
-        # What another process corrects meanwhile is not written over.
+        # With corrections, refuse to overwrite those that another process makes in the meantime.
         read = self.before["ingest_id"] if self.corrections else None
         with self._frames_written(store, manifest, kept):
             return store.stage(row, table, instead_of=read)
@@ -331,10 +331,10 @@ class _Ingest:
     def _frames_written(
         self, store: StoreWriter, manifest: Mapping[str, Any], kept: Sequence[KeptFrames]
     ) -> Iterator[None]:
-        """Write the frames to their file, and delete it again if the block fails.
+        """Write the camera frames to their file, and delete the file again if the block fails.
 
         Raises:
-            RecordingError: a frame that was read before is not there any more.
+            RecordingError: a frame that was read before is missing now.
         """
         file = next((row["file"] for row in manifest["cameras"] if row["file"]), "")
         if not file:
@@ -370,7 +370,7 @@ class _Ingest:
             f"cameras.{name}: {reason} ({counted(count, 'message')})"
             for name, camera in steps.cameras.items()
             for reason, count in camera.problems.items()
-            if count and reason != OFF_CLOCK  # which is said of the topic
+            if count and reason != OFF_CLOCK  # reported for the topic, below
         ]
         lost = frames + [
             f"{loss.topic or 'the file'}: {loss.reason}"
@@ -438,14 +438,14 @@ class _Ingest:
 def commit_all(
     store: StoreWriter, prepared: Sequence[Prepared]
 ) -> list[IngestResult | StoreError | RecordingError]:
-    """Commit recordings, several in one; return the result of each, in their order.
+    """Commit recordings together; return the result of each, in their order.
 
-    If one cannot be committed, the others still are. Their manifests are joined once they are many.
+    If one cannot be committed, the others still are. Merges the manifest files if they are many.
     """
     outcomes: dict[int, IngestResult | StoreError | RecordingError] = {}
     group: dict[int, Prepared] = {}
     for place, one in enumerate(prepared):
-        # Of one recording the later ingest replaces the earlier, in a commit of its own.
+        # A later ingest of the same recording replaces the earlier one, in a commit of its own.
         ids = {other.staged.recording_id for other in group.values() if other.staged}
         if one.staged and one.staged.recording_id in ids:
             outcomes |= _commit(store, group)
@@ -465,7 +465,7 @@ def commit_all(
 def _refusal(
     store: StoreWriter, one: Prepared, before: Sequence[Prepared]
 ) -> RecordingError | StoreError | None:
-    """Return why a recording is not to be committed: it is in the store or earlier in its group."""
+    """Return an error if the recording repeats a drive of the store or of `before` and must not."""
     if one.staged is None or one.repeated in (None, "keep"):
         return None
     ahead = [other.staged for other in before if other.staged]
@@ -476,7 +476,7 @@ def _refusal(
     if found is None or (one.repeated == "replace" and found.the_less):
         return None
     remedy = "leave it out, or use --repeated keep to ingest it anyway"
-    if found.the_less:  # as of a recording that was still being written, or salvaged
+    if found.the_less:  # it was ingested while still being written, or salvaged
         remedy = (
             f"this one holds more of the drive: {_removal(store, found.recording_id)} removes "
             "that one; then ingest this one again (--repeated replace does both), or keep both "
@@ -492,7 +492,10 @@ def _removal(store: StoreWriter, recording_id: str) -> str:
 def _commit(
     store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
 ) -> dict[int, IngestResult | StoreError | RecordingError]:
-    """Commit all in one, or if that fails, each alone; `begun` if a commit of several had begun."""
+    """Commit all recordings at once, or if that fails, each alone.
+
+    `begun` tells whether a commit that includes them had begun before.
+    """
     staged = {place: one.staged for place, one in group.items() if one.staged}
     several = list(staged.values())
     if not several:
@@ -521,10 +524,10 @@ def _commit(
 def _finished(
     store: StoreWriter, one: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
 ) -> IngestResult | StoreError:
-    """Build the result of a committed recording, ignoring the `later` ones of its group."""
+    """Build the result of a committed recording, ignoring the `later` ones of its commit."""
     repeats = None
     if one.repeated is not None:
-        # Looked for after the commit: another process may have written the same drive meanwhile.
+        # Look after the commit: another process may have written the same drive meanwhile.
         try:
             repeats = store.repeated(staged, one.period_s, aside={i.ingest_id for i in later})
         except StoreError as error:
@@ -550,7 +553,7 @@ def _finished(
 def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
     """Remove a recording that is only a part of what was just ingested.
 
-    Returns the store's version (None if the part stays) and a note for the user.
+    Returns the version of `transitions` (None if the part stays) and a note for the user.
     """
     why = "it has steps that this one lacks"
     if part.is_part:
@@ -566,9 +569,10 @@ def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]
 
 
 class CommitGroup:
-    """Recordings that wait for their commit, and `results`, what became of those before, by place.
+    """Collects recordings and commits them together when it is time.
 
-    `store` None is a dry run; `clock` gives seconds.
+    `results` has the outcomes by place: the index of a recording in the ingest. `store` None is a
+    dry run; `clock` gives seconds.
     """
 
     def __init__(
@@ -577,11 +581,11 @@ class CommitGroup:
         self.store, self.clock = store, clock
         self.results: dict[int, IngestResult | RestockError] = {}
         self.waiting: dict[int, Prepared] = {}
-        self._first: dict[str, IngestResult] = {}  # of each recording, by id, in this ingest
-        self._last_s: float | None = None  # when the last commit was done
+        self._first: dict[str, IngestResult] = {}  # recording id -> its first result in this ingest
+        self._last_s: float | None = None  # time of the last commit
 
     def add(self, place: int, one: Prepared | RestockError) -> None:
-        """Take in what was made of a recording; commit where it is time."""
+        """Add a prepared recording or its error, and commit if it is time."""
         if isinstance(one, RestockError):
             self.results[place] = one
         elif self.store is not None and (copy := self._copy(one.result)) is not None:
@@ -594,9 +598,10 @@ class CommitGroup:
         self.commit_if_due()
 
     def _copy(self, result: IngestResult) -> IngestResult | None:
-        """Return the result of a recording that came before under another path with other tags.
+        """Return the result for a recording that came before with other tags; None if it did not.
 
-        The first path's tags stay. Otherwise each ingest of the two paths would change them.
+        That happens if two paths have the same recording. The tags of the first path stay, or each
+        ingest of the two paths would change them.
         """
         first = self._first.setdefault(result.manifest.get("recording_id", ""), result)
         tags = first.manifest.get("tags") or {}
@@ -614,27 +619,27 @@ class CommitGroup:
         return max(0.0, self._last_s + GROUP_S - self.clock())
 
     def commit_if_due(self) -> None:
-        """Commit what waits, where it is time."""
+        """Commit the waiting recordings if it is time."""
         if self.due_in_s() == 0.0:
             self.commit()
 
     def settle(self, recording_id: str) -> None:
-        """Commit what waits, where this recording does: it is about to be looked up."""
+        """Commit the waiting recordings if this one, about to be looked up, is among them."""
         if recording_id in {one.staged.recording_id for one in self.waiting.values() if one.staged}:
             self.commit()
 
     def commit(self) -> None:
-        """Commit what waits."""
+        """Commit the waiting recordings."""
         if not self.waiting or self.store is None:
             return
-        # Once a commit has begun, what it is about is not discarded.
+        # Once their commit has begun, `discard` must not delete their files.
         waiting, self.waiting = self.waiting, {}
         outcomes = commit_all(self.store, list(waiting.values()))
         self.results |= dict(zip(waiting, outcomes, strict=True))
         self._last_s = self.clock()
 
     def discard(self) -> None:
-        """Delete the files of what still waits."""
+        """Delete the files of the recordings that still wait."""
         staged = [one.staged for one in self.waiting.values() if one.staged]
         self.waiting = {}
         if self.store is not None:

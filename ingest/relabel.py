@@ -1,8 +1,8 @@
-"""Relabel: run conditions again over the signals that are stored, without the recordings.
+"""Relabelling: evaluates conditions again on the stored signals, without reading the recordings.
 
-Rows, observations and rewards stay as they were ingested; `condition`, `conditions` and
-`labels_version` become new, and so do the manifest's scores. People's corrections override the new
-labels (`correct_store` puts them into the store). All recordings change in one commit.
+Rows, observations and rewards stay as ingested. `condition`, `conditions`, `labels_version` and the
+manifest's scores are replaced. People's corrections override the new labels (`correct_store` puts
+corrections into the store). All recordings change in one commit.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ from restock.ingest.task.task import Task
 
 @dataclass(frozen=True)
 class Relabelled:
-    """Outcome of relabelling one recording."""
+    """The outcome of relabelling one recording."""
 
     recording_id: str
     source_file: str
     before: str  # labels version
     after: str
-    changed: int = 0  # rows whose one condition is another now
-    named: dict[str, int] = field(default_factory=dict)  # rows per condition, after
+    changed: int = 0  # rows with another `condition` than before
+    named: dict[str, int] = field(default_factory=dict)  # rows by their `condition`, after
     named_before: dict[str, int] = field(default_factory=dict)
     scores: list[LabelScore] = field(default_factory=list)
 
@@ -76,13 +76,14 @@ def relabel_store(
 ) -> tuple[list[Relabelled], int | None]:
     """Label every recording again whose conditions have changed.
 
-    `conditions_of` gives the definitions, of both kinds, for the profile (by name) that read a
-    recording. Returns what became of each, and the version of `transitions` (None where nothing
-    was written).
+    `conditions_of` returns the definitions of outcomes and exposures for a profile, by its name.
+    Returns the outcome of each recording, and the version of `transitions` (None if nothing was
+    written).
 
     Raises:
-        StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
-        ConfigError: a condition's SQL does not run over the signals that are stored.
+        StoreError: rows lack the ends of their episodes (an old version wrote them), or another
+            process changed them meanwhile.
+        ConfigError: a condition's SQL fails on the stored signals.
     """
     outcomes: list[Relabelled] = []
     stale: list[dict[str, Any]] = []
@@ -109,11 +110,11 @@ def relabel_rows(
 ) -> tuple[pa.Table, pa.Table, Relabelled]:
     """Return the manifest and rows of a recording with new labels; `row` is the old manifest.
 
-    `definitions` are conditions of both kinds.
+    `definitions` are the outcomes and exposures.
 
     Raises:
-        StoreError: its rows were written before their episodes' ends were kept.
-        ConfigError: a condition's SQL does not run over the signals that are stored.
+        StoreError: its rows lack the ends of their episodes: an old version wrote them.
+        ConfigError: a condition's SQL fails on the stored signals.
     """
     rows = store.rows(row["recording_id"], row["ingest_id"])
     ends = episode_ends(rows)
@@ -123,7 +124,7 @@ def relabel_rows(
             where=str(store.path),
             remedy="ingest the recording again",
         )
-    stored = rows.select(ends.column_names)  # the signals, and the profile's own
+    stored = rows.select(ends.column_names)  # the signals, also those that the profile adds
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     conditions, exposures = (
@@ -189,7 +190,7 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
     """Open the store at `path`, which must exist.
 
     Raises:
-        StoreError: there is none.
+        StoreError: there is no store, or it is empty.
     """
     store = StoreWriter(path)
     store.reach()
@@ -206,22 +207,22 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
 class RecordingCorrections:
     """People's corrections of one recording's labels."""
 
-    ingest_id: str  # of the rows that it was said of
+    ingest_id: str  # the rows that people judged
     corrections: list[Correction]
 
 
 @dataclass(frozen=True)
 class Changed:
-    """Effect of corrections on one condition's rows."""
+    """The effect of corrections on one condition, as numbers of rows."""
 
-    added: int = 0  # the label is there now
+    added: int = 0  # got the label
     removed: int = 0
-    confirmed: int = 0  # were said to be as they are
+    confirmed: int = 0  # judged, and unchanged
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """Outcome of correcting one recording."""
+    """The outcome of correcting one recording."""
 
     recording_id: str
     source_file: str
@@ -233,9 +234,9 @@ class Corrected:
 def correct_store(
     store: StoreWriter, given: Mapping[str, RecordingCorrections], *, dry_run: bool = False
 ) -> tuple[list[Corrected], int | None]:
-    """Apply corrections to the labels of these recordings (by their ids), all in one commit.
+    """Apply corrections to the labels of recordings, by recording id, all in one commit.
 
-    Returns what became of each, and the version of `transitions` (None: nothing was written).
+    Returns the outcome of each, and the version of `transitions` (None if nothing was written).
 
     Raises:
         StoreError: a recording is not in the store, or was ingested again meanwhile.
@@ -264,10 +265,10 @@ def correct_store(
 def remove_corrections(
     store: StoreWriter, *, dry_run: bool = False
 ) -> tuple[list[Corrected], int | None]:
-    """Remove all corrections from a store, which restores the labels by the rules.
+    """Remove all corrections from a store, which restores the labels that the rules give.
 
     Raises:
-        StoreError: rows were written before their episodes' ends were kept.
+        StoreError: rows lack the ends of their episodes: an old version wrote them.
     """
     outcomes: list[Corrected] = []
     live = [row for row in store.live().to_pylist() if row[COLUMN]]
@@ -287,7 +288,7 @@ def remove_corrections(
 
 
 def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """Return the conditions of a kind that labelled a recording, as its manifest keeps them.
+    """Return the conditions of a kind that labelled a recording, from its manifest.
 
     Raises:
         StoreError: a newer Restock wrote them.
@@ -315,7 +316,7 @@ def _one(
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     names = [condition.name for condition in conditions]
     scores = label_scores(rows, names, task.control_period_s)
-    # Not ingested now: which recording is the newest decides which rules are the store's.
+    # Keep `ingested_at`: the recording with the newest one decides which rules are the store's.
     manifest = row | {
         "ingest_id": ingest_id,
         "labels_version": rows["labels_version"][0].as_py(),
@@ -333,7 +334,7 @@ def _outcome(
     given: Sequence[Correction],
     conditions: Sequence[Condition],
 ) -> Corrected:
-    """Count what changed and what was confirmed, for each condition that was corrected."""
+    """Count the added, removed and confirmed rows of each corrected condition."""
     names = [c.name for c in conditions]
     was, now = held(before["conditions"], names), held(after["conditions"], names)
     moments = Moments.of(before, row["clock_offset_ns"])
@@ -363,7 +364,7 @@ def _write(
     instead_of: Mapping[str, str],
     dry_run: bool,
 ) -> int | None:
-    """Write everything in one commit, unless there is nothing to write or it is a dry run."""
+    """Write all recordings in one commit; None for a dry run, or without recordings."""
     first = next(recordings, None)
     if first is None:
         return None
