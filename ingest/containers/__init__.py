@@ -1,1 +1,1 @@
-"""Paths to recordings: found, opened, and read topic by topic into columns."""
+"""Containers: finds recordings, opens them, and reads their topics into columns."""

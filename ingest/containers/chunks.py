@@ -1,4 +1,4 @@
-"""A file's bytes, and its compressed chunks: read in bounds, whatever the file claims."""
+"""Reads a file's bytes and compressed chunks, within limits whatever the file claims."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _fastest_crc32() -> Callable[..., int]:
     return fast
 
 
-crc32 = _fastest_crc32()  # (data, CRC of what came before = 0)
+crc32 = _fastest_crc32()  # (data, CRC of the data before it = 0)
 
 
 class FileBytes:
@@ -41,8 +41,8 @@ class FileBytes:
     It is not mapped into memory: if a mapped file shrinks, reading it kills the process.
     """
 
-    WINDOW = 16 << 10  # bytes kept of the last small read: fields are read one by one
-    PIECE = 8 << 20  # searched or checked at a time
+    WINDOW = 16 << 10  # bytes that a small read reads at once, as fields are read one by one
+    PIECE = 8 << 20  # bytes searched or checked at a time
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -109,7 +109,7 @@ class FileBytes:
         return crc
 
     def find(self, what: bytes, start: int) -> int:
-        """Return where these bytes occur next, from `start` on; -1 if they do not."""
+        """Return the position of the next occurrence from `start` on; -1 if there is none."""
         for at in range(start, self._size, self.PIECE):
             found = self[at : at + self.PIECE + len(what) - 1].find(what)
             if found >= 0:
@@ -121,9 +121,9 @@ class FileBytes:
         self._file.close()
 
 
-# A chunk's uncompressed size is the file's claim: beyond this it is refused, not allocated.
+# The file claims a chunk's uncompressed size: a larger claim is refused, and nothing is allocated.
 MAX_CHUNK = 4 << 30
-STEP = 1 << 12  # of damaged data at a time: damage costs no more than what is near it
+STEP = 1 << 12  # bytes of damaged data decompressed at a time: only data near the damage is lost
 
 _DECODERS: dict[str, Callable[[], Any]] = {
     "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
@@ -139,21 +139,21 @@ class BadChunk(Exception):
 
 @dataclass(frozen=True)
 class StoredChunk:
-    """Place of a chunk in the file, and what its record claims."""
+    """The position of a chunk in the file, and what its record claims."""
 
-    at: int  # of its record in the file
-    start: int  # of its (compressed) records
+    at: int  # position of its record
+    start: int  # position of its (compressed) content
     stop: int
-    size: int  # uncompressed
+    size: int  # bytes, uncompressed
     crc: int  # of the uncompressed records; 0: unchecked
     compression: str  # "" for none
 
 
 def refuse_implausible(chunk: StoredChunk) -> None:
-    """Check the size that a chunk claims, before as much is allocated.
+    """Check the uncompressed size that a chunk claims, before memory for it is allocated.
 
     Raises:
-        BadChunk: it is more than its stored bytes can hold.
+        BadChunk: its stored bytes cannot hold that much.
     """
     stored = chunk.stop - chunk.start
     if chunk.size > min(most_bytes(stored), MAX_CHUNK):
@@ -175,19 +175,19 @@ def inflate(chunk: StoredChunk, stored: bytes) -> bytes:
 
 
 def inflate_into(chunk: StoredChunk, stored: bytes, room: NDArray[np.uint8]) -> None:
-    """Decompress into `room`, which has the chunk's size: reusing memory costs less.
+    """Decompress a chunk into `room`, which has its size, as reusing memory costs less.
 
     Raises:
         BadChunk: as `inflate`.
     """
     if chunk.compression == "zstd" and _unpack(stored, room):
         _check(chunk, room.data)
-    else:  # which names what is wrong with it
+    else:  # `inflate` raises with the reason if the chunk is bad
         room[:] = np.frombuffer(inflate(chunk, stored), np.uint8)
 
 
 def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:
-    """Decompress zstd data that fills the room exactly; False where it does not."""
+    """Decompress zstd data into `room`; return whether it fills it exactly."""
     try:
         with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
             at = 0

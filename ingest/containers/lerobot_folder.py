@@ -1,14 +1,16 @@
-"""A LeRobot v3.0 data set as a recording: a topic for each feature, a message a frame.
+"""Reads a LeRobot v3.0 data set as a recording: one topic per feature, one message per frame.
 
-    meta/info.json                          features: dtype, shape and names; how many frames
-    data/chunk-*/file-*.parquet             a row a frame
+    meta/info.json                          features (dtype, shape and names), number of frames
+    data/chunk-*/file-*.parquet             one row per frame
 
-A numeric feature becomes a topic of its name (`/action`) with a float64 for each of its `names`
-(`x.vel` is the field `x_vel`; without names `value_0`, `value_1`, …), as CDR with a definition, so
-that what reads ROS 2 messages reads them. `/frame` has the counters of each frame. A feature of
-images becomes a topic of sensor_msgs/msg/CompressedImage; videos are listed and not read.
+A numeric feature becomes a topic with its name (`/action`), with a float64 field for each of its
+`names` (`x.vel` is the field `x_vel`; without names `value_0`, `value_1`, …). Its messages are CDR
+with a definition, so that the decoders of ROS 2 messages read them. `/frame` has the counters of
+each frame. A feature of images becomes a topic of sensor_msgs/msg/CompressedImage. Videos are
+listed but not read.
 
-LeRobot keeps no dates: time starts at 1970-01-01, and each episode `GAP_S` after the one before it.
+LeRobot has no dates. Time starts at 1970-01-01, and each episode starts `GAP_S` after the end of
+the one before.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ from restock.ingest.containers.storage import (
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
 VERSION = "v3.0"
-GAP_S = 10  # between two episodes: longer than what a profile allows within one
-MAX_S, MAX_WIDTH = 1e6, 4096  # of a timestamp; numbers of a feature
+GAP_S = 10  # between episodes: longer than a profile allows within one
+MAX_S, MAX_WIDTH = 1e6, 4096  # limits of a timestamp, and of the numbers in a feature
 ROWS, IMAGES = 65_536, 256  # frames read at a time
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 FRAME, IMAGE = "/frame", "sensor_msgs/msg/CompressedImage"
@@ -54,11 +56,11 @@ _NUMERIC = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 class _Feature(NamedTuple):
     name: str
-    fields: tuple[str, ...]  # of its messages; none: an image
+    fields: tuple[str, ...]  # of its messages; empty for images
 
 
 class _Frames(NamedTuple):
-    """A data file, and what is known of its frames."""
+    """A data file and the log times of its frames."""
 
     path: Path
     name: str
@@ -69,8 +71,8 @@ class LeRobotFolder(Storage):
     """The folder of a data set, read only. The format has no checksums, so it is never verified.
 
     Raises:
-        RecordingError: its info is of no data set of this version, or a data file cannot be read
-            or is out of order (unless `salvage`).
+        RecordingError: `meta/info.json` is missing or of another version, or a data file cannot be
+            read or is out of order (unless `salvage`).
     """
 
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
@@ -107,7 +109,7 @@ class LeRobotFolder(Storage):
         self.span_ns = (int(there[0][0]), int(there[-1][-1])) if there else None
 
     def _described(self, features: object) -> Iterator[_Feature]:
-        """Yield the features that are read; list or note the others."""
+        """Yield the features that are read; list videos in `extras`, and note the others."""
         if not isinstance(features, dict):
             raise RecordingError("it has no features", where=str(self._path / LEROBOT_INFO))
         for name, about in features.items():
@@ -136,7 +138,7 @@ class LeRobotFolder(Storage):
             )
 
     def _opened(self) -> list[_Frames]:
-        """Find the data files and the stamps of their frames."""
+        """Find the data files and the log times of their frames."""
         columns = ("timestamp", *COUNTERS, *(one.name for one in self._features.values()))
         found: list[tuple[Path, str]] = []
         parts: list[tuple[Ints, NDArray[Any]]] = []
@@ -210,7 +212,7 @@ class LeRobotFolder(Storage):
     def _batch(
         self, number: int, part: pa.RecordBatch, stamp_ns: Ints, short: Counter[tuple[int, str]]
     ) -> MessageBatch:
-        """Build the messages of one channel for these frames; count in `short` those without."""
+        """Build the messages of a channel for these frames; count frames without one in `short`."""
         if number == 1:
             counters = [
                 part[name].cast(pa.int64()).to_numpy(zero_copy_only=False) for name in COUNTERS
@@ -241,7 +243,7 @@ _FRAME = "".join([*(f"int64 {name}\n" for name in COUNTERS), "float64 timestamp\
 
 
 def _width(shape: object) -> int | None:
-    """Return how many numbers a feature of this shape has; None if that is not read."""
+    """Return how many numbers a feature of this shape has; None if the shape is not supported."""
     if not isinstance(shape, list) or len(shape) > 1:
         return None
     width = shape[0] if shape else 1
@@ -254,9 +256,9 @@ def _type(feature: _Feature) -> str:
 
 
 def field_names(names: object, width: int) -> tuple[str, ...]:
-    """Return a field for each of a feature's `width` values, made from its `names`.
+    """Return a field name for each of a feature's `width` values, made from its `names`.
 
-    These are a list, or lists by the name of an axis (`{"motors": [...]}`).
+    `names` is a list, or maps the name of an axis to a list (`{"motors": [...]}`).
     """
     if isinstance(names, dict):
         lists = [value if isinstance(value, list) else [key] for key, value in names.items()]
@@ -272,10 +274,10 @@ def field_names(names: object, width: int) -> tuple[str, ...]:
 
 
 def stamps_of(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[int, str] | None]:
-    """Return a log time for each frame (N,), and the first frame that is out of order, and why.
+    """Return a log time for each frame (N,), and the first frame out of order with the reason.
 
-    Within an episode time goes on as its timestamps do; each begins GAP_S after the last ended. So
-    does what follows a frame that is out of order.
+    Within an episode, log times follow its timestamps. Each episode begins GAP_S after the end of
+    the one before, and so do the frames from one that is out of order on.
     """
     if not len(episode):
         return np.zeros(0, np.int64), None
@@ -307,7 +309,7 @@ def rows_of(column: pa.Array, width: int) -> tuple[Bools, NDArray[np.float64]]:
 
 
 def cdr_batch(values: NDArray[Any], stamp_ns: Ints) -> MessageBatch:
-    """Serialise rows (N, k) of eight-byte numbers, a message each, all of one length."""
+    """Serialise rows (N, k) of eight-byte numbers as CDR, one message per row."""
     size = len(CDR) + 8 * values.shape[1]
     messages = np.empty((len(values), size), np.uint8)
     messages[:, : len(CDR)] = np.frombuffer(CDR, np.uint8)
@@ -317,7 +319,7 @@ def cdr_batch(values: NDArray[Any], stamp_ns: Ints) -> MessageBatch:
 
 
 def image_cdr(picture: bytes, stamp_ns: int) -> bytes:
-    """Serialise a picture as sensor_msgs/msg/CompressedImage, its format by its first bytes."""
+    """Serialise a PNG or JPEG file as sensor_msgs/msg/CompressedImage."""
     form = b"png\0" if picture.startswith(b"\x89PNG") else b"jpeg\0\0\0\0"
     head = struct.pack("<iIIII", *divmod(stamp_ns, 10**9), 1, 0, len(form.rstrip(b"\0")) + 1)
     return CDR + head + form + struct.pack("<I", len(picture)) + picture

@@ -1,13 +1,14 @@
-"""Contents of an MCAP file: chunks, loose messages, channels and counts, from one walk.
+"""Finds the contents of an MCAP file in one walk: chunks, loose messages, channels and counts.
 
-The summary at a file's end is used for counts, and its schemas and channels are compared, but its
-places are never used: the walk over the top-level records is cheap (a few records per chunk) and
-finds everything in a file with a wrong summary, or none. See https://mcap.dev/spec.
+A loose message is one outside chunks. The summary at the file's end is used for counts, and its
+schemas and channels are compared with the data's. In an intact file its offsets are not used: the
+walk over the top-level records is cheap (a few records per chunk), and also finds everything if the
+summary is wrong or missing. See https://mcap.dev/spec.
 
-Beyond damage, chunks whose place can be proven are read again (`resume`). Where the summary at the
-file's end is whole, its chunk index gives the places of chunks; a chunk's record must agree.
-Without one, a compressed chunk is recognised by the name of its compression and two lengths that
-must agree. Its CRC is checked when it is read, as always.
+Beyond damage, reading resumes at chunks whose position can be proven (`resume`). If the summary is
+intact, its chunk index gives the positions, and each chunk's record must agree with it. Otherwise a
+compressed chunk is recognised by the name of its compression and two lengths that must agree. Its
+CRC is checked when it is read, as always.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from restock.ingest.containers.mcap_records import (
 )
 from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entries, unwatched
 
-# What the survey keeps is bounded, whatever a file is made of.
+# Limits of what the survey keeps, whatever the file contains.
 MAX_CHUNKS = 1_000_000
-MAX_NAMED = 10_000  # attachments and metadata records; the others are counted
+MAX_NAMED = 10_000  # attachments and metadata records; further ones are only counted
 MAX_DAMAGED = 100
-FOOTER_BYTES = 20  # of its content; the last 4 are the CRC of the summary and of what is before it
-TELL_EVERY = 65_536  # records, of how far the walk is
-ROSBAG2 = "rosbag2"  # the metadata record of rosbag2's storage
-MAX_OTHERS = 1_000_000  # records beside those of messages
+FOOTER_BYTES = 20  # of its content; the last 4 are the CRC from the summary's start up to them
+TELL_EVERY = 65_536  # records between two calls of `watch`
+ROSBAG2 = "rosbag2"  # name of the metadata record of rosbag2's storage
+MAX_OTHERS = 1_000_000  # records of kinds other than `_MANY`
 _MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
 
 
 class Statistics(NamedTuple):
-    """Number of messages that the file claims to hold."""
+    """The numbers of messages that the file claims to contain."""
 
     messages: int
     by_channel: dict[int, int]
@@ -52,35 +53,35 @@ class Statistics(NamedTuple):
 
 @dataclass
 class Contents:
-    """Result of the walk over a file."""
+    """The result of the walk over a file."""
 
     profile: str = ""
     chunks: list[Chunk] = field(default_factory=list)
     loose: dict[int, list[int]] = field(default_factory=dict)  # channel -> records outside chunks
     definitions: Definitions = field(default_factory=Definitions)  # outside chunks
-    copies: Definitions = field(default_factory=Definitions)  # the summary's
-    summary_proven: bool = False  # by its CRC
+    copies: Definitions = field(default_factory=Definitions)  # repeated in the summary
+    summary_proven: bool = False  # its CRC matches
     statistics: Statistics | None = None
     data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
-    cut: Malformed | None = None  # where and why the walk ended
-    cut_chunk: Chunk | None = None  # the chunk it could not pass, with what is left of it
-    resumed: bool = False  # beyond the cut, up to a whole summary
+    cut: Malformed | None = None  # where and why the walk ended early
+    cut_chunk: Chunk | None = None  # the chunk at the cut, up to where the file has it
+    resumed: bool = False  # whether reading went on beyond the cut, up to an intact summary
     damaged: list[str] = field(default_factory=list)  # records that could not be parsed
     extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
-    unnamed: int = 0  # more of them
+    unnamed: int = 0  # number of further extras
     metadata: list[Metadata] = field(default_factory=list)
-    left_out: int = 0  # entries of metadata
-    rosbag2: str = ""  # the metadata.yaml in its own record
+    left_out: int = 0  # number of metadata entries that are not kept
+    rosbag2: str = ""  # the metadata.yaml that rosbag2 writes into a metadata record
 
     def indexed_counts(self) -> Counter[int]:
-        """Count messages per channel as far as possible without looking into chunks."""
+        """Count messages per channel as far as possible without reading chunks."""
         counts = Counter({channel: len(positions) for channel, positions in self.loose.items()})
         for chunk in self.chunks:
             counts.update(chunk.counts())
         return counts
 
     def claimed_counts(self) -> dict[int, int] | None:
-        """Return messages per channel by the statistics; None if missing or incomplete."""
+        """Return messages per channel from the statistics; None if missing or incomplete."""
         if self.statistics is None or (self.cut is not None and not self.resumed):
             return None
         # Counts per channel are optional; the total is not.
@@ -88,13 +89,16 @@ class Contents:
         return by_channel if sum(by_channel.values()) == total else None
 
     def distrust_index(self) -> None:
-        """Forget the message indexes: every chunk is then walked."""
-        # One without an index stays the very chunk: it may be the one that was cut short.
+        """Drop the message indexes, so that every chunk is walked."""
+        # A chunk without an index stays the same object, as it may be `cut_chunk`.
         self.chunks = [replace(c, index={}) if c.index else c for c in self.chunks]
 
 
 def survey(file: FileBytes, watch: Watch = unwatched, *, only: Collection[int] = ()) -> Contents:
-    """Walk the file's top-level records, `only` of some kinds; `watch` is told how far that is."""
+    """Walk the file's top-level records, and take in all kinds or `only` some.
+
+    `watch` is called with the progress.
+    """
     contents = Contents()
     end = len(file)
     finished = False
@@ -121,14 +125,14 @@ def survey(file: FileBytes, watch: Watch = unwatched, *, only: Collection[int] =
     if not finished and contents.cut is None:
         contents.cut = Malformed("its footer is missing", end)
     if contents.cut is not None:
-        if contents.chunks:  # the index records after the last whole chunk may be cut off
+        if contents.chunks:  # the last whole chunk's index may be cut off
             contents.chunks[-1] = replace(contents.chunks[-1], index={})
         contents.cut_chunk = cut_chunk_at(file, contents.cut.at, end)
     return contents
 
 
 def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop: int) -> None:
-    """Add a top-level record, whose content is file[at:stop].
+    """Add a top-level record to `contents`; the record's content is file[at:stop].
 
     Raises:
         Malformed: its fields reach beyond it.
@@ -165,7 +169,7 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
 def check_summary(contents: Contents, file: FileBytes, at: int, stop: int) -> list[str]:
     """Check the summary by the CRC in the footer, whose content is file[at:stop].
 
-    Drops what the summary says if they differ. Returns what is wrong, in words.
+    If the CRC differs, drop the summary's definitions and statistics. Returns the problems.
     """
     if stop - at < FOOTER_BYTES:
         return ["its footer is too short"]
@@ -197,7 +201,7 @@ def _keep(contents: Contents, file: str, name: str, said: dict[str, str]) -> Non
     """Keep the entries of a metadata record.
 
     rosbag2 writes its metadata.yaml into one when it opens the file and again when it closes it:
-    the last counts.
+    the last one is kept.
     """
     if name == ROSBAG2:
         contents.rosbag2 = said.get("serialized_metadata", "")
@@ -223,9 +227,10 @@ def _chunk(file: FileBytes, at: int, stop: int) -> Chunk:
 
 
 def cut_chunk_at(file: FileBytes, at: int, end: int) -> Chunk | None:
-    """Read the chunk at a place whatever its record's length field is, up to `end`.
+    """Read the head of the chunk record at position `at`, whatever its length field is.
 
-    None if nothing of its records is there.
+    The chunk's content is taken to stop at `end` at the latest. None if no chunk begins there, or
+    `end` comes before its content.
     """
     if at < 0 or at + PREFIX + 40 > end or file[at] != Op.CHUNK:
         return None
@@ -245,12 +250,12 @@ def cut_chunk_at(file: FileBytes, at: int, end: int) -> Chunk | None:
 
 
 FOOTER_SIZE = PREFIX + FOOTER_BYTES
-BEFORE_COMPRESSION = PREFIX + 28  # of a chunk's record: times, size, CRC
+BEFORE_COMPRESSION = PREFIX + 28  # bytes of a chunk's record: prefix, times, size and CRC
 _NAMES = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 
 
 def resume(file: FileBytes, contents: Contents) -> list[str]:
-    """Add what lies after the place where the walk ended; return the losses in words.
+    """Add the contents after the position where the walk ended; return descriptions of the losses.
 
     If no later chunk can be proven, only the part before the damage is read, with the intact part
     of the truncated chunk.
@@ -269,14 +274,14 @@ class _Summary:
 
     def __init__(self) -> None:
         self.indexed: list[dict[str, Any]] = []  # chunk index records
-        self.definitions: list[tuple[int, int, int]] = []  # schemas, channels: opcode, start, stop
+        self.definitions: list[tuple[int, int, int]] = []  # opcode, start, stop
         self.statistics: Statistics | None = None
         self.start = 0
-        self.proven = False  # by its CRC
+        self.proven = False  # its CRC matches
 
 
 def _summary(file: FileBytes) -> _Summary | None:
-    """Read the summary section; None if it is not whole."""
+    """Read the summary section; None if it is damaged or missing."""
     end = len(file) - len(MAGIC)
     at = end - FOOTER_SIZE
     if at < len(MAGIC) or file[end:] != MAGIC or file[at] != Op.FOOTER:
@@ -304,7 +309,7 @@ def _summary(file: FileBytes) -> _Summary | None:
 
 
 def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) -> list[str]:
-    """Take the chunks of the chunk index whose records agree with it."""
+    """Use the chunks of the chunk index whose records agree with it; return the losses."""
     lost = []
     chunks = []
     for record in summary.indexed:
@@ -323,7 +328,7 @@ def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) 
     for opcode, start, stop in summary.definitions:
         contents.copies.take(opcode, file, start, stop)
     contents.statistics, contents.summary_proven = summary.statistics, summary.proven
-    # What the walk took for messages outside chunks, but lies within the damage, is dropped.
+    # Drop what the walk took for messages outside chunks, but is in the damage or in a chunk.
     contents.loose = {
         channel: whole
         for channel, places in contents.loose.items()
@@ -339,12 +344,12 @@ def _within(at: int, chunks: list[Chunk]) -> bool:
 
 
 def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
-    """Continue at each recognisable chunk, and walk from it to the next damage."""
+    """Continue at each recognisable chunk, and walk to the next damage; return the losses."""
     lost = []
     for at in _recognised(file, cut + 1):
         if at < cut:
-            continue  # within what was walked since
-        if contents.cut_chunk is not None:  # it ends where the next begins, at the latest
+            continue  # already walked
+        if contents.cut_chunk is not None:  # it ends at the latest where the next one begins
             contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
         lost.append(f"{_lost(contents, cut, at)}: reading continues at the next chunk")
         if contents.cut_chunk is not None:
@@ -365,9 +370,9 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
 
 
 def _lost(contents: Contents, cut: int, until: int) -> str:
-    """Describe what is lost between two places.
+    """Describe what is lost between the positions `cut` and `until`.
 
-    A chunk that begins at the first place is read as far as it goes.
+    A chunk that begins at `cut` is read as far as possible.
     """
     at = f"{until - cut:,} bytes from byte {cut:,} on"
     if contents.cut_chunk is None or contents.cut_chunk.at != cut:
@@ -376,7 +381,7 @@ def _lost(contents: Contents, cut: int, until: int) -> str:
 
 
 def _recognised(file: FileBytes, start: int) -> Iterator[int]:
-    """Yield the places of compressed chunks, recognised by two lengths that agree."""
+    """Yield the positions of compressed chunks, recognised by two lengths that agree."""
     nearest = {name: file.find(name, start) for name in _NAMES}
     while places := {at: name for name, at in nearest.items() if at >= 0}:
         place = min(places)

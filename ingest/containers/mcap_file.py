@@ -1,4 +1,4 @@
-"""MCAP files, read a few chunks at a time; a damaged chunk costs only its own messages."""
+"""Reads MCAP files a few chunks at a time; a damaged chunk costs only its own messages."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from restock.ingest.containers.storage import (
 )
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
-_Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
-_Room: TypeAlias = tuple[Chunk, int, bytes | None]  # its bytes; of the cut one, what it still holds
+_Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, its first byte in the buffer, its size
+_Room: TypeAlias = tuple[Chunk, int, bytes | None]  # a chunk, its size, its content if it is cut
 
 
 class ChunkReader:
-    """Reads the chunks of one file. `cut` is the one in which the file ends, if it ends so."""
+    """Reads the chunks of one file. `cut` is the chunk that is cut short, if there is one."""
 
     def __init__(self, file: FileBytes, owner: Storage, cut: Chunk | None) -> None:
-        self.walked: dict[int, Positions] = {}  # chunk.at -> its messages, where it has no index
-        self.verified = self.unchecked = 0  # chunks and data sections with a CRC, and without one
+        self.walked: dict[int, Positions] = {}  # chunk.at -> messages of chunks that were walked
+        self.verified = self.unchecked = 0  # chunks and data sections read, with and without a CRC
         self._file, self._owner, self._cut = file, owner, cut
-        self._scratch = np.zeros(0, np.uint8)  # memory that is used again
+        self._scratch = np.zeros(0, np.uint8)  # reused for every group
 
     def inflate(self, chunk: Chunk) -> bytes:
-        """Return one chunk's records; nothing if they cannot be read."""
+        """Return one chunk's records; empty if they cannot be read."""
         if chunk is self._cut:
             return chunks.inflate_partly(chunk, self._file)
         try:
@@ -65,12 +65,12 @@ class ChunkReader:
         self._owner.damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
 
     def _read(self, chunk: Chunk) -> None:
-        """Count a chunk whose CRC matches, or that has none."""
+        """Count a chunk as verified by its CRC, or as unchecked if it has none."""
         self.verified += bool(chunk.crc)
         self.unchecked += not chunk.crc
 
     def walk(self, chunk: Chunk) -> Positions:
-        """Find a chunk's messages by walking it, and remember them."""
+        """Find a chunk's messages by walking it, and keep their positions."""
         if chunk.at not in self.walked:
             self.walked[chunk.at] = self._walk_part(chunk, self.inflate(chunk))
         return self.walked[chunk.at]
@@ -78,7 +78,7 @@ class ChunkReader:
     def read(
         self, groups: Iterable[list[Chunk]], wanted: set[int]
     ) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield the messages of these channels, group by group; a batch is valid until the next."""
+        """Yield the messages of channels, group by group; each batch is valid until the next."""
         for group in groups:
             buffer, parts = self._inflate_group(group)
             whole = self._by_index(parts, buffer, wanted)
@@ -87,12 +87,12 @@ class ChunkReader:
             )
             for channel in sorted(set().union(*located)):
                 yield channel, batch_of(buffer, [at[channel] for at in located if channel in at])
-        self._scratch = np.zeros(0, np.uint8)  # the file stays open while rows are made
+        self._scratch = np.zeros(0, np.uint8)  # free it: the file stays open while rows are made
 
     def _by_index(
         self, parts: list[_Part], buffer: NDArray[np.uint8], wanted: set[int]
     ) -> dict[int, Messages] | None:
-        """Find the messages of some chunks by their indexes; None if one index is wrong."""
+        """Find messages of chunks by the chunks' indexes; None if one is missing or wrong."""
         entries: dict[int, list[Indexed]] = {}
         for chunk, base, size in parts:
             if not chunk.index or chunk.at in self.walked:
@@ -111,7 +111,7 @@ class ChunkReader:
         return located
 
     def _inflate_group(self, group: list[Chunk]) -> tuple[NDArray[np.uint8], list[_Part]]:
-        """Decompress these chunks into one memory, leaving out bad ones."""
+        """Decompress chunks into one buffer; leave out bad ones."""
         rooms: list[_Room] = []
         for chunk in group:
             if chunk is self._cut:
@@ -147,7 +147,7 @@ class ChunkReader:
     def _locate(
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
     ) -> dict[int, Messages]:
-        """Find a chunk's messages by its index, or by walking it if that is wrong."""
+        """Find a chunk's messages by its index, or by a walk if the index is missing or wrong."""
         located = self._by_index([part], buffer, wanted)
         if located is not None:
             return located
@@ -173,7 +173,7 @@ class ChunkReader:
 
 
 def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
-    """Join messages from several places of one buffer to one batch."""
+    """Join messages from several places of one buffer into one batch."""
     return MessageBatch(
         buffer,
         np.concatenate([part.start for part in parts]),
@@ -183,16 +183,17 @@ def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
     )
 
 
-GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
+GROUP_BYTES = 8 << 20  # of chunks read together: enough to amortise NumPy's calls
 
 
 class McapFile(Storage):
     """An MCAP file, chunked or not, with or without summary, statistics and message index.
 
-    `watch` gets the progress of opening: without statistics the messages must be counted.
+    `watch` is called with the progress of opening, which takes long if the file has no statistics
+    and messages must be counted.
 
     Raises:
-        RecordingError: no MCAP file, or cut short and not to be salvaged.
+        RecordingError: it is not an MCAP file, or is cut short (unless `salvage`).
     """
 
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
@@ -233,16 +234,16 @@ class McapFile(Storage):
     # -- contents ---------------------------------------------------------------------
 
     def _count(self) -> dict[int, int]:
-        """Count messages by the statistics if there are any, else by walking chunks.
+        """Count messages per channel: from the statistics if there are any, else by walking chunks.
 
-        Nothing else would reveal a missing message index.
+        Without statistics, only the walk reveals a missing message index.
         """
         contents = self._contents
         claimed = contents.claimed_counts()
         counts = contents.indexed_counts()
         if claimed is not None:
             if any(count > counts[number] for number, count in claimed.items()):
-                contents.distrust_index()  # it leaves messages out; look for them
+                contents.distrust_index()  # the index leaves messages out: walk
                 return claimed
             more = {number for number, count in counts.items() if count > claimed.get(number, 0)}
             if more:
@@ -257,10 +258,10 @@ class McapFile(Storage):
         return counts
 
     def _channels(self) -> dict[int, Channel]:
-        """Return the channels as the file defines them.
+        """Return the channels that the file defines.
 
-        What the summary repeats counts if its CRC matches. Else the data counts, and the summary
-        only for what the data does not define; a difference is damage.
+        If the summary's CRC matches, its definitions are used. Otherwise the data's are used, and
+        the summary's only for what the data does not define; a difference counts as damage.
         """
         contents, copies = self._contents, self._contents.copies
         needed = {channel for channel, count in self.counts.items() if count}
@@ -271,7 +272,7 @@ class McapFile(Storage):
                 break
             without_them = at and chunk.index and not lacking & chunk.index.keys()
             if without_them and not copies.lacking(lacking):
-                continue  # not read for what begins in a later chunk
+                continue  # the lacking channels begin in a later chunk
             records = self._chunks.inflate(chunk)
             known = mcap_records.definitions_in(records).beneath(known)
         if not contents.summary_proven:
@@ -308,7 +309,7 @@ class McapFile(Storage):
         return "verified" if read.verified and not read.unchecked else "unverified"
 
     def _check_loose(self) -> None:
-        """Check messages outside chunks by the CRC of the whole data section."""
+        """Check messages outside chunks with the CRC of the whole data section."""
         position, crc = self._contents.data_end
         if not crc:
             self._chunks.unchecked += 1
@@ -321,9 +322,9 @@ class McapFile(Storage):
     # -- reading ---------------------------------------------------------------------------
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield loose messages first, then groups of chunks of up to about 8 MiB.
+        """Yield messages outside chunks first, then those in chunks.
 
-        A batch is valid until the next one is read: its buffer is used again.
+        About 8 MiB are read at a time. A batch is valid until the next one: its buffer is reused.
         """
         wanted = set(channels)
         loose = wanted & self._contents.loose.keys()
@@ -336,7 +337,7 @@ class McapFile(Storage):
     def _loose(
         self, channels: Collection[int]
     ) -> Iterator[tuple[int, NDArray[np.uint8], Messages]]:
-        """Yield these channels' messages outside chunks, about 8 MiB of the file at a time."""
+        """Yield channels' messages outside chunks, about 8 MiB of the file at a time."""
         places = {c: np.asarray(self._contents.loose[c], np.int64) for c in sorted(channels)}
         if not places:
             return
@@ -355,9 +356,9 @@ class McapFile(Storage):
                 yield channel, buffer, mcap_records.messages_at(buffer, at - start)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
-        """Yield the chunks that hold these channels, in groups that grow to about 8 MiB.
+        """Yield the chunks that contain these channels, in groups that grow to about 8 MiB.
 
-        The first chunk is alone, as some readers need no more than a few messages.
+        The first group is a single chunk, as some callers need only a few messages.
         """
         group: list[Chunk] = []
         size = most = 0
@@ -381,7 +382,7 @@ class McapFile(Storage):
 
 
 def metadata_of(path: Path) -> list[Metadata] | None:
-    """Return the metadata of an MCAP file, read without the rest of it; None if it is cut short."""
+    """Return the metadata of an MCAP file, reading nothing else; None if it is cut short."""
     file = FileBytes(path)
     try:
         contents = survey(file, only=(Op.METADATA,))
@@ -391,7 +392,7 @@ def metadata_of(path: Path) -> list[Metadata] | None:
 
 
 def _metadata(contents: Contents, path: Path, notes: list[str]) -> list[Metadata]:
-    """Return the entries of its metadata records, rosbag2's own included; say what is not."""
+    """Return the entries of the metadata records and of rosbag2's; add problems to `notes`."""
     kept, left_out = contents.metadata, contents.left_out
     try:
         custom, more = custom_data(contents.rosbag2, path.name, kept)

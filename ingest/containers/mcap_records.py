@@ -1,7 +1,6 @@
-"""MCAP's records and chunks. See https://mcap.dev/spec.
+"""Parses MCAP records, and finds messages and definitions in chunks. See https://mcap.dev/spec.
 
-One table of the records' fields and one bounded parser; the places of messages in chunks, and
-definitions.
+One table has the fields of all records, and one parser reads them, never beyond their record.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from restock.ingest.containers.chunks import Buffer, StoredChunk
 from restock.ingest.decoding.columns import Channel, gather
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_KEPT = 64 << 10  # bytes of a definition that is kept for other files
-PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
+MAX_KEPT = 64 << 10  # bytes of a definition that is cached for other files
+PREFIX = 9  # bytes before a record's content: opcode (1), length of the content (8)
 
 
 class Malformed(Exception):
-    """A record that claims to hold more than there is. `at` is its position in the buffer."""
+    """A record that is cut short or not a record. `at` is its position in the buffer."""
 
     def __init__(self, what: str, at: int) -> None:
         super().__init__(what)
@@ -35,7 +34,7 @@ class Malformed(Exception):
 
 
 class Op(IntEnum):
-    """Opcodes. Others are to be skipped."""
+    """Opcodes of records. Readers skip others."""
 
     HEADER = 0x01
     FOOTER = 0x02
@@ -54,7 +53,8 @@ class Op(IntEnum):
     DATA_END = 0x0F
 
 
-# name and kind of each field. "span32"/"span64"/"rest" are (start, stop) in the buffer: not copied.
+# Name and kind of each field. "span32", "span64" and "rest" give (start, stop) in the buffer, not
+# copies.
 FIELDS: dict[Op, tuple[tuple[str, str], ...]] = {
     Op.HEADER: (("profile", "text"), ("library", "text")),
     Op.FOOTER: (("summary_start", "Q"), ("summary_offset_start", "Q"), ("summary_crc", "I")),
@@ -132,7 +132,7 @@ def walk(buffer: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]
     """Yield each record's opcode and the (start, stop) of its content, from `start` to `stop`.
 
     Raises:
-        Malformed: a record has opcode 0, or ends beyond `stop`; whatever came before it was whole.
+        Malformed: a record has opcode 0, or ends beyond `stop`; the records before it were whole.
     """
     unpack = struct.Struct("<BQ").unpack
     position = start
@@ -152,7 +152,7 @@ def walk(buffer: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]
 
 
 def parse(op: Op, buffer: Buffer, start: int, stop: int) -> dict[str, Any]:
-    """Parse the record whose content is buffer[start:stop]. Bytes after its fields are padding.
+    """Parse the record whose content is buffer[start:stop], ignoring bytes after its fields.
 
     Raises:
         Malformed: a field reaches beyond the record.
@@ -167,7 +167,7 @@ _SIZES = {"B": 1, "H": 2, "I": 4, "Q": 8}
 class _Cursor:
     """Reads fields one after the other, never beyond `stop`."""
 
-    HEAD = 4096  # bytes that are read at once: each access to a file takes longer than a field
+    HEAD = 4096  # bytes read at once: reading a file field by field would be slow
 
     def __init__(self, buffer: Buffer, start: int, stop: int) -> None:
         self.buffer, self.start, self.position, self.stop = buffer, start, start, stop
@@ -231,18 +231,18 @@ _START = np.dtype([("op", "u1"), ("length", "<u8"), ("channel", "<u2")])
 _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
-Positions: TypeAlias = dict[int, Ints]  # of message records, by channel
+Positions: TypeAlias = dict[int, Ints]  # channel id -> positions of its message records
 
 
 @dataclass(frozen=True)
 class Chunk(StoredChunk):
-    """A chunk's place, the log times that it spans, and its message index."""
+    """A chunk's position, the log times that it spans, and its message index."""
 
     span_ns: tuple[int, int]
-    index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
+    index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel id -> start, stop
 
     def counts(self) -> dict[int, int]:
-        """Count messages per channel by the message index."""
+        """Count messages per channel with the message index."""
         return {
             channel: (stop - start) // _INDEX.itemsize
             for channel, (start, stop) in self.index.items()
@@ -274,9 +274,9 @@ class Indexed:
 def indexed_messages(
     buffer: NDArray[np.uint8], parts: Sequence[Indexed], channel: int
 ) -> Messages | None:
-    """Find a channel's messages by its index entries in some chunks, which lie in this order.
+    """Find a channel's messages with its index entries in chunks, given in buffer order.
 
-    None if the index does not fit the chunks: then the chunks must be walked.
+    None if the index does not fit the chunks, which must then be walked.
     """
     if any(len(part.entries) % _INDEX.itemsize for part in parts):
         return None
@@ -290,7 +290,7 @@ def indexed_messages(
     room = np.maximum(size - HEAD_SIZE, 0).astype(np.uint64)
     if (offset > room).any() or (size < HEAD_SIZE).any():
         return None
-    # File order: entries are sorted by time. Chunk by chunk, so `base` and `size` stay right.
+    # File order, as entries are sorted by time. Chunks stay in order, so `base` and `size` still fit.
     at = np.sort(offset.astype(np.int64) + base)
     head = gather(buffer, at, _HEAD)
     length = head["length"]
@@ -312,7 +312,7 @@ def _stamps(values: NDArray[np.uint64]) -> Ints:
 
 
 def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
-    """Find where message records start in an uncompressed chunk, per channel, and what is cut."""
+    """Walk an uncompressed chunk; return positions of message records, and where it is cut."""
     places: list[int] = []
     note = places.append
     length_at = struct.Struct("<xQ").unpack_from  # after the opcode
@@ -354,7 +354,7 @@ def _messages(at: Ints, head: NDArray[np.void]) -> Messages:
 
 
 class SchemaRecord(NamedTuple):
-    """Definition of the messages of some channels."""
+    """The definition of the messages of some channels."""
 
     name: str = ""
     encoding: str = ""
@@ -382,7 +382,7 @@ class Definitions:
         if opcode not in (Op.SCHEMA, Op.CHANNEL):
             return
         raw = bytes(buffer[at - PREFIX : stop])
-        # All recordings of a robot define the same.
+        # Cached, as all recordings of a robot have the same definitions.
         try:
             number, record = (_defined if len(raw) < MAX_KEPT else _defined.__wrapped__)(raw)
         except Malformed as bad:
@@ -393,11 +393,11 @@ class Definitions:
             self.channels[number] = record
 
     def beneath(self, other: Definitions) -> Definitions:
-        """Return both; where both define an id, what `other` says."""
+        """Return the definitions of both; `other`'s if both define an id."""
         return Definitions(self.schemas | other.schemas, self.channels | other.channels)
 
     def lacking(self, channels: set[int]) -> set[int]:
-        """Return those of these channels that are not defined, or whose schemas are not."""
+        """Return the channels that are not defined, or whose schemas are not."""
         known = self.schemas.keys() | {0}
         return {
             number
@@ -406,7 +406,7 @@ class Definitions:
         }
 
     def differing(self, other: Definitions) -> list[str]:
-        """Return what both define, but differently."""
+        """Return the names of schemas and channels that both define, but differently."""
         schemas = self.schemas.keys() & other.schemas.keys()
         channels = self.channels.keys() & other.channels.keys()
         return [
@@ -432,7 +432,7 @@ class Definitions:
 
 @lru_cache(1024)
 def _defined(raw: bytes) -> tuple[int, SchemaRecord | ChannelRecord]:
-    """Parse a record of a schema or a channel: its id, and what it defines."""
+    """Parse a schema or channel record; return its id and definition."""
     found = parse(Op(raw[0]), raw, PREFIX, len(raw))
     if raw[0] == Op.SCHEMA:
         low, high = found["data"]
@@ -444,7 +444,7 @@ def _defined(raw: bytes) -> tuple[int, SchemaRecord | ChannelRecord]:
 
 
 def definitions_in(records: bytes) -> Definitions:
-    """Return the schemas and channels of an uncompressed chunk, up to what is cut."""
+    """Return the schemas and channels of an uncompressed chunk, up to damage."""
     found = Definitions()
     with suppress(Malformed):
         for opcode, at, stop in walk(records, 0, len(records)):

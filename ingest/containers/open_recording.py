@@ -1,11 +1,11 @@
-"""Open recordings: from a path to columns, whatever the container.
+"""Finds and opens recordings of all containers.
 
 with open_recording(Path("logs/run.mcap")) as recording:
     columns = recording.read({"/odom": ["twist.twist.linear.x", "header.stamp"]})
 columns["/odom"].fields["twist.twist.linear.x"]  # (N,) float64
 
-A path may be a file, a bag's folder, a folder of many or a glob. A new container is a file with its
-`Container`, and a row in CONTAINERS.
+A path may be a file, a bag's folder, a folder of recordings or a glob. To add a container, write a
+module that defines its `Container`, and add that to CONTAINERS.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from restock.ingest.decoding.definitions import DEFAULT_DISTRO, choose_definitio
 
 
 def _open_lerobot(path: Path, *, salvage: bool, watch: Watch) -> Storage:
-    from restock.ingest.containers.lerobot_folder import LeRobotFolder  # with it comes PyArrow
+    from restock.ingest.containers.lerobot_folder import LeRobotFolder  # imports PyArrow
 
     return LeRobotFolder(path, salvage=salvage, watch=watch)
 
@@ -71,7 +71,7 @@ CONTAINERS: tuple[Container, ...] = (
 
 
 def folder_container(folder: Path) -> Container | None:
-    """Return the container that claims a whole folder by its first file, or None."""
+    """Return the container whose format is this whole folder, or None."""
     for one in CONTAINERS:
         if one.files and (file := next(one.files(folder))).is_file():
             with file.open("rb") as stream:
@@ -81,7 +81,7 @@ def folder_container(folder: Path) -> Container | None:
 
 
 def endings() -> tuple[str, ...]:
-    """Return how the names of recordings' files end, without and with rosbag2's compression."""
+    """Return the file name endings of recordings, without and with rosbag2's compression."""
     plain = [ending for one in CONTAINERS for ending in one.endings]
     return (*plain, *(ending + packed for packed in (".zstd", ".zst") for ending in plain))
 
@@ -89,24 +89,24 @@ def endings() -> tuple[str, ...]:
 T = TypeVar("T")
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
-LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
-MAX_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
-FOLDER_HEAD_BYTES = 1 << 20  # of the file by which a container claims a folder
-_PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # of a bag that is split; longer ones are dates
+LOST_AND_FOUND = "lost+found"  # at the top of a disk, readable by root alone
+MAX_METADATA = 2 << 20  # bytes; real files have some kB, and the parser is slow
+FOLDER_HEAD_BYTES = 1 << 20  # of the file by which a container recognises a folder
+_PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # a file of a split bag; longer numbers are dates
 _NAMES = (
     f"recordings end in {', '.join(name for one in CONTAINERS for name in one.endings)}"
     " or are folders of rosbag2 or LeRobot"
 )
-# A list of each publisher's: most of the text, which no one reads, and the parser is slow.
+# Most of the text, and not needed here: the profiles of every publisher. The parser is slow.
 _QOS = re.compile(r"(?m)^( +)offered_qos_profiles:[ \t]*\n(?:\1[ -].*\n)+")
 _ZSTD = re.compile(r"\.zstd?$")
 
 
 def recording_path(path: Path | str) -> Path:
-    """Return the given path; an empty one is refused, as Path takes it for the working directory.
+    """Return the path, unless it is empty: `Path` would make that the working directory.
 
     Raises:
-        RecordingError: it is empty.
+        RecordingError: the path is empty.
     """
     if not str(path).strip():
         raise RecordingError(
@@ -117,23 +117,23 @@ def recording_path(path: Path | str) -> Path:
 
 
 def recordings_in(path: Path | str) -> list[Path]:
-    """Find the recordings at a path: a file, a bag's folder, a folder of many, or a glob.
+    """Find the recordings at a path: a file, a bag's folder, a folder of recordings, or a glob.
 
-    Folders are searched deeply. A bag with all its split files is one recording, named by its
-    folder.
+    Folders are searched with all subfolders. A bag with all its split files is one recording, whose
+    path is its folder.
 
     Raises:
-        RecordingError: no such path, or no recording in it.
+        RecordingError: the path does not exist, or has no recording.
     """
     path = recording_path(path)
     try:
         return _found(path)
-    except OSError as error:  # the folder itself; one within it is named as a recording would be
+    except OSError as error:  # of this folder; an unreadable subfolder is listed as a recording
         raise cannot_be_read(error, path) from error
 
 
 def cannot_be_read(error: OSError, path: Path) -> RecordingError:
-    """Build the error for a path that the file system does not let us read."""
+    """Build the error for a path that the file system refuses to read."""
     return RecordingError(
         f"cannot be read: {error.strerror or error}",
         where=str(error.filename or path),
@@ -183,9 +183,9 @@ def _refuse_special(path: Path) -> None:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    """Return a folder's recordings, and items that cannot be looked at.
+    """Return a folder's recordings, and its subfolders that cannot be read.
 
-    Opening such an item raises an error for it alone.
+    Opening such a subfolder later raises an error for it alone.
     """
     if is_bag(folder) or folder_container(folder):
         return [folder]
@@ -195,7 +195,7 @@ def _in_folder(folder: Path) -> list[Path]:
             continue
         if item.is_dir():
             recordings += [] if item.is_symlink() else _within(item)
-        elif is_storage_name(item):  # a link into nowhere, or a pipe, too
+        elif is_storage_name(item):  # also a broken link or a pipe
             recordings.append(item)
     return recordings
 
@@ -213,7 +213,10 @@ def is_storage_name(path: Path) -> bool:
 
 
 def is_bag(folder: Path) -> bool:
-    """Return whether a folder is one rosbag2 bag: metadata.yaml, or split files of its name."""
+    """Return whether a folder is one rosbag2 bag.
+
+    It has a metadata.yaml, or its storage files are all named after it.
+    """
     if (folder / METADATA).is_file():
         return True
     files = [item for item in folder.iterdir() if item.is_file() and is_storage_name(item)]
@@ -223,7 +226,7 @@ def is_bag(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class ClaimedTopic:
-    """Topic as metadata.yaml claims it; None if a value is missing or of another type."""
+    """A topic in metadata.yaml. Values that are missing or of a wrong type are None."""
 
     name: str | None
     serialization: str | None
@@ -232,24 +235,24 @@ class ClaimedTopic:
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """Claims of a bag's metadata.yaml, none of which is trusted."""
+    """The contents of a bag's metadata.yaml, which are not trusted."""
 
-    files: tuple[str, ...] = ()  # names without folders: only files in the bag's own are read
+    files: tuple[str, ...] = ()  # without folders: only files in the bag's own folder are read
     topics: tuple[ClaimedTopic, ...] = ()
     custom_data: Metadata | None = None
 
 
 def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str], list[str]]:
-    """Return a bag's storage files in order, listed names that are missing, and copies in words.
+    """Return a bag's storage files in order, names of missing ones, and notes on copies.
 
-    Messages of a copy would count twice, so it is not read.
+    A copy is not read, as its messages would count twice.
     """
     present = {item.name: item for item in folder.iterdir() if item.is_file()}
     storages = {name: item for name, item in present.items() if is_storage_name(item)}
     order = []
     missing = []
     for name in dict.fromkeys(metadata.files):
-        # File-mode compression adds its ending, to the names in some versions' metadata only.
+        # File-mode compression adds its ending to the file name; some versions do not list it.
         options = (name, name + ".zstd", name + ".zst")
         match = next((option for option in options if option in present), None)
         if match is None:
@@ -275,9 +278,10 @@ def _equal(one: Path, other: Path) -> bool:
 
 
 def holes(files: Sequence[Path], *, from_zero: bool) -> list[str]:
-    """Return the names that a bag's files lack by their numbers (`run_0.db3`, `run_2.db3`).
+    """Return the names of files missing in a bag's numbering (`run_0.db3`, `run_2.db3`).
 
-    rosbag2 counts from 0, but leaves out the first files if it keeps only the last.
+    rosbag2 counts from 0. It may be set to keep only the last files: with `from_zero` False,
+    missing first files are not reported.
     """
     series: dict[str, dict[int, str]] = {}
     for file in files:
@@ -298,7 +302,7 @@ def _natural(name: str) -> list[int | str]:
 
 
 def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
-    """Read the claims of metadata.yaml, and say what is wrong if it cannot be used."""
+    """Read metadata.yaml; also return what is wrong with it, or None."""
     file = folder / METADATA
     if not file.is_file():
         return BagMetadata(), f"no {METADATA}: read from the storage files alone"
@@ -344,7 +348,7 @@ def _of_type(value: object, kind: type[T]) -> T | None:
 
 
 def container_of(path: Path) -> Container | None:
-    """Return the container that claims a file by its first bytes; None if it is compressed.
+    """Return the container of a file, by its first bytes; None if it is compressed.
 
     Raises:
         RecordingError: it is missing, empty, a Git LFS pointer or not a recording.
@@ -392,10 +396,10 @@ class IdentifiedFile(NamedTuple):
 def identify(
     path: Path | str, *, definitions: str | None = None, watch: Watch | None = None
 ) -> IdentifiedFile | None:
-    """Return the id of a recording that is one MCAP file; None of others, which must be opened.
+    """Return the id of a recording that is one MCAP file; None for others, which must be opened.
 
     Raises:
-        RecordingError: there are no such `definitions`.
+        RecordingError: `definitions` do not exist.
     """
     choose_definitions(definitions)
     path = Path(path)
@@ -407,12 +411,12 @@ def identify(
                 return None
         state = state_of(path)
         return IdentifiedFile(path, content_id([path], watch or unwatched), state)
-    except OSError:  # opening it says why
+    except OSError:  # opening the recording reports it
         return None
 
 
 def state_of(path: Path) -> tuple[int, ...]:
-    """Return what changes if a file does."""
+    """Return a file's inode, size and time of change, to detect changes."""
     state = path.stat()
     return state.st_ino, state.st_size, state.st_mtime_ns
 
@@ -424,7 +428,7 @@ def open_recording(
     salvage: bool = False,
     watch: Watch | None = None,
 ) -> Recording:
-    """Open an MCAP file, a rosbag2 folder or one of its files, or a ROS 1 bag.
+    """Open an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag or a LeRobot data set.
 
     Args:
         path: the file or folder.
@@ -433,12 +437,12 @@ def open_recording(
             .idl definitions, which is used on top of Humble's; "jazzy+a/folder" names both.
         salvage: read what can still be read of a file that is cut short or damaged, instead of
             refusing it; what is missing is in the recording's `lost_messages`.
-        watch: gets the progress of a long opening or read: what is being done, how much of it is
-        done, and of how much.
+        watch: called with the progress of a long opening or read: activity, how much is done,
+            total.
 
     Raises:
-        RecordingError: no such file, empty, a Git LFS pointer, no recording, cut short (unless
-            `salvage`), or in a serialisation that is not CDR.
+        RecordingError: the file does not exist, is empty, a Git LFS pointer or not a recording, is
+            cut short (unless `salvage`), or is a ROS 2 bag that is not serialised as CDR.
     """
     path = recording_path(path)
     distro = choose_definitions(definitions)  # before anything is opened
@@ -448,8 +452,8 @@ def open_recording(
 def refuse_no_recording(path: Path) -> None:
     """Reject paths that are not recordings, by file name and magic bytes.
 
-    Raises: RecordingError: it is not one. A recording that is damaged later in the file is not
-    refused.
+    Raises:
+        RecordingError: the path is not a recording. Damage later in a file is not detected.
     """
     opening = _Opening(path, DEFAULT_DISTRO, False, unwatched)
     for file in opening.files():
@@ -465,7 +469,7 @@ class _Opening:
         self.storages: list[Storage] = []
         self.containers: list[Container] = []
         self.damage: list[Damage] = []
-        self.missing: list[str] = []  # files that metadata.yaml lists
+        self.missing: list[str] = []  # files that metadata.yaml lists, but are not there
         self.notes: list[str] = []
         self.cleanup: list[Callable[[], None]] = []
 
@@ -518,7 +522,7 @@ class _Opening:
         return recording
 
     def _opened(self, files: list[Path]) -> list[Path]:
-        """Open these files; with `salvage`, one of several that cannot be opened is damage."""
+        """Open files; return those that opened. With `salvage`, the others count as damage."""
         opened, refused = [], []
         for file in files:
             try:
@@ -596,7 +600,7 @@ class _Opening:
         return container.bag_format if self.path.is_dir() else container.format
 
     def _refuse_serialisation(self, metadata: BagMetadata) -> None:
-        """Refuse other serialisations than CDR, which rosbag2 can store, too."""
+        """Refuse serialisations other than CDR, which rosbag2 can also store."""
         ros2 = [storage for storage in self.storages if storage.from_ros2]
         encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
         claimed = {topic.serialization for topic in metadata.topics if topic.serialization}
@@ -612,8 +616,8 @@ class _Opening:
     def _compare(self, metadata: BagMetadata, files: list[Path]) -> None:
         """Compare metadata.yaml with the files.
 
-        Messages that it counts and they do not hold are lost; what they hold beyond it is noted.
-        Names that it lists do not matter if every message is there.
+        Messages that it counts but the files lack are lost; messages that it does not count are
+        noted. A missing file that it lists is only noted if every counted message is there.
         """
         counts = Counter[str]()
         for storage in self.storages:
@@ -629,12 +633,12 @@ class _Opening:
                 self.damage.append(Damage(what))
         held = [sum(storage.counts.values()) for storage in self.storages]
         for file, here, later in zip(files, held, range(1, len(held) + 1), strict=True):
-            if not here and any(held[later:]) and not whole:  # rosbag2 begins a file by a message
+            if not here and any(held[later:]) and not whole:  # rosbag2 never starts an empty file
                 self.damage.append(Damage(f"{file.name} holds no message"))
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:
                 continue
-            name = visible(topic.name)  # as the files' names are
+            name = visible(topic.name)  # like the topic names in the files
             counted = counts[name]
             if counted == topic.messages:
                 continue

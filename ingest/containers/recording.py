@@ -1,7 +1,7 @@
-"""Open recordings: topics, columns, and the account of what became of each message.
+"""Open recordings: their topics, the columns of their messages, and an account of each topic.
 
-Whatever the container, messages come in the order of their log time, and what was expected, read,
-decoded and skipped is kept per topic.
+For every container, columns are in the order of log time, and the account counts the messages that
+were expected, read, decoded and skipped.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from restock.ingest.decoding.columns import (
 from restock.ingest.decoding.decoders import decoder_of, type_of
 from restock.ingest.decoding.row_by_row import Decoder
 
-MAX_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
+MAX_DEFINED_BYTES = 8 << 20  # of message definitions: parsing takes about a second per MB
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,15 @@ class _Stream:
     channel: Channel
 
     def payloads(self) -> Iterator[bytes]:
-        """Yield the messages as they are in the file, in file order."""
+        """Yield the serialised messages in file order, decompressed."""
         for _, batch in self.storage.batches([self.channel.id]):
             for plain, _ in decompressed(batch):
                 yield from plain.payloads()
 
 
 def content_id(files: Sequence[Path], watch: Watch = unwatched) -> str:
-    """Return 16 hex digits of BLAKE3 of files' content, in order, wherever they lie."""
-    digest = blake3()  # of a bag with images, blake2b was a third of an ingest
+    """Return 16 hex digits of the BLAKE3 hash of files' sizes and contents, not their paths."""
+    digest = blake3()  # with blake2b, hashing a bag with images took a third of its ingest
     done, whole = 0, sum(file.stat().st_size for file in files)
     for file in files:
         digest.update(str(file.stat().st_size).encode())
@@ -78,9 +78,9 @@ def content_id(files: Sequence[Path], watch: Watch = unwatched) -> str:
 class Recording:
     """An open recording: an MCAP file, or a bag with all its files.
 
-    `topics` names every topic with its type and count; `read` decodes some of them. After it
-    `accounts` says per topic what was expected, read, decoded and skipped, and `lost_messages`
-    what is missing. Use as a context manager, or call `close`.
+    `topics` has every topic with its type and count; `read` decodes some of them. After `read`,
+    `accounts` counts the expected, read, decoded and skipped messages of each topic read, and
+    `lost_messages` lists what is missing. Use it as a context manager, or call `close`.
     """
 
     def __init__(
@@ -98,16 +98,16 @@ class Recording:
     ) -> None:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
-        self.watch: Watch = unwatched  # is told how far a long read is
-        self.robot: str | None = None  # the namespace of the one that is meant, of several in it
+        self.watch: Watch = unwatched  # called with the progress of a long read
+        self.robot: str | None = None  # namespace of the chosen robot, if it has several
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)
         self._bag_metadata, self._closed = tuple(metadata), False
         self._streams: dict[str, list[_Stream]] = {}
-        # By storage and channel: what its messages are, or why they cannot be decoded.
+        # (storage index, channel id) -> type of its messages, or why they cannot be decoded
         self._types: dict[tuple[int, int], MessageType | CannotDecode] = {}
-        self._defined: dict[tuple[str, str, int], int] = {}  # bytes of definitions, each once
+        self._defined: dict[tuple[str, str, int], int] = {}  # definition -> its bytes
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
@@ -135,7 +135,7 @@ class Recording:
         return TopicInfo(name, first.type, expected, first.encoding, source, skipped)
 
     def _several_types(self, topic: str) -> str | None:
-        """Return which types a topic's messages have, and which are read, if there are several."""
+        """Return a note if a topic's messages have several types: which, and which are read."""
         counts, read = Counter[str](), set[str]()
         for stream in self._streams[topic]:
             name = stream.channel.type
@@ -152,9 +152,9 @@ class Recording:
         return f"{said}: only those of {', '.join(sorted(read))} are read"
 
     def _alike(self, one: _Stream, other: _Stream) -> bool:
-        """Return whether messages of both have the same type, or types of the same fields.
+        """Return whether two streams have the same type, or types with the same fields.
 
-        ROS 1 has tf/tfMessage and tf2_msgs/TFMessage.
+        For example, ROS 1 has both tf/tfMessage and tf2_msgs/TFMessage.
         """
         if one.channel.type == other.channel.type:
             return True
@@ -170,7 +170,7 @@ class Recording:
             try:
                 self._bound_definitions(stream.channel)
                 self._types[key] = type_of(stream.channel, self.distro, stream.payloads)
-            except CannotDecode as reason:  # found out once: parsing takes time
+            except CannotDecode as reason:  # kept, as parsing takes time
                 self._types[key] = reason
         kind = self._types[key]
         if isinstance(kind, CannotDecode):
@@ -188,16 +188,16 @@ class Recording:
 
     @property
     def size_bytes(self) -> int:
-        """Return the bytes of all its files."""
+        """Return the total size of its files."""
         return sum(file.stat().st_size for file in self.files)
 
     def qos(self, topic: str) -> str:
-        """Return the quality of service that a topic's publishers offered: YAML, as in the file."""
+        """Return the quality of service that a topic's publishers offered, YAML; "" if unknown."""
         return next((one.channel.qos for one in self._channels(topic) if one.channel.qos), "")
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """Return first and last log time; None for a recording without messages."""
+        """Return the first and last log time; None for a recording without messages."""
         spans = [storage.span_ns for storage in self._storages if storage.span_ns]
         if not spans:
             return None
@@ -205,7 +205,7 @@ class Recording:
 
     @property
     def messages(self) -> int:
-        """Return the messages of all topics, by the container's own count."""
+        """Return the number of messages of all topics, by the container's own count."""
         return sum(topic.expected for topic in self.topics.values())
 
     @property
@@ -218,7 +218,7 @@ class Recording:
 
     @property
     def damage(self) -> list[Damage]:
-        """Return what of its files could not be read."""
+        """Return the parts of its files that could not be read."""
         return self._bag_damage + [item for storage in self._storages for item in storage.damage]
 
     @property
@@ -234,7 +234,7 @@ class Recording:
 
     @property
     def lost_messages(self) -> list[LostMessages]:
-        """Return what is missing, each once: from the files, and from the topics that were read."""
+        """Return the losses in the files and in the topics that were read, each loss once."""
         damaged = {item.what for item in self.damage}
         lost = [LostMessages(None, _count(item), item.what) for item in self._bag_damage]
         for storage in self._storages:
@@ -252,11 +252,11 @@ class Recording:
         return lost
 
     def leaves(self, topic: str) -> list[str]:
-        """Return every field path of a topic's messages; none if it cannot be decoded."""
+        """Return every field path of a topic's messages; [] if they cannot be decoded."""
         return [leaf.path for leaf in self.fields(topic)]
 
     def fields(self, topic: str) -> list[Leaf]:
-        """Return every field of a topic's messages; none if it cannot be decoded."""
+        """Return every field of a topic's messages; [] if they cannot be decoded."""
         try:
             return self._type(self._channels(topic)[0]).leaves()
         except CannotDecode:
@@ -265,13 +265,14 @@ class Recording:
     def read(
         self, wanted: Mapping[str, Sequence[str]], reductions: Mapping[str, Reduction] | None = None
     ) -> dict[str, TopicColumns]:
-        """Read columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
+        """Read fields of topics as columns, arrays (N, …) or Ragged, in the order of log time.
 
-        A topic that cannot be decoded is left out; `accounts` has the reason. `reductions` replaces
-        wide fields of some topics by smaller ones while they are read.
+        `wanted` maps each topic to its field paths. A topic that cannot be decoded is left out;
+        `accounts` has the reason. `reductions` replaces wide fields of some topics by smaller ones
+        while they are read.
 
         Raises:
-            RecordingError: it has no such topic, or its messages no such field, or it is closed.
+            RecordingError: a topic or field does not exist, or the recording is closed.
         """
         for topic in wanted:
             self._channels(topic)
@@ -295,10 +296,10 @@ class Recording:
         return columns
 
     def batches(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[Ints, Fields]]:
-        """Yield log times (N,) and columns of these fields, some messages of a topic at a time.
+        """Yield log times (N,) and columns of a topic's fields, batch by batch in file order.
 
-        They come in file order. What cannot be decoded is left out: after the last, `accounts` says
-        how much that is, unless `read` has said so before.
+        Messages that cannot be decoded are left out. After the last batch, `accounts` counts them,
+        unless the topic was read before.
         """
         self._expect_open()
         reading = TopicReading(self.topics[topic], fields)
@@ -316,13 +317,13 @@ class Recording:
         return self._streams[topic]
 
     def _expect_open(self) -> None:
-        if self._closed:  # its files would give nothing, as if it had no messages
+        if self._closed:  # closed files would look like files without messages
             raise RecordingError("it is closed", where=str(self.path), remedy="open it again")
 
     def _read_storage(
         self, storage: Storage, readings: Mapping[str, TopicReading]
     ) -> Iterator[int]:
-        """Read one file, and yield how many messages were read each time."""
+        """Read one file; yield the number of messages of each batch."""
         decoders: dict[int, Decoder] = {}
         topics: dict[int, str] = {}
         for topic, reading in readings.items():
@@ -364,7 +365,7 @@ class Recording:
         return decoder_of(channel, kind, leaves)
 
     def _lost(self, topic: str) -> dict[str, int]:
-        """Count messages of a topic that damage is known to have cost, by reason."""
+        """Count the messages of a topic that are known to be lost to damage, by reason."""
         lost = Counter[str]()
         for stream in self._streams[topic]:
             for item in stream.storage.damage:
@@ -373,7 +374,7 @@ class Recording:
         return lost
 
     def close(self) -> None:
-        """Close its files; it cannot be read after it."""
+        """Close its files; the recording can then no longer be read."""
         self._closed = True
         for storage in self._storages:
             storage.close()
@@ -388,5 +389,5 @@ class Recording:
 
 
 def _count(damage: Damage) -> int | None:
-    """Return how many messages damage cost; None if that is not known."""
+    """Return the number of messages lost to damage; None if it is not known."""
     return sum(damage.messages.values()) or None

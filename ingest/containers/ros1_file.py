@@ -1,9 +1,9 @@
-"""ROS 1 bags: the messages of each chunk, read once, in the order of the file.
+"""Reads ROS 1 bags, chunk by chunk in file order.
 
-One walk over the records outside chunks finds the chunks, and at the end of the file what the
-recorder says of them: their counts of messages, and the connections. The places in the index are
-never used. A bag that was cut short has no such end: its chunks, which also define the connections,
-are looked through. See http://wiki.ros.org/Bags/Format/2.0.
+One walk over the records outside chunks finds the chunks, and at the end of the file the
+connections and the number of messages per chunk. The index's offsets of messages are not used. A
+bag that was cut short lacks that end: its chunks, which also define the connections, are walked.
+See http://wiki.ros.org/Bags/Format/2.0.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from restock.ingest.decoding.columns import Channel, MessageBatch
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER = 64 << 10  # bytes of a record's header
 INDEX_ENTRY = 12  # bytes
-# Of inflated bz2 chunks: who proposes a profile reads topic after topic, and bz2 is slow.
+# Limit of decompressed bz2 chunks in memory: proposing a profile reads topic by topic; bz2 is slow.
 KEPT_BYTES = 128 << 20
-# Messages whose places are remembered, of 24 bytes: walking a chunk takes longer than inflating it.
+# Limit of messages whose positions are kept, 24 bytes each: walking a chunk takes longer than
+# decompressing it.
 MAX_REMEMBERED = 1 << 20
 
 _KNOWN = frozenset(map(int, RecordType))
@@ -44,17 +45,17 @@ Fields: TypeAlias = dict[bytes, bytes]  # of a record's header
 
 
 class Walked(NamedTuple):
-    """What a chunk holds."""
+    """The contents of a chunk."""
 
-    places: dict[int, Ints]  # by connection: start, end and stamp of its messages (N, 3)
-    cut: int | None  # where it is damaged
-    connections: dict[int, tuple[Fields, Fields]]  # that it defines
+    places: dict[int, Ints]  # connection -> start, stop and log time of its messages, (N, 3)
+    cut: int | None  # offset of the damage
+    connections: dict[int, tuple[Fields, Fields]]  # the ones defined in it
 
 
 def records(buffer: Buffer, start: int) -> Iterator[tuple[int, Fields, int, int]]:
-    """Yield each record's place, the fields of its header, and where its data begins and ends.
+    """Yield each record's position, header fields, and the start and stop of its data.
 
-    The data of the last one may end beyond the buffer.
+    The data of the last record may end beyond the buffer.
     """
     at, end = start, len(buffer)
     while at < end:
@@ -67,7 +68,7 @@ def records(buffer: Buffer, start: int) -> Iterator[tuple[int, Fields, int, int]
 
 
 def fields_in(header: bytes) -> Fields:
-    """Parse `name=value` fields, each after its length."""
+    """Parse `name=value` fields, each preceded by its length."""
     fields, at = Fields(), 0
     while at < len(header):
         stop = at + 4 + int.from_bytes(header[at : at + 4], "little")
@@ -81,7 +82,7 @@ def walk(data: bytes) -> Walked:
     """Find the messages of a chunk, and the connections that it defines."""
     rows: dict[int, list[tuple[int, int, int]]] = {}
     connections: dict[int, tuple[Fields, Fields]] = {}
-    whole = 0  # up to here
+    whole = 0  # end of the last whole record
     for _, fields, start, stop in records(data, 0):
         kind, time = _kind(fields), fields.get(b"time", b"")
         if stop > len(data) or kind not in (RecordType.MSGDATA, RecordType.CONNECTION):
@@ -115,17 +116,17 @@ class Ros1File(Storage):
     """A ROS 1 bag of format 2.0, read only. The format has no checksums, so it is never verified.
 
     Raises:
-        RecordingError: it is none; or it was cut short or damaged, and is not to be salvaged.
+        RecordingError: it is not such a bag, or is cut short or damaged (unless `salvage`).
     """
 
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
         super().__init__()
         self._file = FileBytes(path)
-        self._chunks: dict[int, StoredChunk] = {}  # by their places
-        self._claimed: dict[int, Counter[int]] = {}  # messages by connection, as the end says
-        self._indexed: dict[int, Counter[int]] = {}  # … as the index behind each chunk says
+        self._chunks: dict[int, StoredChunk] = {}  # by position in the file
+        self._claimed: dict[int, Counter[int]] = {}  # chunk -> connection -> messages, by the end
+        self._indexed: dict[int, Counter[int]] = {}  # … by the index after each chunk
         self._spans = list[tuple[int, int]]()
-        self._index_at, self._due = 0, (0, 0)  # the end's place; how many connections, chunks
+        self._index_at, self._due = 0, (0, 0)  # position of the end; its connections, chunks
         self._connections: dict[int, tuple[Fields, Fields]] = {}
         self._walks: dict[int, Walked] = {}
         self._room = MAX_REMEMBERED
@@ -168,12 +169,12 @@ class Ros1File(Storage):
         self.span_ns = (min(lows), max(highs)) if lows else None
 
     def _survey(self, watch: Watch) -> str | None:
-        """Find chunks, counts and connections; return what keeps it from being whole, in words."""
+        """Find chunks, counts and connections; return the problem if the bag is not whole."""
         file, end = self._file, len(self._file)
         if file[: len(MAGIC)] != MAGIC:
             return "it is not of format 2.0"
         cut = stop = self._take_records(len(MAGIC), watch)
-        if stop < self._index_at < end:  # the end of the file says where the other chunks are
+        if stop < self._index_at < end:  # the end of the file lists the other chunks
             stop = self._take_records(self._index_at, watch)
             for at in sorted(one for one in self._claimed if cut <= one < self._index_at):
                 place, fields, data, after = next(records(file, at), (at, Fields(), end, end))
@@ -189,7 +190,7 @@ class Ros1File(Storage):
         return None if whole else "no index, or not all of it"
 
     def _take_records(self, start: int, watch: Watch) -> int:
-        """Take the records from `start` on, and return where they end: at damage, or at the end."""
+        """Take in the records from `start` on; return where they end, by damage or at the end."""
         stop, chunk = start, -1
         for at, fields, data, after in records(self._file, start):
             watch("looking through the file, bytes", at, len(self._file))
@@ -218,7 +219,7 @@ class Ros1File(Storage):
         self._indexed[at] = Counter()
 
     def _take_info(self, fields: Fields, content: bytes) -> None:
-        """Take what the end of the file says of a chunk: pairs of connection and count."""
+        """Take in a chunk info record: the chunk's span, and pairs of connection and count."""
         pairs = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
         self._claimed[_number(fields, b"chunk_pos")] = Counter(dict(pairs))
         low, high = (fields.get(name, b"") for name in (b"start_time", b"end_time"))
@@ -226,7 +227,7 @@ class Ros1File(Storage):
             self._spans.append((_time_ns(low), _time_ns(high)))
 
     def _count(self, at: int) -> Counter[int]:
-        """Count a chunk's messages by connection; a chunk on which the bag disagrees is walked."""
+        """Count a chunk's messages per connection; walk it unless the bag's counts agree."""
         claimed, indexed = self._claimed.get(at), self._indexed[at]
         if claimed is not None:
             if claimed == indexed and claimed.keys() <= self._connections.keys():
@@ -236,7 +237,7 @@ class Ros1File(Storage):
             )
         try:
             walked = self._walk(at, self._inflated(at))
-        except BadChunk:  # noted when it is read
+        except BadChunk:  # recorded as damage when the chunk is read
             return indexed | (claimed or Counter())
         for key, one in walked.connections.items():
             self._connections.setdefault(key, one)
@@ -248,7 +249,7 @@ class Ros1File(Storage):
         """Decompress a chunk's records.
 
         Raises:
-            BadChunk: they cannot be, and why.
+            BadChunk: they are damaged.
         """
         if at in self._kept:
             return self._kept[at]
@@ -264,7 +265,7 @@ class Ros1File(Storage):
         return data
 
     def _walk(self, at: int, data: bytes) -> Walked:
-        """Walk a chunk, or remember what it holds."""
+        """Return a chunk's contents: cached, or from a walk."""
         if at not in self._walks:
             walked = walk(data)
             self._room -= sum(map(len, walked.places.values()))
@@ -274,7 +275,7 @@ class Ros1File(Storage):
         return self._walks[at]
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield the messages chunk by chunk, by what each holds, whatever the index says.
+        """Yield the messages found by walking each chunk, whatever the index says.
 
         A damaged chunk costs only its own messages.
         """
@@ -309,7 +310,7 @@ class Ros1File(Storage):
 
 
 def _channel(number: int, outer: Fields, inner: Fields) -> Channel:
-    """Build a channel from the fields of a connection's header and of its data."""
+    """Build a channel from the fields of a connection record's header and data."""
     topic, kind = (
         one.decode(errors="replace") for one in (outer.get(b"topic", b""), inner.get(b"type", b""))
     )

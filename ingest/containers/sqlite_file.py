@@ -1,8 +1,8 @@
-"""rosbag2's sqlite3 storage: one `.db3` file.
+"""Reads rosbag2's sqlite3 storage, one `.db3` file.
 
-A sqlite file is a program as much as it is data: views and computed columns run what a stranger
-wrote, pages that point to each other make a small file endless, and texts need not be texts. So
-queries are bounded, and only plain tables are read.
+A sqlite file can be malicious: its views and computed columns run SQL that a stranger wrote, pages
+that point to each other make a small file endless, and text may be invalid. So queries are limited,
+and only plain tables are read.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ BYTES_PER_BATCH = 8 << 20
 MAX_MESSAGE = 256 << 20
 MAX_METADATA = 2 << 20  # characters
 MAX_QOS = 8192  # characters of a topic's offered profiles
-MAX_FOUND = 10  # by the check: one is enough to refuse the file
-STEPS_PER_BYTE = 64  # of sqlite's machine; reading rows of a few bytes takes one or two
+MAX_FOUND = 10  # problems that SQLite's check lists: one is enough to refuse the file
+STEPS_PER_BYTE = 64  # limit for SQLite's virtual machine; reading short rows takes one or two
 MIN_STEPS = 10_000_000
 STEPS_AT_ONCE = 100_000
-# What the check says of values, not of pages: those are read as they are.
+# Findings of the check that are about values, not pages: such values are read as they are.
 _OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
 
-_Pending = dict[int, tuple[list[bytes], list[int]]]  # payloads and stamps, by topic
+_Pending = dict[int, tuple[list[bytes], list[int]]]  # topic id -> payloads, log times
 
 
 def open_sqlite(
@@ -50,7 +50,7 @@ def open_sqlite(
     """Open a sqlite3 storage file.
 
     Raises:
-        RecordingError: it is not rosbag2's, or it is damaged and not to be salvaged.
+        RecordingError: it is not rosbag2's, or is damaged (unless `salvage`).
     """
     try:
         return SqliteFile(path)
@@ -70,16 +70,16 @@ class DamagedSqliteError(RecordingError):
 
 
 class SqliteFile(Storage):
-    """A whole sqlite3 storage file, read only.
+    """An undamaged sqlite3 storage file, read only.
 
-    rosbag2 keeps no checksums, so it is never verified, but SQLite's own check of its pages must
-    pass.
+    rosbag2 has no checksums, so the file is never verified, but it must pass SQLite's own check of
+    its pages.
 
-    Rows that a writer left in a `-wal` or `-journal` file beside it count too: such a file is
-    read from a private copy, so that nothing next to the user's recording is ever written.
+    Rows that a writer left in a `-wal` or `-journal` file beside it are read, too. Then a private
+    copy is read, so that nothing is ever written next to the user's recording.
 
     Raises:
-        DamagedSqliteError: its check fails.
+        DamagedSqliteError: it is cut short or fails the check.
         RecordingError: it is not rosbag2's.
     """
 
@@ -98,7 +98,7 @@ class SqliteFile(Storage):
             self._connection.execute("SELECT id, topic_id, timestamp, data FROM messages LIMIT 0")
             self.counts, self.span_ns = self._count()
             self._read_metadata()
-        except (sqlite3.Error, UnicodeError) as error:  # its messages, too, quote what they read
+        except (sqlite3.Error, UnicodeError) as error:  # SQLite's messages may quote invalid text
             self.close()
             raise RecordingError(
                 f"not a rosbag2 recording: {error}",
@@ -125,11 +125,11 @@ class SqliteFile(Storage):
             raise DamagedSqliteError(f"cut short: {size:,} bytes of {page * pages:,}", self.path)
 
     def _refuse_damaged(self) -> None:
-        """Run SQLite's quick check: of every page, and that each has its place.
+        """Run SQLite's quick check of all pages and their structure.
 
-        It costs about as much as reading all rows.
+        It takes about as long as reading all rows.
         """
-        self._connection.execute("PRAGMA ignore_check_constraints = ON")  # those are programs
+        self._connection.execute("PRAGMA ignore_check_constraints = ON")  # they are programs
         try:
             found = self._connection.execute(f"PRAGMA quick_check({MAX_FOUND})").fetchall()
         except sqlite3.DatabaseError as error:
@@ -168,7 +168,7 @@ class SqliteFile(Storage):
                 for name, form, text in rows
             }
         names = {row[1] for row in self._connection.execute("PRAGMA table_info(topics)")}
-        # Before rosbag2 0.0.5 there was no such column: all was CDR.
+        # Before rosbag2 0.0.5 there was no such column, and everything was CDR.
         encoding = "serialization_format" if "serialization_format" in names else "'cdr'"
         qos = f"substr(offered_qos_profiles, 1, {MAX_QOS})"
         qos = qos if "offered_qos_profiles" in names else "''"
@@ -204,7 +204,7 @@ class SqliteFile(Storage):
         return counts, (min(stamps), max(stamps)) if stamps else None
 
     def _read_metadata(self) -> None:
-        """Read rosbag2's metadata.yaml from the database; the last row is from its closing."""
+        """Read rosbag2's metadata.yaml from the database's last row, written when it was closed."""
         try:
             refuse_programs(self._connection, ("metadata",))
             row = self._connection.execute(
@@ -222,7 +222,7 @@ class SqliteFile(Storage):
             self.notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield all messages in one pass in rowid order, which is the order of arrival."""
+        """Yield the messages in one pass in rowid order, which is the order of arrival."""
         wanted = [channel for channel in channels if channel in self.channels]
         marks = ",".join("?" * len(wanted))
         query = (
@@ -262,7 +262,7 @@ class SqliteFile(Storage):
 
 
 def _sidecars(path: Path) -> list[Path]:
-    """Return the files that a writer left beside a file, to be merged into it."""
+    """Return the files beside a database that a writer left and SQLite has not merged into it."""
     beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
     return [item for item in beside if item.is_file() and item.stat().st_size]
 
@@ -272,7 +272,7 @@ def _size(path: Path) -> int:
 
 
 def _private_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
-    """Copy a file with what lies beside it; None if nothing does."""
+    """Copy a database with its sidecars to a temporary folder; None if it has no sidecars."""
     if not (sidecars := _sidecars(path)):
         return None
     folder = tempfile.TemporaryDirectory(prefix="restock-")
@@ -282,7 +282,7 @@ def _private_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
 
 
 def _merged(path: Path) -> tempfile.TemporaryDirectory[str] | None:
-    """Copy a file and let SQLite merge what lies beside it, as far as it can."""
+    """Copy a database and merge its sidecars as far as possible; None if it has no sidecars."""
     copy = _private_copy(path)
     if copy:
         with suppress(sqlite3.DatabaseError):
@@ -307,10 +307,10 @@ def _batches(pending: _Pending) -> Iterator[tuple[int, MessageBatch]]:
 
 
 def guard(connection: sqlite3.Connection, size: int) -> None:
-    """Limit the time of queries on a file of `size` bytes.
+    """Limit the work of queries on a file of `size` bytes.
 
-    A query that runs for longer than the file can have rows is interrupted: that raises
-    sqlite3.OperationalError, as damage does.
+    All queries of the connection together get more steps than a file of that size can need. Beyond
+    those, a query is interrupted, which raises sqlite3.OperationalError, as damage does.
     """
     connection.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
     # No value in a file is longer than the file.
@@ -327,10 +327,10 @@ def guard(connection: sqlite3.Connection, size: int) -> None:
 
 
 def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> None:
-    """Refuse a database that has anything but plain tables.
+    """Refuse a database if one of these tables is not a plain one.
 
     Raises:
-        sqlite3.DatabaseError: one of these is a view, a virtual table, or has computed columns.
+        sqlite3.DatabaseError: one is a view or a virtual table, or has computed columns.
     """
     for table in tables:
         rows = connection.execute(
@@ -340,7 +340,7 @@ def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> 
             words = str(sql).upper().split()[:2]
             if kind != "table" or words != ["CREATE", "TABLE"]:
                 raise sqlite3.DatabaseError(f"{table} is not a plain table")
-        # Not as a function in FROM: in a schema that is not trusted, that is not allowed.
+        # A statement, as the function in FROM is not allowed in a schema that is not trusted.
         if any(row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")):
             raise sqlite3.DatabaseError(f"{table} has computed columns")
 

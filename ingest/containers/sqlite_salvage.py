@@ -1,10 +1,10 @@
-"""Salvage of cut or damaged `.db3` files: messages in whole pages, and a count of the others.
+"""Salvages damaged `.db3` files: reads the messages in whole pages, and counts the others.
 
 SQLite itself stops at the first damage.
 
-A leaf page of a table is recognised by its form, wherever it lies, and its rows by their columns.
-If pages were inserted or removed, the page numbers in a file are off: by how much shows in the
-interior pages, which name the leaf of each row number. See https://www.sqlite.org/fileformat2.html.
+A leaf page of a table is recognised by its structure, wherever it is, and a row by its columns. If
+pages were inserted or removed, the page numbers in the file are wrong. The interior pages, which
+name the leaf of each row number, show by how much. See https://www.sqlite.org/fileformat2.html.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ INT_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # by serial type
 
 
 class Cell(NamedTuple):
-    """A row in a leaf page: its number, the types of its columns, and where its content is."""
+    """A row in a leaf page."""
 
     rowid: int
-    types: tuple[int, ...]
-    body: int  # where the columns start in the payload
+    types: tuple[int, ...]  # serial types of the columns
+    body: int  # offset of the columns in the payload
     size: int  # of the whole payload
-    local: bytes  # as much of it as is in the page
-    overflow: int  # the page where it goes on; 0: nowhere
+    local: bytes  # the part of the payload in this page
+    overflow: int  # the page with the next part; 0: none
 
 
 class NotAPage(Exception):
-    """A page that is no whole page of a table."""
+    """A page that is not an intact page of a table."""
 
 
 @dataclass(frozen=True)
 class Moves:
-    """Number of pages by which the page named `named` has moved, at some pages in order."""
+    """How far pages moved: what the file calls page `named` is at `named + by`, in page order."""
 
     named: Ints
     by: Ints
 
     def of(self, page: int) -> int | None:
-        """Return how far a page moved; None if those around it moved differently."""
+        """Return how far a page moved; None if its neighbours moved differently."""
         if not len(self.named):
             return 0
         at = int(np.searchsorted(self.named, page))
@@ -69,7 +69,7 @@ class Pages:
         size = int.from_bytes(head[16:18], "big")
         self.page_size = 65536 if size == 1 else size
         if self.page_size < 512 or self.page_size & (self.page_size - 1):
-            self.page_size = 4096  # which is not what the damaged header says
+            self.page_size = 4096  # the default, as the header is damaged
         self.usable = self.page_size - (head[20] if head[20] < 32 else 0)
         self.count = path.stat().st_size // self.page_size
 
@@ -79,7 +79,7 @@ class Pages:
         return self._file.read(self.page_size)
 
     def tables(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield number, kind and content of every page that starts like one of a table."""
+        """Yield number, kind and content of every page that starts like a page of a table."""
         for number in range(1, self.count + 1):
             content = self.page(number)
             kind = content[0] if number > 1 and content else 0
@@ -94,7 +94,7 @@ class Pages:
         """Parse the rows of a leaf page.
 
         Raises:
-            NotAPage: not all of it has the form of one.
+            NotAPage: it does not have the structure of a leaf page.
         """
         cells = [self.cell(page, at) for at in _pointers(page, 8)]
         if any(left.rowid >= right.rowid for left, right in itertools.pairwise(cells)):
@@ -102,7 +102,7 @@ class Pages:
         return cells
 
     def cell(self, page: bytes, at: int) -> Cell:
-        """Parse the row that starts at a place of a leaf page."""
+        """Parse the row at an offset in a leaf page."""
         size, start = _varint(page, at)
         rowid, start = _varint(page, start)
         rowid -= (rowid >> 63) << 64
@@ -120,9 +120,9 @@ class Pages:
         return Cell(rowid, *_types(content, size), size, content, overflow)
 
     def payload(self, cell: Cell, moves: Moves, taken: Bools) -> bytes | None:
-        """Read a row's whole content; None if some of its pages are missing or not surely its own.
+        """Read a row's whole content; None if a page of it is missing or may belong elsewhere.
 
-        `taken` marks the pages that belong to something; those of this row are added.
+        `taken` marks the pages that are in use; those of this row are added.
         """
         parts, left, number = [cell.local], cell.size - len(cell.local), cell.overflow
         used = list[int]()
@@ -147,7 +147,7 @@ def children(page: bytes) -> list[tuple[int, int]]:
     """Return the pages below an interior page, each with the last row number it may hold.
 
     Raises:
-        NotAPage: not all of it has the form of one.
+        NotAPage: it does not have the structure of an interior page.
     """
     found = []
     for at in _pointers(page, 12):
@@ -162,8 +162,8 @@ def children(page: bytes) -> list[tuple[int, int]]:
 def moves_of(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]]]) -> Moves:
     """Find how far pages moved, from the leaves (last row number, page) and interior pages.
 
-    An interior page counts where it is the one right above leaves: each of its rows' numbers is
-    the last of the leaf that comes next.
+    Only interior pages right above leaves are used: each of their row numbers is the last one of
+    the leaf that goes with it.
     """
     leaves = sorted(leaves)
     place = {last: (order, page) for order, (last, page) in enumerate(leaves)}
@@ -230,7 +230,7 @@ def _size(kind: int) -> int:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """Read a number of one to nine bytes, and return where it ends."""
+    """Read an integer of one to nine bytes; also return where it ends."""
     value = 0
     for place in range(at, min(at + 8, len(data))):
         byte = data[place]
@@ -248,10 +248,10 @@ PIECE_ROWS = 4096
 
 
 class SalvagedSqliteFile(Storage):
-    """A damaged sqlite3 storage file, of which every row in a whole page is read.
+    """A damaged sqlite3 storage file, of which every row in an intact page is read.
 
-    Rows that lie in the pages more than once count once. rosbag2 numbers its rows one by one: by
-    their numbers it shows how many are missing.
+    A row that is in several pages counts once. rosbag2 numbers rows without gaps, so the numbers
+    show how many are missing.
 
     Raises:
         RecordingError: no topic can be found in it.
@@ -263,14 +263,14 @@ class SalvagedSqliteFile(Storage):
         self, path: Path, what: str, copy: tempfile.TemporaryDirectory[str] | None = None
     ) -> None:
         super().__init__()
-        self.path, self._copy = path, copy  # a private copy has what a `-wal` file held
+        self.path, self._copy = path, copy  # a private copy includes the rows of a `-wal` file
         self.damaged(what)
-        # By all passes: each finds what others have found, of its own topics.
+        # One entry for all passes: each finds the same losses again, for its own topics.
         self._unread = Damage("their pages are missing, damaged or too many")
         self._pages = Pages(Path(copy.name) / path.name if copy else path)
         self._taken = np.zeros(self._pages.count + 2, np.bool_)
         self._texts: list[Cell] = []  # rows of `topics` and `message_definitions`
-        self._last = 0  # row number that the file's interior pages name
+        self._last = 0  # highest row number in the interior pages
         rows = self._survey()
         self.channels = self._channels()
         if not self.channels:
@@ -286,7 +286,7 @@ class SalvagedSqliteFile(Storage):
         self.span_ns = (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
     def _survey(self) -> Ints:
-        """Scan once for row number, topic, stamp, page and offset in the page of every message."""
+        """Return row number, topic id, log time, page and index in the page of messages, (N, 5)."""
         pieces, rows = [np.zeros((0, 5), np.int64)], list[tuple[int, int, int, int, int]]()
         leaves, interiors = list[tuple[int, int]](), list[list[tuple[int, int]]]()
         for number, kind, page in self._pages.tables():
@@ -313,7 +313,7 @@ class SalvagedSqliteFile(Storage):
         return np.concatenate(pieces)
 
     def _messages(self, cells: list[Cell], page: int) -> Iterator[tuple[int, int, int, int, int]]:
-        """Yield the messages of a leaf page, and keep the rows of the other tables."""
+        """Yield the messages of a leaf page; keep the rows of other tables in `_texts`."""
         for place, cell in enumerate(cells):
             if _is_message(cell.types):
                 topic, stamp = integer(cell, 1), integer(cell, 2)
@@ -346,7 +346,7 @@ class SalvagedSqliteFile(Storage):
         }
 
     def _known(self, rows: Ints) -> Ints:
-        """Return the messages of known topics in the order of their row numbers; count the rest."""
+        """Return the messages of known topics in the order of row numbers; the rest is damage."""
         _, first = np.unique(rows[:, 0], return_index=True)
         rows = rows[first]
         named = np.isin(rows[:, 1], list(self.channels))
@@ -361,7 +361,7 @@ class SalvagedSqliteFile(Storage):
         return rows[named]
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield all messages in one pass in the order of row numbers, the order of arrival."""
+        """Yield the messages in one pass in the order of row numbers, the order of arrival."""
         pending: dict[int, PendingBatch] = {}
         size, lost, wanted = 0, dict[int, int](), list(channels)
         taken = self._taken.copy()
@@ -388,14 +388,14 @@ class SalvagedSqliteFile(Storage):
             self.damage.append(self._unread)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file and remove the private copy, if there was one."""
         self._pages.close()
         if self._copy:
             self._copy.cleanup()
 
 
 def _is_message(types: tuple[int, ...]) -> bool:
-    """Return whether a row is of `messages`: no id of its own, a topic, a stamp and the data."""
+    """Return whether a row is of `messages`: a null for its id, a topic, a log time, a blob."""
     return (
         len(types) == 4
         and types[0] == 0

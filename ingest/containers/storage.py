@@ -1,9 +1,9 @@
-"""Interface that every container of messages implements, between file formats and recordings.
+"""The interface between file formats and recordings, which every container implements.
 
-Also rosbag2's own zstd, around a whole storage file or around each message, and the reading of one
-topic: batches of payloads in, columns out, and an account of losses. Only the wanted fields of a
-batch are kept, and of wide fields (a scan's ranges) only the result of a `Reduction`: memory does
-not grow with a recording's bytes.
+This module also decompresses rosbag2's zstd (of a whole storage file or of each message), and turns
+a topic's batches of payloads into columns and an account of losses. Only the wanted fields of a
+batch are kept, and for wide fields (a scan's ranges) only the result of a `Reduction`, so that
+memory does not grow with the size of a recording.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from restock.ingest.decoding.columns import (
 from restock.ingest.decoding.row_by_row import Decoded
 
 Integrity = Literal["verified", "unverified", "damaged"]
-Watch = Callable[[str, int, int], None]  # what is being done, how much of it is done, of how much
+Watch = Callable[[str, int, int], None]  # (activity, how much is done, total)
 
-# Of a file's metadata so much is kept; the rest is counted.
+# Limits of the metadata that is kept from a file; the rest is only counted.
 MAX_ENTRIES = 1_000
 MAX_TEXT = 4_096  # characters of a name or value
 MAX_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
-HEAD_BYTES = 64  # by which a container claims a file
+HEAD_BYTES = 64  # first bytes of a file, by which a container recognises it
 LEROBOT_INFO, LEROBOT_DATA = "meta/info.json", "data/*/*.parquet"
 NOT_KEPT = f"not text, longer than {MAX_TEXT:,} characters, or beyond entry {MAX_ENTRIES:,}"
-# The key, and the lines further in: two spaces in metadata.yaml, none in what storages keep.
+# The key and its block. The key is indented by two spaces in metadata.yaml, not in storage files.
 _CUSTOM_DATA = re.compile(
     r"^(?P<indent> {0,4})custom_data:(?P<value>.*)(?P<block>(?:\n(?:(?P=indent) .*|[ \t]*$))*)",
     re.MULTILINE,
@@ -56,7 +56,7 @@ def unwatched(doing: str, done: int, whole: int) -> None:
 
 @dataclass
 class Damage:
-    """Part of a file that could not be read, and how many messages that cost if known."""
+    """A part of a file that could not be read, and the number of messages lost, if known."""
 
     what: str
     messages: dict[int, int] = field(default_factory=dict)  # by channel id
@@ -67,7 +67,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Extra:
-    """Attachment or metadata record of a file."""
+    """An attachment or metadata record of a file."""
 
     kind: Literal["attachment", "metadata"]
     name: str
@@ -80,9 +80,9 @@ class Extra:
 
 
 class Metadata(NamedTuple):
-    """Metadata of a whole recording, by its recorder or added later: text by name."""
+    """Metadata of a whole recording, from its recorder or added later: name -> text."""
 
-    source: str  # where it says so, for errors
+    source: str  # where it was found, for errors
     record: str  # name of the MCAP record; "" for the custom_data of a bag
     entries: Mapping[str, str]
 
@@ -90,7 +90,7 @@ class Metadata(NamedTuple):
 def keep_entries(
     said: Mapping[str, str], kept: Collection[Metadata] = ()
 ) -> tuple[dict[str, str], int]:
-    """Return the entries of a record that still fit beside `kept`, and how many do not."""
+    """Return the entries within the limits, `kept` ones included, and the number left out."""
     room = MAX_ENTRIES - sum(len(item.entries) for item in kept)
     short = {n: v for n, v in said.items() if len(n) <= MAX_TEXT and len(v) <= MAX_TEXT}
     entries = dict(list(short.items())[: max(room, 0)])
@@ -98,12 +98,13 @@ def keep_entries(
 
 
 def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tuple[Metadata, int]:
-    """Read rosbag2's `custom_data` from the text of a bag's metadata, which is `source`.
+    """Read rosbag2's `custom_data` from the text of a bag's metadata; `source` names its file.
 
-    Also returns how many of its entries do not fit beside `kept`.
+    Also returns the number of entries left out: those that are not text or exceed the limits, which
+    include the `kept` ones.
 
     Raises:
-        ValueError: it is too long, or no YAML.
+        ValueError: it is too long, or not valid YAML.
     """
     said, no_text = _custom_data(text)
     entries, beyond = keep_entries(said, kept)
@@ -111,9 +112,9 @@ def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tupl
 
 
 def _custom_data(text: str) -> tuple[dict[str, str], int]:
-    """Return the entries, and how many of them are not text.
+    """Return the entries that are text, and the number of others.
 
-    Only those lines are parsed, and their values stay as they are written: `007` is no number.
+    Only the lines of `custom_data` are parsed. Values stay as written: `007` is not read as 7.
     """
     found = _CUSTOM_DATA.search(text)
     if found is None:
@@ -134,17 +135,17 @@ def _custom_data(text: str) -> tuple[dict[str, str], int]:
 
 
 def yaml_value(text: str, key: str, *, kind: str = "safe") -> Any:
-    """Parse a YAML document, and return its value of a key.
+    """Parse a YAML document and return the value of a key.
 
     Raises:
-        ValueError: it is none, or has no such key, and why.
+        ValueError: it is not valid YAML, or has no such key.
     """
-    from ruamel.yaml import YAML  # slow to import, and MCAP files need none
+    from ruamel.yaml import YAML  # slow to import, and MCAP files do not need it
     from ruamel.yaml.error import YAMLError
 
     try:
         return YAML(typ=kind, pure=True).load(text)[key]
-    except (  # of an invalid document, or of one that the library does not expect
+    except (  # the document is invalid, or the library does not expect it
         *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
         *(RecursionError, OverflowError, NotImplementedError),
     ) as error:
@@ -155,11 +156,11 @@ def yaml_value(text: str, key: str, *, kind: str = "safe") -> Any:
 class Storage(ABC):
     """An open file of messages.
 
-    A container's class calls `__init__` and sets `channels`, `counts` (messages by the container's
-    own count, per channel id) and `span_ns` (the first and last log time; None without a message).
-    `damage` is final once everything wanted has been read. `notes` inform the user about things
-    that lose no data. `extras` are listed, not read; `metadata` are the entries among them that
-    describe the whole recording. `from_ros2` says whether a ROS 2 middleware serialised its
+    A subclass calls `__init__` and sets `channels`, `counts` (messages per channel id, by the
+    container's own count) and `span_ns` (the first and last log time; None without messages).
+    `damage` is complete once everything wanted has been read. `notes` tell the user about things
+    that lose no data. `extras` lists attachments and metadata records; `metadata` has the entries
+    that describe the whole recording. `from_ros2` is whether a ROS 2 middleware serialised the
     messages.
     """
 
@@ -180,7 +181,7 @@ class Storage(ABC):
         return "damaged" if self.damage else "unverified"
 
     def damaged(self, what: str, messages: Mapping[int, int] | None = None) -> None:
-        """Note damage, once, and how many messages it costs, by channel id."""
+        """Record damage, once, with the number of messages lost by channel id."""
         if all(item.what != what for item in self.damage):
             self.damage.append(Damage(what, dict(messages or {})))
 
@@ -194,7 +195,7 @@ class Storage(ABC):
 
 
 class Opener(Protocol):
-    """Opens one file of a container; with `salvage`, what can be read of a damaged one."""
+    """Opens one file of a container; with `salvage`, also a damaged one, as far as readable."""
 
     def __call__(self, path: Path, *, salvage: bool, watch: Watch) -> Storage: ...
 
@@ -204,22 +205,22 @@ class Container:
     """A file format of recordings: a row of `containers.open_recording.CONTAINERS`."""
 
     name: str
-    endings: tuple[str, ...]  # of its files' names
-    claims: Callable[[bytes], bool]  # by a file's first `HEAD_BYTES`
+    endings: tuple[str, ...]  # of its file names
+    claims: Callable[[bytes], bool]  # whether these first `HEAD_BYTES` are of this format
     open: Opener
-    format: str  # what a store calls a recording that is one such file
-    bag_format: str  # and one that is a folder of them
-    # Of a format that is a folder: its files, the first of which is the one that `claims` looks at.
+    format: str  # `format` in the store of a recording that is one such file
+    bag_format: str  # `format` in the store of a recording that is a folder of such files
+    # For a format that is a folder: yields its files; `claims` gets the beginning of the first.
     files: Callable[[Path], Iterator[Path]] | None = None
 
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_MESSAGE = 1 << 30
-PIECE = 32 << 20  # of messages decompressed at a time
-BLOCK = 1 << 12  # bytes given to zstd at a time: at its most that makes 128 MiB of them
-RATIO = 1000  # bytes that a stored one may hold: what claims more is an attack, or an accident
-CHUNK = 64 << 20  # of a few bytes: as much is nothing to fear
-FILE = 256 << 20
+PIECE = 32 << 20  # bytes of decompressed messages that are yielded at a time
+BLOCK = 1 << 12  # bytes given to zstd at a time, which become 128 MiB at most
+RATIO = 1000  # largest plausible ratio of compression: a larger one is an attack or an accident
+CHUNK = 64 << 20  # bytes that are plausible for a chunk of any stored size: they do no harm
+FILE = 256 << 20  # the same for a file
 
 
 def most_bytes(stored: int, at_least: int = CHUNK) -> int:
@@ -228,10 +229,10 @@ def most_bytes(stored: int, at_least: int = CHUNK) -> int:
 
 
 def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
-    """Decompress a storage file into `target`; return its damage if it is to be salvaged.
+    """Decompress a storage file into `target`; return its damage, or None.
 
     Raises:
-        RecordingError: it is damaged, cut short, or decompresses to implausibly much.
+        RecordingError: it is damaged or cut short (unless `salvage`), or implausibly large.
     """
     limit = most_bytes(path.stat().st_size, FILE)
     size = 0
@@ -262,12 +263,12 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
 
 
 def decompressed(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
-    """Yield the batch with zstd payloads decompressed, and how many could not be.
+    """Yield the batch with zstd payloads decompressed, and the number of damaged payloads.
 
-    It comes in pieces of about PIECE bytes, as it may hold many times more than the batch.
+    It comes in pieces of about PIECE bytes, as it may be many times larger decompressed.
 
-    Whether a payload is compressed shows in its first four bytes: CDR starts with two zeros, or
-    a zero and another small number.
+    The first four bytes of a payload show whether it is compressed: CDR starts with two zeros, or
+    with a zero and another small number.
     """
     if not _any_zstd(batch):
         yield batch, 0
@@ -301,7 +302,7 @@ def _plain(payload: bytes) -> bytes:
         return bytes(zstandard.ZstdDecompressor().decompress(payload, max_output_size=limit))
     if size >= 0:
         raise zstandard.ZstdError("implausibly large")
-    # Its size is not given: nothing is allocated for it.
+    # Its size is not given: decompress it block by block.
     decoder, parts, total = zstandard.ZstdDecompressor().decompressobj(), list[bytes](), 0
     for at in range(0, len(payload), BLOCK):
         parts.append(decoder.decompress(payload[at : at + BLOCK]))
@@ -320,7 +321,7 @@ def _any_zstd(batch: MessageBatch) -> bool:
     return bool(np.logical_and.reduce(same).any())
 
 
-SMALL_ROWS = 1024  # batches of fewer messages are put together, up to
+SMALL_ROWS = 1024  # batches with fewer messages are joined, up to the next two limits
 TOGETHER_ROWS = 4096
 TOGETHER_BYTES = 4 << 20
 LATEST_NS = 2**63 - 1
@@ -334,14 +335,14 @@ class TopicInfo:
     """Description of a topic before anything is read."""
 
     name: str
-    type: str  # "nav_msgs/msg/Odometry"; "" where the container names none
+    type: str  # "nav_msgs/msg/Odometry"; "" if the container has none
     expected: int  # messages, by the container's own count
     encoding: str  # "cdr", "json", "protobuf", "ros1", …
-    definition: str  # "embedded", a distribution's name, or "" where it cannot be decoded
+    definition: str  # "embedded", a distribution's name, or "" if it cannot be decoded
     skipped: str | None  # why it cannot be decoded, or None
 
 
-FAR_BACK_NS = 100_000_000  # between two messages of a topic, as they lie in the file
+FAR_BACK_NS = 100_000_000  # log time that goes back further within a topic was set back
 
 
 @dataclass
@@ -353,12 +354,12 @@ class Account:
     expected: int  # by the container's own count
     read: int = 0  # payloads that came out of the container
     decoded: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)  # why the rest were not decoded
-    log_backsteps: int = 0  # messages logged before the one that lies before them in the file
+    reasons: dict[str, int] = field(default_factory=dict)  # reason -> messages not decoded
+    log_backsteps: int = 0  # messages with a log time before that of their predecessor
 
     @property
     def lost(self) -> int:
-        """Count messages that the container counts and that gave no row."""
+        """Return the number of messages that the container counts but that gave no row."""
         return max(self.expected - self.decoded, 0)
 
 
@@ -366,17 +367,17 @@ class Account:
 class LostMessages:
     """Messages or bytes of a recording that could not be read, and why."""
 
-    topic: str | None  # None: of the file as a whole
+    topic: str | None  # None: the file as a whole
     messages: int | None  # None: unknown
     reason: str
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """Fields of a topic that are read to be made into others, batch by batch, and not kept.
+    """Fields of a topic that are read only to compute others from them, batch by batch.
 
-    `apply` gets columns of N messages and answers with columns of N rows, each row made of its
-    own message alone, so that it does not matter which messages come together.
+    `apply` takes columns of N messages and returns columns of N rows. Each row depends on its own
+    message alone, so it does not matter which messages are in a batch.
     """
 
     fields: tuple[str, ...]
@@ -384,7 +385,7 @@ class Reduction:
 
 
 class TopicReading:
-    """Columns and account of one topic so far."""
+    """Collects the columns and the account of one topic."""
 
     def __init__(
         self, topic: TopicInfo, wanted: Iterable[str], reduction: Reduction | None = None
@@ -393,14 +394,14 @@ class TopicReading:
         self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
         no_times = np.zeros(0, np.int64)
         self._log = GrowingArray(no_times)
-        self._publish: GrowingArray | None = None  # None while all are sent when they are logged
+        self._publish: GrowingArray | None = None  # None while all equal the log times
         self._fields: dict[str, GrowingArray | GrowingRagged] = {}
         self.decodable = False
-        self.interleaved = False  # channels of one file: each batch has one, the file mixes them
+        self.interleaved = False  # several channels in a file: batches are not in its order
 
     @property
     def paths(self) -> list[str]:
-        """Return the fields to decode: those wanted, and those that are reduced."""
+        """Return the fields to decode: the wanted ones, and the inputs of the reduction."""
         return list(dict.fromkeys([*self._wanted, *self._reduced]))
 
     @property
@@ -408,7 +409,7 @@ class TopicReading:
         return self._reduction.fields if self._reduction else ()
 
     def use(self, empty: Fields) -> None:
-        """Make columns for the fields decoded, even if no message comes."""
+        """Create columns for the decoded fields, even if no message comes."""
         self.decodable = True
         for path, column in self._kept(empty).items():
             self._fields.setdefault(path, growing(column))
@@ -428,7 +429,7 @@ class TopicReading:
     def decoded(
         self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch
     ) -> Iterator[tuple[MessageBatch, Decoded]]:
-        """Yield what a batch decodes to, in pieces, and account for it."""
+        """Decode a batch; yield its messages and their columns in pieces, and count both."""
         account = self._account
         account.read += len(batch)
         for plain, damaged in decompressed(batch):
@@ -462,7 +463,7 @@ class TopicReading:
             self._account.reasons[reason] = self._account.reasons.get(reason, 0) + count
 
     def close(self, lost: Mapping[str, int]) -> Account:
-        """Reconcile and return the account: messages that are counted but missing are lost too."""
+        """Return the account; add the `lost` messages, and those that are counted but missing."""
         account = self._account
         self._add(lost)
         unexplained = account.expected - account.decoded - sum(account.reasons.values())
@@ -471,7 +472,7 @@ class TopicReading:
         return account
 
     def columns(self) -> TopicColumns:
-        """Return all columns, in the order of log time."""
+        """Return all columns in the order of log time."""
         log = self._log.column()
         fields: dict[str, FieldColumn] = {}
         order, lap = None, None
@@ -486,14 +487,14 @@ class TopicReading:
         publish = log
         if self._publish is not None:
             publish = self._publish.column() if order is None else self._publish.column()[order]
-        for path in list(self._fields):  # one by one: the unordered column is freed first
+        for path in list(self._fields):  # one by one, so that the unordered column is freed
             column = self._fields.pop(path).column()
             fields[path] = column if order is None else take(column, order)
         return TopicColumns(log, publish, fields, lap)
 
 
 def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:
-    """Yield the same messages in the same order, with small batches of a channel put together.
+    """Join small batches of a channel; its messages stay in order.
 
     Decoding has a cost per batch besides the cost per message, and a slow topic has only a handful
     of messages in 8 MiB of a recording.
