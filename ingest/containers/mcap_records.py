@@ -290,7 +290,7 @@ def indexed_messages(
     room = np.maximum(size - HEAD_SIZE, 0).astype(np.uint64)
     if (offset > room).any() or (size < HEAD_SIZE).any():
         return None
-    # File order, as entries are sorted by time. Chunks stay in order, so `base` and `size` still fit.
+    # File order: entries are sorted by time. Chunks stay in order, so `base` and `size` still fit.
     at = np.sort(offset.astype(np.int64) + base)
     head = gather(buffer, at, _HEAD)
     length = head["length"]

@@ -1,1 +1,1 @@
-"""Payloads to columns: message definitions, and decoders of CDR, JSON, protobuf and ROS 1."""
+"""Decoding of payloads into columns: message definitions; CDR, ROS 1, JSON and protobuf."""

@@ -1,7 +1,7 @@
-"""Reading position in a batch of messages: a cursor per message, and gathers from one buffer.
+"""Reads CDR fields of many messages at once: a cursor per message, and gathers from one buffer.
 
-A cursor that is the same for all messages is one int, not an array: as long as messages are laid
-out alike, as most of a topic's are, position arithmetic costs nothing.
+If the cursor is the same for all messages, it is one int and not an array. Most messages of a topic
+have the same layout, so that computing positions costs nothing.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ TOO_SHORT = "mis-sized: it ends before its last field"
 TOO_LONG = "mis-sized: bytes are left after its last field"
 NOT_TEXT = "text that is not valid UTF-8"
 UNTERMINATED = "text without its terminating zero"
-_LOOP_BYTES = 512  # rows longer than this are copied one by one: cheaper than an index per value
+_LOOP_BYTES = 512  # longer rows are copied one by one: cheaper than an index per value
 
 
 class BadRows(Exception):
-    """Messages (their rows in the batch) that do not decode, and why."""
+    """Messages (rows of the batch) that cannot be decoded, and the reason."""
 
     def __init__(self, rows: NDArray[np.intp], reason: str) -> None:
         super().__init__(reason)
@@ -36,9 +36,10 @@ class BadRows(Exception):
 
 
 class TextBuffer:
-    """A buffer that holds little but these messages, as one text, made when it is first needed.
+    """The buffer of some messages as one text, decoded on first use.
 
-    Slicing it takes a third of the time of copying and decoding bytes.
+    Slicing it takes a third of the time of copying and decoding bytes. Only a buffer made from a
+    `bytes` object has a text: it contains little besides the messages.
     """
 
     def __init__(self, buffer: NDArray[np.uint8]) -> None:
@@ -47,11 +48,11 @@ class TextBuffer:
         self._text: str | None = None
 
     def texts(self, at: Ints, stop: Ints) -> list[str] | None:
-        """Slice the texts at these places; None if not all are ASCII, or the buffer has none."""
+        """Return the texts at these positions; None if one is not ASCII, or there is no text."""
         if self._whole is None:
             return None
         if self._text is None:
-            self._text = self._whole.decode("latin-1")  # which never fails
+            self._text = self._whole.decode("latin-1")  # never fails
         whole = self._text
         pieces = [whole[a:b] for a, b in zip(at.tolist(), stop.tolist(), strict=True)]
         if not "".join(pieces).isascii():
@@ -78,16 +79,16 @@ class Frame:
         self.buffer = buffer
         self.text_buffer = text_buffer or TextBuffer(buffer)
         self.order = order  # "<" or ">"
-        self.origin = origin  # (N,) of the message's first byte in the buffer: alignment is from it
-        self.end = end  # (N,) of the message, from its origin
-        self.rows = rows  # (N,) of the message in the batch
-        self.position = position  # from the origin
+        self.origin = origin  # (N,) the message's first byte in the buffer; alignment is from it
+        self.end = end  # (N,) end of the message, from its origin
+        self.rows = rows  # (N,) row of the message in the batch
+        self.position = position  # cursor, from the origin
 
     def __len__(self) -> int:
         return len(self.origin)
 
     def select(self, rows: NDArray[np.intp], position: Position) -> Frame:
-        """Select messages (some perhaps several times), at these positions."""
+        """Return a frame of these messages (repeats allowed) with the cursor at `position`."""
         return Frame(
             self.buffer,
             self.order,
@@ -109,7 +110,7 @@ class Frame:
         self.position = (self.position + (size - 1)) & -size
 
     def read_uint32(self, align: int) -> Position:
-        """Read a uint32: one int where all messages have the same."""
+        """Read a uint32 from each message; return one int if all are the same."""
         if align > 1:
             self.align(4)
         self.check_bounds(self.position + 4)
@@ -209,26 +210,26 @@ SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class FixedField:
-    """A primitive, or a fixed array of them, among fields of fixed size."""
+    """A field of fixed size: a primitive, or a fixed array of primitives."""
 
     dtype: np.dtype[Any]  # "<" is implied
     count: int | None  # of a fixed array
     align: int
     path: str | None  # None: not wanted
     part: str = ""  # "sec" or "nanosec" of a time
-    also: str | None = None  # its own path, where both it and the whole time are wanted
+    also: str | None = None  # path of this part, if it is wanted besides the whole time
 
     @property
     def size(self) -> int:
-        """Return the bytes of all its values."""
+        """Return the size of all its values in bytes."""
         return self.dtype.itemsize * (1 if self.count is None else self.count)
 
 
 @dataclass
 class _Layout:
-    """The fields laid out from one starting phase (the cursor modulo the alignment)."""
+    """The layout of fields for one starting phase (the cursor modulo the alignment)."""
 
-    size: int  # from the cursor to past the last field, padding before the first included
+    size: int  # bytes from the cursor to the end of the last field, with padding before the first
     groups: list[tuple[int, dict[Order, np.dtype[Any]]]]  # first byte; byte order -> structure
 
 
@@ -304,7 +305,7 @@ class FixedFields:
                     out[str(field.path)] = values
 
     def stride(self, phase: int) -> int | None:
-        """Return the size of one more element of these fields; None if it varies."""
+        """Return the distance between elements of these fields; None if it varies."""
         size = self.layouts[phase].size
         return size if (phase + size) & self.mask == phase else None
 

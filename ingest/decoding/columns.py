@@ -2,8 +2,8 @@
 
 A field path names a value inside a message: `twist.twist.linear.x`, `ranges`, `header.stamp`
 (nanoseconds), `poses[].pose.position.x` (one value per element of a sequence), `name` or `name[]`.
-Names come out of files, and go to terminals, tables and reports: control characters in them are
-written out (`visible`) where they come in.
+Names come from files, and go to terminals, tables and reports. Control characters in them are
+therefore escaped (`visible`) when they are read.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from restock.arrays import F64, Ints
 from restock.errors import RecordingError, visible
 
-# The number of messages to come is the file's claim: no more than this is allocated for them.
-# Memory that is allocated and not yet written to costs nothing.
+# Limit of the memory that is allocated ahead, as the file only claims its number of messages.
+# Memory that is allocated but not yet written to costs nothing.
 AHEAD_BYTES = 32 << 20
 
 
@@ -30,7 +30,7 @@ AHEAD_BYTES = 32 << 20
 class Ragged:
     """Rows of different lengths: row i is `values[offsets[i]:offsets[i + 1]]`.
 
-    `values` is an array (total, …), or Ragged again where a sequence holds sequences
+    `values` is an array (total, …), or Ragged again if a sequence contains sequences
     (`status[].values[].key`). `offsets` is (N + 1,) int64 and starts at 0.
     """
 
@@ -112,7 +112,8 @@ def equal(left: FieldColumn, right: FieldColumn) -> bool:
 def gather(buffer: NDArray[np.uint8], at: Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Gather one value of `dtype` (also a structure or array) at each byte position, (N, …).
 
-    Positions must fit. All bytes of a value are moved at once, whatever its fields.
+    The values must lie within the buffer. All bytes of a value are moved at once, whatever its
+    fields.
     """
     size = dtype.itemsize
     if not len(at) or not size:
@@ -131,9 +132,9 @@ class TopicColumns:
     """The decoded messages of one topic, in the order of their log time."""
 
     log_time_ns: Ints  # (N,) when the recorder received it
-    publish_time_ns: Ints  # (N,) when the sender sent it; the log time where that is not kept
+    publish_time_ns: Ints  # (N,) when the sender sent it; the log time if unknown
     fields: dict[str, FieldColumn] = field(default_factory=dict)  # by field path
-    lap: Ints | None = None  # (N,) how often log time had gone far back before each; None: never
+    lap: Ints | None = None  # (N,) jumps far back of log time before each; None: no jumps
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
@@ -143,7 +144,7 @@ class TopicColumns:
         return 0 if self.lap is None else int(self.lap.max(initial=0))
 
     def gaps_s(self) -> F64:
-        """Return the seconds from each message to the next; none where log time goes far back."""
+        """Return the seconds from each message to the next, except at jumps far back."""
         if self.lap is None:
             return np.asarray(np.diff(self.log_time_ns) * 1e-9, np.float64)
         laps = [self.log_time_ns[self.lap == lap] for lap in range(self.laps() + 1)]
@@ -157,7 +158,7 @@ class TopicColumns:
 
 
 class GrowingArray:
-    """An array (N, …) that grows at its end, with room set aside for what is expected."""
+    """An array (N, …) that grows at its end, with memory reserved for the expected rows."""
 
     def __init__(self, empty: NDArray[Any]) -> None:
         self._room, self._size = empty[:0], 0
@@ -166,7 +167,7 @@ class GrowingArray:
         return self._size
 
     def add(self, part: FieldColumn, expected: int) -> None:
-        """Copy a part in; `expected` is how many rows there will be in the end, as far as known."""
+        """Append a copy of a part; `expected` is the final number of rows, as far as known."""
         assert not isinstance(part, Ragged)
         size = self._size + len(part)
         if size > len(self._room):
@@ -184,7 +185,7 @@ class GrowingArray:
 
 
 class GrowingRagged:
-    """A ragged column as it grows."""
+    """A ragged column that grows at its end."""
 
     def __init__(self, empty: Ragged) -> None:
         self._values = growing(empty.values)
@@ -195,11 +196,11 @@ class GrowingRagged:
         return len(self._offsets) - 1
 
     def add(self, part: FieldColumn, expected: int) -> None:
-        """Copy a part in, as `GrowingArray.add` does."""
+        """Append a copy of a part, as `GrowingArray.add` does."""
         assert isinstance(part, Ragged)
         before, rows = len(self._values), len(self) + len(part)
         inside = int(part.offsets[-1]) + before
-        # As many values in the rows to come as in those so far, and a few more.
+        # Expect as many values per row as so far, and a few more.
         share = -(-inside * max(expected, rows) * 33 // (32 * max(rows, 1)))
         self._values.add(part.values, share)
         self._offsets.add(part.offsets[1:] + before, expected + 1)
@@ -216,7 +217,7 @@ def growing(empty: FieldColumn) -> GrowingArray | GrowingRagged:
 
 DEEPEST = 24  # nested messages; real ones reach 6
 MAX_FIELDS = 20_000
-MAX_WHY = 300  # it may quote a definition
+MAX_WHY = 300  # characters of a reason, which may quote a definition
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "bool": np.dtype(np.bool_),
@@ -245,7 +246,7 @@ class CannotDecode(Exception):
 
 @dataclass(frozen=True)
 class Many:
-    """A field that repeats: a fixed array of `length`, or a sequence where that is None."""
+    """A repeated field: a fixed array of `length`, or a sequence if that is None."""
 
     length: int | None
 
@@ -262,7 +263,7 @@ class FieldType:
 
 @dataclass(frozen=True)
 class Leaf:
-    """A field path, resolved: the fields it goes through and what is at its end."""
+    """A resolved field path: the fields along it, and the kind of value at its end."""
 
     path: str
     steps: tuple[FieldType, ...]
@@ -270,25 +271,25 @@ class Leaf:
 
     @property
     def dims(self) -> tuple[int | None, ...]:
-        """Return the fixed length of each repetition along the path, outermost first, or None."""
+        """Return the length of each repetition along the path, outermost first; None: sequence."""
         return tuple(step.many.length for step in self.steps if step.many)
 
 
 class MessageType(ABC):
-    """A message type with everything it is made of.
+    """A message type, with the messages that it contains.
 
     `source` is where its definition comes from: "embedded", a distribution's name, "inferred".
-    `times` are the messages that stand for a moment or a duration: read as nanoseconds.
+    `times` names the messages that are a time or a duration, which are read as nanoseconds.
     """
 
     name: str
     source: str
     times: Sequence[str] = ()
-    recursive = False  # whether a message may hold messages of its own type
+    recursive = False  # whether a message may contain messages of its own type
 
     @abstractmethod
     def fields_of(self, name: str) -> Sequence[FieldType]:
-        """Return the fields of a message of this type's family.
+        """Return the fields of a message: of this type, or of one inside it.
 
         Raises:
             CannotDecode: it is not defined, or uses something unsupported.
@@ -297,8 +298,8 @@ class MessageType(ABC):
     def leaves(self) -> list[Leaf]:
         """Return every field path of the type, in the order of its definition.
 
-        Inside a message that holds its own type the paths have no end: there they are left out
-        (`leaf` still finds each).
+        A message that contains its own type has endless paths. They are left out from where it
+        repeats (`leaf` still resolves each).
 
         Raises:
             CannotDecode: it nests too deeply, or has too many fields.
@@ -307,7 +308,7 @@ class MessageType(ABC):
 
     @cached_property
     def _by_path(self) -> dict[str, Leaf]:
-        """Hold the leaves by their paths: a process keeps its types, and many recordings ask."""
+        """Return the leaves by path, computed once, as many recordings share a type."""
         every = self._leaves(self.name, "", (), (self.name,), [0])
         return {leaf.path: leaf for leaf in every}
 
@@ -340,7 +341,7 @@ class MessageType(ABC):
         """Resolve one field path.
 
         Raises:
-            RecordingError: the type has no such field; names those it has.
+            RecordingError: the type has no such field. The error lists its fields.
         """
         if path in self._by_path:
             return self._by_path[path]
@@ -377,7 +378,7 @@ _SHORT_NAME = re.compile(r"(\w+)/(\w+)")
 class Channel:
     """A stream of messages of one type in one file.
 
-    Some writers leave the `msg` out of a ROS type's name: the type has it.
+    Some writers omit the `msg` in the name of a ROS type. `type` always has it.
     """
 
     id: int
@@ -386,7 +387,7 @@ class Channel:
     encoding: str  # of the messages: "cdr", "json", "protobuf", "ros1", …
     definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
     definition: bytes = b""
-    qos: str = ""  # the profiles that its publishers offered, as the file has them: YAML
+    qos: str = ""  # profiles that its publishers offered, as the file has them (YAML)
 
     def __post_init__(self) -> None:
         for name in ("topic", "type", "encoding", "definition_format"):
@@ -401,7 +402,7 @@ class MessageBatch:
 
     buffer: NDArray[np.uint8]
     start: Ints  # (N,) first byte of each payload in `buffer`
-    stop: Ints  # (N,) one past its last
+    stop: Ints  # (N,) one past its last byte
     log_time_ns: Ints  # (N,)
     publish_time_ns: Ints  # (N,)
 
@@ -409,7 +410,7 @@ class MessageBatch:
         return len(self.start)
 
     def select(self, rows: NDArray[np.intp]) -> MessageBatch:
-        """Select rows, in the same buffer."""
+        """Select messages; they share the buffer."""
         return MessageBatch(
             self.buffer,
             self.start[rows],
@@ -420,7 +421,7 @@ class MessageBatch:
 
     @property
     def size_bytes(self) -> int:
-        """Return the bytes of all payloads."""
+        """Return the total size of the payloads."""
         return int((self.stop - self.start).sum())
 
     def payloads(self) -> list[bytes]:
@@ -431,7 +432,7 @@ class MessageBatch:
 
     @classmethod
     def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> MessageBatch:
-        """Concatenate payloads."""
+        """Build a batch from payloads."""
         offsets = offsets_of(np.fromiter(map(len, payloads), np.int64, len(payloads)))
         return cls(
             np.frombuffer(b"".join(payloads), np.uint8),
@@ -443,7 +444,7 @@ class MessageBatch:
 
 
 class PendingBatch:
-    """Messages of one channel that wait for more of them, to be decoded together."""
+    """Messages of one channel that wait to be decoded together with later ones."""
 
     def __init__(self) -> None:
         self._payloads = list[bytes]()

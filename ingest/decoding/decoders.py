@@ -1,9 +1,9 @@
-"""Decoders of channels: by the encoding of their messages, ROS's straight to columns.
+"""Decoders for each encoding of messages; ROS messages are decoded straight into columns.
 
-ROS messages are CDR in both byte orders, or ROS 1's serialisation. The first four bytes of a CDR
-payload (the encapsulation header) define how the rest is laid out; alignment is relative to the
-byte after them. Of these layouts, ROS 2 writes plain CDR ("00 01", little-endian); XCDR2 and
-parameter lists are refused by name.
+ROS messages are CDR in either byte order, or ROS 1's serialisation. The first four bytes of a CDR
+payload (the encapsulation header) define how the rest is laid out, and alignment is relative to the
+byte after them. ROS 2 writes plain CDR ("00 01", little-endian). XCDR2 and parameter lists are
+refused by name.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class CdrPlan:
     """The operations of one message type, in the order of its serialisation."""
 
     operations: list[Operation]
-    paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted -> kind, repetitions inside
+    paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted -> kind, lengths of repetitions
 
     def decode(self, frame: Frame) -> Columns:
         """Decode the wanted fields of all messages, and move the cursor past the last field.
@@ -82,7 +82,7 @@ class CdrPlan:
         return out
 
     def empty(self) -> Columns:
-        """Return the columns of no messages."""
+        """Return columns without rows."""
         return {path: empty_column(kind, dims) for path, (kind, dims) in self.paths.items()}
 
 
@@ -96,7 +96,7 @@ def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
 
 
 def wrap(column: FieldColumn, length: int | None, rows: int, offsets: Ints) -> FieldColumn:
-    """Turn elements into rows: a fixed repetition becomes an axis, others are Ragged."""
+    """Group elements into rows: a fixed repetition becomes an axis, others become Ragged."""
     if length is not None and not isinstance(column, Ragged):
         return column.reshape(rows, length, *column.shape[1:])
     return Ragged(column, offsets)
@@ -110,13 +110,13 @@ class Text:
     ros1: bool
 
     def decode(self, frame: Frame, out: Columns) -> None:
-        """Step over the strings, or decode them."""
+        """Decode the strings, or skip them without a `path`."""
         length = frame.read_uint32(1 if self.ros1 else 4)
         stop = frame.position + length
         frame.check_bounds(stop)
         start = frame.origin + frame.position
         if not self.ros1:
-            # Some writers give an empty text no bytes at all, not even its zero.
+            # Some writers write an empty text as no bytes at all, not even its zero.
             ends = frame.origin + stop - 1
             bad = (frame.buffer[np.maximum(ends, 0)] != 0) & (spread(length, len(frame)) > 0)
             if bad.any():
@@ -136,7 +136,7 @@ class Primitives:
     ros1: bool
 
     def decode(self, frame: Frame, out: Columns) -> None:
-        """Step over the sequences, or gather them."""
+        """Gather the sequences, or skip them without a `path`."""
         count = frame.read_uint32(1 if self.ros1 else 4)
         size = self.dtype.itemsize
         if size > 4 and not self.ros1:
@@ -161,7 +161,7 @@ class Primitives:
 
 @dataclass
 class Repeat:
-    """A sequence or fixed array of messages, or of texts: the inner plan, once per element."""
+    """A sequence or fixed array of messages or texts; `inner` decodes each element."""
 
     inner: CdrPlan
     length: int | None  # of a fixed array
@@ -179,7 +179,7 @@ class Repeat:
         if not self.inner.operations:  # ROS 1: messages without fields take no bytes
             return
         counts = spread(count, len(frame))
-        # An element takes at least a byte: refuse counts that cannot be, before allocating.
+        # An element takes at least a byte: refuse impossible counts before allocating.
         frame.check_bounds(frame.position + count)
         offsets = offsets_of(counts)
         if offsets[-1] == 0:
@@ -193,7 +193,7 @@ class Repeat:
             out[path] = wrap(column, self.length, len(frame), offsets)
 
     def _fixed(self, frame: Frame, counts: Ints, offsets: Ints) -> Columns | None:
-        """Gather elements of one fixed size, whose places are known."""
+        """Gather elements of one fixed size, whose positions are known; None for others."""
         fields = self._only_fixed
         if fields is None:
             return None
@@ -213,18 +213,19 @@ class Repeat:
 
 
 class _Elements:
-    """Elements of varying size: where the next one starts is known when this one has been read.
+    """Reads elements of varying size: each must be read to know where the next one starts.
 
-    The first two of every message are read one after the other. The rest are then guessed to be
-    as long as the second, and read all at once: a guess is right where every element ends just
-    where the next was thought to start. Where it was wrong, elements are read one by one.
+    The first two elements of every message are read one after the other. The rest are then guessed
+    to be as long as the second, and read all at once. The guess is right for a message if each of
+    its elements ends exactly where the next was assumed to start. In the other messages, elements
+    are read one by one.
     """
 
     def __init__(self, inner: CdrPlan, frame: Frame, counts: Ints, offsets: Ints) -> None:
         self.inner, self.frame = inner, frame
         self.counts, self.offsets = counts, offsets
         self.position = spread(frame.position, len(frame)).copy()
-        self.places: list[Ints] = []  # of the elements that were read, in the answer
+        self.places: list[Ints] = []  # indices of `parts`' elements in the result
         self.parts: list[Columns] = []
 
     def read(self) -> Columns:
@@ -257,7 +258,7 @@ class _Elements:
         self.position[rows] = frame.position
 
     def _guess(self, rows: NDArray[np.intp], left: Ints, stride: Ints) -> NDArray[np.intp]:
-        """Read what is left of these messages by the guess; the rows where it was right."""
+        """Read the remaining elements by the guess; return the messages for which it was right."""
         no_rows = np.zeros(0, np.intp)
         if not rows.size:
             return no_rows
@@ -307,7 +308,7 @@ class _Compiler:
 
     def _message(self, name: str, prefix: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
         fields = self.message.fields_of(name)
-        if not fields and not self.ros1:  # C and C++ have no empty structure: it holds one byte
+        if not fields and not self.ros1:  # C and C++ have no empty structure: it takes a byte
             fixed.append(FixedField(np.dtype(np.uint8), None, 1, None))
         for part in fields:
             self._field(part, prefix + part.name, plan, fixed)
@@ -354,7 +355,7 @@ class _Compiler:
             plan.paths[inner_path] = (kind, (length, *dims))
 
     def _time(self, name: str, path: str, dot: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
-        """Add its two fields: as nanoseconds of both, or each by its own path, or all."""
+        """Add the two fields of a time: as one in nanoseconds, each by its own path, or both."""
         fields = self.message.fields_of(name)
         bases = [field.base for field in fields]
         if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):
@@ -385,7 +386,7 @@ class _Compiler:
 def compile_plan(message: RosType, wanted: frozenset[str], *, ros1: bool = False) -> CdrPlan:
     """Compile the plan that reads these leaf paths of a message type (as `Leaf.path` gives them).
 
-    It holds nothing of the messages that it reads, so many recordings share one.
+    A plan keeps nothing of the messages that it reads, so many recordings share one.
 
     Raises:
         CannotDecode: the type uses something unsupported.
@@ -395,7 +396,7 @@ def compile_plan(message: RosType, wanted: frozenset[str], *, ros1: bool = False
 
 HEADER = 4  # bytes of the encapsulation header
 PADDING = 3  # a payload is padded to a multiple of four
-RESTARTS = 16  # with fewer rows each time, before the rest is decoded in two halves
+RESTARTS = 16  # attempts, each without the rows that failed, before the rows are halved
 
 _ENCAPSULATIONS = {
     0x0002: "a parameter list (PL_CDR)",
@@ -410,20 +411,20 @@ _ENCAPSULATIONS = {
 
 
 class ColumnDecoder:
-    """Decodes the wanted fields of one message type, whole batches at a time."""
+    """Decodes the wanted fields of one message type, a whole batch at a time."""
 
     def __init__(self, message: RosType, leaves: Sequence[Leaf], *, ros1: bool = False) -> None:
         self._ros1 = ros1
-        # `name[]` is asked for and `name` compiled: brackets at the end add nothing.
+        # A path `name[]` is compiled as `name`: brackets at the end have no meaning.
         self._paths = {leaf.path: leaf.path.removesuffix("[]") for leaf in leaves}
         self._plan = compile_plan(message, frozenset(self._paths.values()), ros1=ros1)
 
     def empty(self) -> Columns:
-        """Return columns without a row."""
+        """Return columns without rows."""
         return self._named(self._plan.empty())
 
     def decode(self, batch: MessageBatch) -> Decoded:
-        """Decode a batch to columns, counting messages that do not decode by reason."""
+        """Decode a batch to columns; count messages that cannot be decoded, by reason."""
         if self._ros1:
             every = np.arange(len(batch))
             return self._join([self._decode_rows(batch, every, "<", 0)], Counter())
@@ -490,10 +491,10 @@ SAMPLE_MESSAGES = 1000
 
 
 def type_of(channel: Channel, distro: str, payloads: Sample) -> MessageType:
-    """Return the type of a channel's messages; the first messages show what no definition says.
+    """Return the type of a channel's messages; `payloads` yields them, to infer types of JSON.
 
     Raises:
-        CannotDecode: an encoding or a type that is not supported, and why.
+        CannotDecode: the encoding or the type is not supported.
     """
     if channel.encoding not in READABLE:
         raise CannotDecode(f"messages encoded as {channel.encoding!r} are not supported")
@@ -526,7 +527,7 @@ def _first(payloads: Iterable[bytes]) -> list[bytes]:
 
 
 def decoder_of(channel: Channel, kind: MessageType, leaves: Sequence[Leaf]) -> Decoder:
-    """Make the decoder of these fields of a channel's messages.
+    """Create the decoder for some fields of a channel's messages.
 
     Raises:
         CannotDecode: the type uses something unsupported.

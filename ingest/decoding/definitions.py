@@ -1,8 +1,9 @@
 """ROS message definitions: from the text in a recording, a named distribution, or a folder.
 
-rosbag2 keeps the text of files: with `#include` lines, comments, and the line ends of the editor.
-Bags of sqlite3 before 2023 carry no definitions: `--definitions PATH` reads those of a robot's own
-packages from their sources: `DIR/**/PACKAGE/msg/NAME.msg` (or `PACKAGE/NAME.msg`) and `.idl`.
+rosbag2 stores the text of definition files unchanged, with `#include` lines, comments and the
+editor's line endings. sqlite3 bags from before 2023 have no definitions. `--definitions PATH` reads
+those of a robot's own packages from their sources: `DIR/**/PACKAGE/msg/NAME.msg` (or
+`PACKAGE/NAME.msg`) and `.idl`.
 """
 
 from __future__ import annotations
@@ -35,29 +36,29 @@ from restock.ingest.decoding.columns import (
     MessageType,
 )
 
-# The line before each message inside another one names it, after a line of "=".
+# A message inside another one is preceded by a line of "=" and a line with its name.
 _RULE = re.compile(r"^=+[ \t]*\n\s*(?:MSG|IDL):[ \t]*([\w/]+)[ \t]*(?:\n|\Z)", re.MULTILINE)
-# What no field depends on: strings, comments, and lines for a preprocessor. What an #include names
-# is in the definition, too, and a guard against reading it twice always lets it be read once.
+# Text that no field depends on: strings, comments, and lines for a preprocessor. What an #include
+# names is part of the definition anyway, and so an include guard never hides anything.
 _ASIDE = re.compile(
     r'(?P<string>"(?:\\.|[^"\\])*(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)'
     r"|^[ \t]*#[ \t]*(?:(?:include|pragma|ifndef|endif)\b|define[ \t]+\w+[ \t]*$)[^\n]*",
     re.DOTALL | re.MULTILINE,
 )
 _HEADER = re.compile(r"^[ \t]*Header\b", re.MULTILINE)
-# The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
+# The IDL parser takes exponential time if these are nested, which rosidl does not write.
 _ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
 _NESTED = re.compile(r"(?:<[^<>]*){4}")
-MAX_PLACE = 60  # characters of a text that are named where it cannot be parsed
+MAX_PLACE = 60  # characters of the text that an error quotes
 
 
 def types_in(content: bytes, name: str, form: str) -> Typesdict:
-    """Parse the definition of a message, `name`, and of the messages inside it.
+    """Parse the definition of the message `name` and of the messages inside it.
 
     `form` is "ros2msg", "ros1msg" or "ros2idl".
 
     Raises:
-        CannotDecode: it cannot be parsed, and where.
+        CannotDecode: it cannot be parsed. The error quotes the place.
     """
     types: Typesdict = {}
     try:
@@ -69,7 +70,7 @@ def types_in(content: bytes, name: str, form: str) -> Typesdict:
             if form == "ros2idl":
                 types.update(_idl_types(lines))
                 continue
-            own = f"{part.rpartition('/')[0]}/Header"  # ROS 1 and rosbags mean that of std_msgs
+            own = f"{part.rpartition('/')[0]}/Header"  # ROS 1 and rosbags always take std_msgs'
             if form == "ros2msg" and own in parts.keys() - {part}:
                 lines = own.join(_HEADER.split(lines))
             types.update(get_types_from_msg(lines, part))
@@ -87,9 +88,9 @@ def _idl_types(text: str) -> Typesdict:
 
 
 def _where(error: Exception) -> str:
-    """Say where parsing ended.
+    """Return where parsing ended, as the end of an error message.
 
-    The errors of rosbags hold the whole text on one line, then the place, what is there, and
+    An error of rosbags has the whole text on one line, then the position, the text there, and
     perhaps what was expected.
     """
     lines = re.sub(r"\n\{['\"].*\Z", "", str(error) or type(error).__name__).splitlines()
@@ -101,7 +102,7 @@ def _where(error: Exception) -> str:
 
 LARGEST = 512 << 10  # bytes of one file
 MAX_FILES = 5000
-# Part of no distribution's core, and what every robot that steers is driven by (ackermann_msgs).
+# ackermann_msgs: not in any distribution's core, but the commands of every robot that steers.
 ACKERMANN = {
     "ackermann_msgs/msg/AckermannDrive": (
         "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
@@ -124,10 +125,10 @@ def ackermann_types() -> Typesdict:
 
 @cache
 def folder_types(folder: str) -> Typesdict:
-    """Return every type that a `.msg` or `.idl` file defines, or all of them in a folder.
+    """Return every type that a `.msg` or `.idl` file defines, or all such files in a folder.
 
     Raises:
-        RecordingError: no definition in it or too many, or one that cannot be read; names it.
+        RecordingError: there are no definitions or too many, or a file cannot be read.
     """
     root = Path(folder)
     files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])
@@ -164,19 +165,19 @@ DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
 MAX_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
 MAX_ARRAY = 1 << 20
-KEPT = 1024  # types as recordings define them
+KEPT = 1024  # cached types of recordings
 
 EMPTY = "structure_needs_at_least_one_member"  # ROS's placeholder in a message without fields
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
-@dataclass(frozen=True, eq=False)  # one object a definition: plans are kept by it
+@dataclass(frozen=True, eq=False)  # hashed by identity, for the cache of plans
 class RosType(MessageType):
-    """A ROS message type with everything it is made of."""
+    """A ROS message type, with the messages that it contains."""
 
     name: str
     source: str  # "embedded" or the distribution's name
-    raw: Typesdict  # as rosbags has them: the row-wise decoder registers
+    raw: Typesdict  # the definitions in the form of rosbags
     times = TIMES
 
     def fields_of(self, name: str) -> list[FieldType]:
@@ -204,10 +205,10 @@ def _field(name: str, description: Any) -> FieldType:
 
 
 def distro_types(distro: str) -> Typesdict:
-    """Return a distribution's message definitions; for `humble+DIR`, with a folder's on top.
+    """Return a distribution's message definitions; `humble+DIR` overrides them by a folder's.
 
     Raises:
-        RecordingError: no distribution of that name, or no definitions in that folder.
+        RecordingError: there are no definitions in the folder, or one cannot be read.
     """
     name, _, folder = distro.partition("+")
     hand = folder_types(folder) if folder else {}
@@ -215,13 +216,14 @@ def distro_types(distro: str) -> Typesdict:
 
 
 def choose_definitions(definitions: str | None) -> str:
-    """Name a distribution, and after a `+` the folder or file whose definitions are on top.
+    """Return the distribution, and after a `+` the path whose definitions override it.
 
-    `definitions` is a distribution, a folder or file, both with a `+` between them, or None. The
-    distribution's definitions are not loaded.
+    `definitions` is a distribution ("jazzy"), the path of a folder or file (on top of Humble), both
+    with a `+` between them, or None (Humble). The distribution's definitions are not loaded.
 
     Raises:
-        RecordingError: neither a distribution nor a place, or a place without definitions.
+        RecordingError: it is neither a distribution nor an existing path, or the path has no
+            definitions.
     """
     distro, _, place = (definitions or DEFAULT_DISTRO).partition("+")
     if distro not in _STORES:
@@ -251,16 +253,16 @@ def message_type(channel: Channel, distro: str) -> RosType:
     """Return the type of a channel's messages.
 
     Raises:
-        CannotDecode: a service or action event, an undefined type, or a definition
-            that cannot be parsed.
+        CannotDecode: it is a service or action event, or its type is not defined or cannot be
+            parsed.
     """
     name = _normalized(channel.type) if channel.type else ""
     for part, kind in (("/srv/", "service"), ("/action/", "action")):
         if part in name:
             raise CannotDecode(f"{kind} events are not supported")
-    # An empty definition is that of a message without fields, or was left out by the writer.
+    # If a definition is empty, the message has no fields or the writer left its definition out.
     embedded = channel.definition_format in ("ros2msg", "ros2idl", "ros1msg")
-    # Loading a distribution takes a quarter of a second: not where a recording defines all.
+    # Loading a distribution takes a quarter of a second: skip it if the recording has a definition.
     types = {} if embedded and channel.definition else distro_types(distro)
     if embedded and (channel.definition or name not in types):
         if len(channel.definition) > MAX_DEFINITION:
@@ -291,7 +293,7 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
         types = {**distro_types("ros1_noetic"), **types}
     source = "embedded"
     missing = _named(types) - types.keys()
-    if missing:  # some writers leave out the messages inside; their sizes will tell if they differ
+    if missing:  # some writers omit inner messages; if those differ, sizes will not fit
         types = {**distro_types(distro), **types}
         source = f"embedded, and {distro}"
     kind = RosType(name, source, types)
@@ -300,6 +302,6 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
 
 
 def _named(types: Typesdict) -> set[str]:
-    """Return the messages that fields of these types consist of."""
+    """Return the names of the messages that these types have as fields."""
     fields = [_field(*item) for _, items in types.values() for item in items]
     return {field.message for field in fields if field.message}

@@ -1,6 +1,6 @@
-"""Protobuf messages: their fields by the FileDescriptorSet in the recording, and their values.
+"""Protobuf messages: their fields from the FileDescriptorSet in the recording, and their values.
 
-A field that a message leaves out has protobuf's default: 0, an empty text, no element.
+A field that a message omits has protobuf's default: 0, an empty text, no element.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from restock.ingest.decoding.row_by_row import Unparsable, objects
 
 LARGEST = 256 << 20  # bytes of a message
 MAX_DEFINITION = 4 << 20
-KEPT = 256  # types: each keeps its pool
+KEPT = 256  # cached types, each with its descriptor pool
 TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
 _BASES = {
@@ -76,7 +76,7 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
     """Return the type of this name in a serialised FileDescriptorSet.
 
     Raises:
-        CannotDecode: no such set, or the type is not in it, or it uses something unsupported.
+        CannotDecode: the set cannot be parsed, lacks the type, or uses something unsupported.
     """
     if len(definition) > MAX_DEFINITION:
         raise CannotDecode(f"its definition of {len(definition):,} bytes is too long")
@@ -84,7 +84,7 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
     try:
         files = {file.name: file for file in FileDescriptorSet.FromString(definition).file}
         order = TopologicalSorter({name: file.dependency for name, file in files.items()})
-        for file in order.static_order():  # a file comes after those that it needs
+        for file in order.static_order():  # dependencies first
             if file in files:
                 pool.Add(files[file])
         pool.FindMessageTypeByName(name)
@@ -101,7 +101,7 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
 
 
 class ProtobufParser:
-    """Values of parsed protobuf messages."""
+    """Parses protobuf messages and reads their values."""
 
     def __init__(self, kind: ProtobufType) -> None:
         self._class = kind.message_class

@@ -1,9 +1,10 @@
-"""Messages parsed one by one, then laid out in columns: JSON and protobuf.
+"""Decodes JSON and protobuf: parses messages one by one, then puts their values into columns.
 
-JSON has its fields by JSON Schema; where the schema does not describe a place (or is missing), the
-channel's first messages do. JSON does not tell 0 from 0.0: seen numbers are float64, except
-integers that only int64 can hold. A message that lacks a wanted field, or has another kind of value
-there, is counted as undecodable; a null is NaN where a number should be.
+The fields of JSON messages come from a JSON Schema; where the schema is missing or does not define
+a value, the channel's first messages do. JSON does not distinguish 0 from 0.0: a number without a
+schema is float64, unless there are integers that only int64 represents. A message that lacks a
+wanted field, or has another kind of value there, counts as undecodable. A null instead of a number
+becomes NaN.
 """
 
 from __future__ import annotations
@@ -36,32 +37,32 @@ from restock.ingest.decoding.columns import (
     offsets_of,
 )
 
-BYTES_AT_ONCE = 1 << 20  # of payloads that are parsed, and so objects, at the same time
+BYTES_AT_ONCE = 1 << 20  # of payloads that exist as parsed objects at the same time
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """Decoded batch: columns of the good rows, and why the others failed."""
+    """A decoded batch: columns of the good rows, and why the others failed."""
 
-    rows: NDArray[np.intp]  # (G,) of the batch
+    rows: NDArray[np.intp]  # (G,) good rows of the batch
     fields: dict[str, FieldColumn]  # (G, …) each
     bad: dict[str, int]  # reason -> messages
 
 
 class Decoder(Protocol):
-    """Some fields of one channel's messages, a batch at a time."""
+    """Decodes some fields of one channel's messages, a batch at a time."""
 
     def empty(self) -> dict[str, FieldColumn]:
-        """Return columns without a row."""
+        """Return columns without rows."""
         ...
 
     def decode(self, batch: MessageBatch) -> Decoded:
-        """Decode a batch to columns, counting messages that do not decode by reason."""
+        """Decode a batch to columns; count messages that cannot be decoded, by reason."""
         ...
 
 
 class Unparsable(Exception):
-    """A message that is not what it should be; the reason names no value of it."""
+    """A message that does not fit its type. The reason, by which it is counted, has no values."""
 
 
 class Parser(Protocol):
@@ -72,7 +73,7 @@ class Parser(Protocol):
         ...
 
     def member(self, message: Any, field: FieldType) -> Any:
-        """Return the value of one field; that of a repeated field has a length and is iterable."""
+        """Return the value of one field; for a repeated field, a sized iterable."""
         ...
 
     def stamp_ns(self, value: Any) -> int:
@@ -95,11 +96,11 @@ class ParsedDecoder:
         self._parser, self._leaves = parser, tuple(leaves)
 
     def empty(self) -> dict[str, FieldColumn]:
-        """Return columns without a row."""
+        """Return columns without rows."""
         return self._columns([])
 
     def decode(self, batch: MessageBatch) -> Decoded:
-        """Decode a batch to columns, counting messages that do not decode by reason."""
+        """Decode a batch to columns; count messages that cannot be decoded, by reason."""
         parts, rows, bad = [self.empty()], list[int](), Counter[str]()
         for some in _slices(batch):
             messages, good = list[Any](), list[int]()
@@ -113,7 +114,7 @@ class ParsedDecoder:
             try:
                 parts.append(self._columns(messages))
                 rows += good
-            except Unparsable:  # whose it was is not known: one by one
+            except Unparsable:  # it is unknown which message it was: take them one by one
                 for row, message in zip(good, messages, strict=True):
                     try:
                         parts.append(self._columns([message]))
@@ -185,7 +186,7 @@ LARGEST = 64 << 20  # bytes of a message; as objects it takes some thirty times 
 MAX_SCHEMA = 4 << 20
 EXACT = 1 << 53  # up to here float64 holds every integer
 
-# Members by which an object is a time or a duration: seconds, nanoseconds.
+# An object with exactly these two members, seconds and nanoseconds, is a time or a duration.
 TIMES = (("sec", "nsec"), ("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"))
 _KINDS = {"boolean": "bool", "integer": "int64", "number": "float64", "string": "string"}
 
@@ -194,13 +195,13 @@ Sample = Callable[[], Iterable[bytes]]
 
 @dataclass
 class Node:
-    """Knowledge about the values at one place of the messages."""
+    """What is known about the values at one path of the messages."""
 
-    seen: Counter[str] = field(default_factory=Counter)  # JSON Schema's kinds; null is left out
+    seen: Counter[str] = field(default_factory=Counter)  # values by JSON Schema's kind, except null
     members: dict[str, Node] = field(default_factory=dict)  # of objects
     items: Node | None = None  # of arrays
-    declared: bool = False  # by the schema: what is seen changes nothing
-    widest: int = 0  # of the integers seen
+    declared: bool = False  # the schema defines it, whatever the messages have
+    widest: int = 0  # largest magnitude of the integers seen
 
     @property
     def kind(self) -> str | None:
@@ -220,7 +221,7 @@ class JsonType(MessageType):
     """
 
     name: str
-    source: str  # "embedded", or "inferred" where there is no schema
+    source: str  # "embedded", or "inferred" without a schema
     schema: bytes
     sample: Sample  # the channel's first messages
     _root: Node = field(init=False)
@@ -238,7 +239,7 @@ class JsonType(MessageType):
                     try:
                         _observe(root, parse(payload), 0)
                     except Unparsable:
-                        continue  # counted when it is read
+                        continue  # counted when the message is read
             self._fields = {}
             _Fields(self._fields).add(self.name, root)
         return self._fields.get(name, [])
@@ -256,7 +257,7 @@ def parse(payload: bytes) -> dict[str, Any]:
         try:
             value = msgspec.json.decode(payload)
         except msgspec.DecodeError:
-            # Not in the standard, and yet written by Python and read by it.
+            # NaN and Infinity are not in the standard, but Python writes and reads them.
             if b"NaN" not in payload and b"Infinity" not in payload:
                 raise
             value = json.loads(payload)
@@ -270,7 +271,7 @@ def parse(payload: bytes) -> dict[str, Any]:
 
 
 class _Schema:
-    """A JSON Schema's document, as far as it describes which values are where."""
+    """Reads a JSON Schema, as far as it defines which fields there are and their kinds."""
 
     def __init__(self, text: bytes) -> None:
         if len(text) > MAX_SCHEMA:
@@ -289,7 +290,7 @@ class _Schema:
         if self._count > MAX_FIELDS:
             raise CannotDecode(f"its definition has more than {MAX_FIELDS:,} fields")
         if isinstance(schema, dict) and isinstance(target := schema.get("$ref"), str):
-            if target in within:  # its paths have no end: they are left out
+            if target in within:  # it contains itself: its endless paths are left out
                 return Node(declared=True)
             return self._node(self._at(target), depth, within | {target})
         if not isinstance(schema, dict) or depth >= DEEPEST:
@@ -304,13 +305,13 @@ class _Schema:
             }
         if node.seen["array"] and "items" in schema:
             node.items = self._node(schema["items"], depth + 1, within)
-        # A place where several kinds may be is what is seen there.
+        # If several kinds are allowed, the messages decide.
         node.declared = len(node.seen) == 1
         node.seen = node.seen if node.declared else Counter()
         return node
 
     def _at(self, target: str) -> Any:
-        """Follow a reference within the document; others describe nothing."""
+        """Follow a reference within the document; None for other references."""
         place = self._document if target.startswith("#") else None
         for part in target.split("/")[1:]:
             place = place.get(part) if isinstance(place, dict) else None
@@ -318,7 +319,7 @@ class _Schema:
 
 
 def _complete(node: Node) -> bool:
-    """Return whether the schema describes everything, members and array items included."""
+    """Return whether the schema defines everything, members and array items included."""
     if not node.declared or (node.kind == "object" and not node.members):
         return False
     if node.kind == "array" and (node.items is None or not _complete(node.items)):
@@ -327,7 +328,7 @@ def _complete(node: Node) -> bool:
 
 
 def _observe(node: Node, value: Any, depth: int) -> None:
-    """Add what this value shows."""
+    """Count the kind of a value, and of the values inside it."""
     if depth > DEEPEST or value is None or (node.declared and not node.seen):
         return
     if isinstance(value, dict):
@@ -352,7 +353,7 @@ def _observe(node: Node, value: Any, depth: int) -> None:
 
 
 class _Fields:
-    """Turns nodes to fields. A place where nothing was seen gives no field."""
+    """Turns nodes into fields. A node without a known kind gives no field."""
 
     def __init__(self, fields: dict[str, list[FieldType]]) -> None:
         self._fields = fields
@@ -364,7 +365,7 @@ class _Fields:
             self._count += 1
             if self._count > MAX_FIELDS:
                 raise CannotDecode(f"its messages have more than {MAX_FIELDS:,} fields")
-            # A path could not tell such a name from its own dots and brackets.
+            # In a path, dots and brackets of a name would be ambiguous.
             if member and member.isprintable() and "." not in member and "[]" not in member:
                 made = self._field(f"{name}.{member}", member, inner, None)
                 fields += [made] if made else []
@@ -398,7 +399,7 @@ def _base(node: Node) -> str | None:
 
 
 class JsonParser:
-    """Values of parsed JSON messages."""
+    """Parses JSON messages and reads their values."""
 
     def parse(self, payload: bytes) -> Any:
         return parse(payload)
