@@ -1,1 +1,1 @@
-"""A running robot: messages as they come, the policy's command, the ROS 2 node around them."""
+"""A running robot: observations from live messages, the policy's decisions, the ROS 2 node."""

@@ -1,15 +1,15 @@
-"""The ROS 2 node: a lifecycle node that drives by an exported policy, or says what it would drive.
+"""A ROS 2 lifecycle node that drives by an exported policy, or reports what it would drive.
 
 Unconfigured, it has no policy. Configured (inactive), it listens, decides and reports on
 /diagnostics, but publishes no commands. Active, it publishes commands; in shadow mode it only
-publishes what they would have been. It publishes a stop if an input cannot be relied on, its timer
-stalls (a steady clock watches it), or it is deactivated or shut down; while a person drives,
-nothing.
+publishes what they would have been. It publishes a stop if an input is unreliable, if its timer
+stalls (a steady clock watches it), or if it is deactivated or shut down. While a person drives, it
+publishes no commands.
 
-A recording of its topics has the limiter's rule, the proposed action and what would have been
-driven as columns (`limiter_rule`, `shadow_action`, `shadow_speed_mps`, `shadow_yaw_rate_radps`),
-null in recordings without a node. The exposure `limited` labels the steps at which the limiter held
-a command back.
+In a recording of its topics, the limiter's rule, the proposed action and the command that it would
+have sent become columns (`limiter_rule`, `shadow_action`, `shadow_speed_mps`,
+`shadow_yaw_rate_radps`), which are null without the node. The exposure `limited` labels the steps
+at which the limiter held a command back.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ACTION, LIMITER = "/restock/action", "/restock/limiter"
 TAKEOVER = "/restock/takeover"
 BEHAVIOUR = "/behaviour_policy"
 STRING = "std_msgs/msg/String"
-TWISTS = {  # message type -> where speed and yaw rate are in it
+TWISTS = {  # message type -> field paths of speed and yaw rate
     "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
     "geometry_msgs/msg/TwistStamped": ("twist.linear.x", "twist.angular.z"),
 }
@@ -49,23 +49,23 @@ TWISTS = {  # message type -> where speed and yaw rate are in it
 
 @dataclass(frozen=True)
 class CommandForm:
-    """A type of command, and where it says what."""
+    """The topic and type of a command, and the fields of speed and turn."""
 
     topic: str
     type: str
     speed: str  # field paths
     turn: str
-    wheelbase_m: float | None = None  # `turn` is a steering angle
+    wheelbase_m: float | None = None  # if set, `turn` is a steering angle
 
     @classmethod
     def of(cls, profile: Profile, topic: str = "", kind: str = "") -> CommandForm:
         """Return the form of a robot's command; `topic` and `kind` replace the profile's.
 
         Raises:
-            ConfigError: a type that the profile does not read and that is no twist.
+            ConfigError: `kind` is neither the profile's command nor a twist.
         """
         command = profile.inputs.command
-        measured = is_motion(command.type)  # its commands were not recorded
+        measured = is_motion(command.type)  # commands were not recorded
         topic = topic or ("/cmd_vel" if measured else command.topic)
         kind = kind or ("geometry_msgs/msg/Twist" if measured else command.type)
         if kind == command.type:
@@ -80,7 +80,7 @@ class CommandForm:
         return cls(topic, kind, *TWISTS[kind])
 
     def fill(self, message: Any, speed_mps: float, yaw_rate_radps: float) -> Any:
-        """Write this command into the message; a value that is not finite becomes a stop."""
+        """Write a command into the message; write a stop if a value is not finite."""
         turn = yaw_rate_radps
         if not (math.isfinite(speed_mps) and math.isfinite(turn)):
             speed_mps = turn = 0.0
@@ -96,7 +96,7 @@ class CommandForm:
 
 
 def with_node_topics(profile: Profile) -> Profile:
-    """Return the profile with inputs for what the node published beside the robot's own topics."""
+    """Return the profile with inputs from the node's topics, besides the robot's own."""
     form = CommandForm.of(profile)
     age_s = 2 * profile.task.control_period_s
 
@@ -137,9 +137,9 @@ def with_node_topics(profile: Profile) -> Profile:
 
 
 def quality(ros: Any, depth: int, *, reliable: bool = True, latched: bool = False) -> Any:
-    """Return a quality of service; one that is not reliable matches whatever a publisher offers.
+    """Return a quality of service; without `reliable` it matches every publisher's.
 
-    A latched one also gives late subscribers the last message.
+    With `latched`, late subscribers also get the last message.
     """
     reliability, durability = ros.ReliabilityPolicy, ros.DurabilityPolicy
     return ros.QoSProfile(
@@ -150,12 +150,12 @@ def quality(ros: Any, depth: int, *, reliable: bool = True, latched: bool = Fals
 
 
 def load_ros() -> SimpleNamespace:
-    """Import rclpy of the ROS 2 that is sourced (Jazzy or later), and its classes by their names.
+    """Import rclpy of the sourced ROS 2 (Jazzy or later), and return its classes by name.
 
-    `get_message` gives the class of a message type.
+    `get_message` returns the class of a message type.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: rclpy cannot be imported.
     """
     names = {
         "rclpy.lifecycle": ("LifecycleNode", "TransitionCallbackReturn"),
@@ -189,41 +189,41 @@ def _message_class(kind: str) -> Any:
 
 DIAGNOSTICS_S = 1.0
 DISCOVERY_S = 1.0
-MAX_AHEAD_S = 0.2  # of a stamp to the node's clock: simulators publish /clock at 10 Hz and more
-ACKED_S = 0.5  # a listener that hangs holds a last stop back at most this long, per topic
-WAKE_S = 0.2  # a signal is heard after at most this time
+MAX_AHEAD_S = 0.2  # of a stamp to the node's clock: simulators publish /clock at 10 Hz or more
+ACKED_S = 0.5  # longest wait per topic for a subscriber that hangs to get the last stop
+WAKE_S = 0.2  # SIGINT and SIGTERM are handled within this time
 NAME = "restock_policy"
 
 
 class PolicyNode:
-    """Behaviour of a lifecycle node in its transitions; `node` is an rclpy LifecycleNode."""
+    """What a lifecycle node does in its transitions; `node` is an rclpy LifecycleNode."""
 
     def __init__(self, ros: Any, node: Any, policy: Path, *, drive: bool = False) -> None:
         self.ros, self.node = ros, node
         self.pilot: Pilot | None = None
         self.active = False
         self._watch_group = ros.MutuallyExclusiveCallbackGroup()
-        self._commanding = threading.Lock()  # nothing is commanded after the last stop
-        self._decided_s = math.inf  # by the steady clock
+        self._commanding = threading.Lock()  # so that no command follows the last stop
+        self._decided_s = math.inf  # time of the last decision, by the steady clock
         self._said = ""  # who drives, as last published
         self._classes: dict[str, Any] = {}
         self._published: dict[str, Any] = {}
         self._reports: Any = None
-        self._subscriptions: dict[str, Any] = {}  # best effort, which any publisher matches
-        self._latched: dict[str, Any] = {}  # second ones, while a publisher latches
-        self._latching: dict[str, Any] = {}  # topics that a publisher may latch, with their classes
+        self._subscriptions: dict[str, Any] = {}  # best effort, which matches any publisher
+        self._latched: dict[str, Any] = {}  # additional ones, while a publisher latches
+        self._latching: dict[str, Any] = {}  # topic that a publisher may latch -> its class
         self._timers: list[Any] = []
         self._parameter("policy", str(policy))
         self._parameter("profile", "")
         self._parameter("shadow", not drive)
         self._parameter("limiter", True)
-        self._parameter("cmd_vel_topic", "")  # these: the profile's
+        self._parameter("cmd_vel_topic", "")  # "" in both: the profile's
         self._parameter("cmd_vel_type", "")
 
     # -- transitions ----------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Read the policy, and make publishers, subscriptions and timers.
+        """Read the policy, and create publishers, subscriptions and timers.
 
         Raises:
             RestockError: the policy or a parameter cannot be used.
@@ -272,7 +272,7 @@ class PolicyNode:
         }
         self._latching = {topic: heard[topic] for topic in sorted(pilot.latched)}
         self._match_latched()
-        # Control ticks by the node's clock, which use_sim_time sets; the rest by a steady one.
+        # Control ticks are by the node's clock, which obeys use_sim_time; the rest by a steady one.
         steady = self.ros.Clock(clock_type=self.ros.ClockType.STEADY_TIME)
         self._timers = [
             self.node.create_timer(task.control_period_s, self._tick),
@@ -286,12 +286,12 @@ class PolicyNode:
         self._log(f"{policy.path}: profile {profile.name}, task {task.hash}, {mode}")
 
     def activate(self) -> None:
-        """Start to publish; the lifecycle publishers must be enabled."""
+        """Start to publish; the lifecycle publishers must be enabled already."""
         self._decided_s, self.active = time.monotonic(), True
         self._say(self._own())
 
     def deactivate(self) -> None:
-        """Stop, and publish nothing from here on; the lifecycle publishers are still enabled."""
+        """Publish a stop, then nothing more; the lifecycle publishers must still be enabled."""
         with self._commanding:
             if self.active and self._drives():
                 self._command(0.0, 0.0)
@@ -301,17 +301,17 @@ class PolicyNode:
             self.active = False
 
     def _await_delivery(self) -> None:
-        """Wait until the listeners have the stop: what is unsent is lost with its publisher."""
+        """Wait until subscribers have the stop, as unsent messages are lost with the publisher."""
         for name in ("command", "behaviour"):
             try:
                 acked = self._published[name].wait_for_all_acked(self.ros.Duration(seconds=ACKED_S))
-            except RuntimeError:  # this middleware cannot say
+            except RuntimeError:  # this middleware does not support it
                 continue
             if not acked:
                 self._log(f"last {name}: not all who listen had it within {ACKED_S:g} s")
 
     def cleanup(self) -> None:
-        """Take down what `configure` made."""
+        """Destroy what `configure` created."""
         self.deactivate()
         self.pilot = None
         for timer in self._timers:
@@ -331,9 +331,10 @@ class PolicyNode:
         return self.node.create_subscription(kind, topic, partial(self._receive, topic), qos)
 
     def _match_latched(self) -> None:
-        """Ask for the last message of a topic while a publisher keeps it, whenever that starts.
+        """Subscribe to a topic's last message while a publisher latches it.
 
-        Asked for it, a publisher that keeps none sends nothing, and both sides warn.
+        A publisher that does not latch would send nothing to such a subscription, and both would
+        log a warning.
         """
         keeps = self.ros.DurabilityPolicy.TRANSIENT_LOCAL
         for topic, kind in self._latching.items():
@@ -370,7 +371,7 @@ class PolicyNode:
             self._command(*((0.0, 0.0) if late else decision.command))
 
     def _publish_shadow(self, decision: Decision) -> None:
-        """Publish what it would do and why, for the log, whoever drives."""
+        """Publish what it would do and why, to be recorded, whoever drives."""
         rule = self._classes["limiter"]()
         rule.data = decision.rule
         self._published["limiter"].publish(rule)
@@ -382,7 +383,7 @@ class PolicyNode:
             self._published["proposal"].publish(self._filled("proposal", *decision.proposal))
 
     def _watch(self) -> None:
-        """Publish a stop if control ticks no longer come: a hanging decision or stopped clock."""
+        """Publish a stop if ticks stop coming, because a decision hangs or the clock stands."""
         with self._commanding:
             if not self.active or self.pilot is None:
                 return
@@ -392,7 +393,7 @@ class PolicyNode:
                     self._command(0.0, 0.0)
 
     def _drives(self) -> bool:
-        """Return whether its commands are the robot's."""
+        """Return whether its commands drive the robot."""
         return (
             not self.shadow and self.pilot is not None and not self.pilot.taken_over(self._now_ns())
         )
@@ -465,16 +466,16 @@ class PolicyNode:
             self.node.declare_parameter(name, default)
 
     def _number(self, name: str) -> float | None:
-        """Return a number that may be given in place of the profile's; below 0 means not given."""
+        """Return a parameter that replaces a number of the profile; None if it is negative."""
         self._parameter(name, -1.0)
         value = float(self._value(name))
-        return None if value < 0 else value  # 0 and NaN are refused where they are no limit
+        return None if value < 0 else value  # the caller refuses 0 and NaN
 
     def _value(self, name: str) -> Any:
         return self.node.get_parameter(name).value
 
     def _limits(self, policy: PolicyFile) -> Limits | None:
-        """Return the limits by parameters `limiter_…`, else by the profile."""
+        """Return the limits from parameters `limiter_…`, or else the profile; None: no limiter."""
         profile = policy.profile
         limits = {} if profile.limiter is None else msgspec.structs.asdict(profile.limiter)
         for name in Limiter.__struct_fields__:
@@ -499,10 +500,10 @@ class PolicyNode:
 
 
 def lifecycle_node(ros: Any, policy: Path, *, drive: bool = False) -> Any:
-    """Make the node, unconfigured.
+    """Create the node, unconfigured.
 
-    Its transitions return SUCCESS, or FAILURE if it cannot be configured: it then stays
-    unconfigured and says why.
+    Its transitions return SUCCESS. If it cannot be configured, it logs the reason, returns FAILURE
+    and stays unconfigured.
     """
     returned = ros.TransitionCallbackReturn
 
@@ -514,7 +515,7 @@ def lifecycle_node(ros: Any, policy: Path, *, drive: bool = False) -> Any:
         def on_configure(self, state: Any) -> Any:
             try:
                 self.policy.configure()
-            except Exception as error:  # noqa: BLE001  (rclpy would say nothing of it)
+            except Exception as error:  # noqa: BLE001  (rclpy would not report it)
                 self.get_logger().error(f"cannot be configured: {error}")
                 self.policy.cleanup()
                 return returned.FAILURE
@@ -549,17 +550,17 @@ def lifecycle_node(ros: Any, policy: Path, *, drive: bool = False) -> Any:
 
 
 def run_node(ros: Any, policy: Path, *, drive: bool = False, activate: bool = False) -> int:
-    """Spin the node until SIGINT or SIGTERM; it stops the robot before it goes. Returns 0."""
+    """Spin the node until SIGINT or SIGTERM; stop the robot before it ends. Returns 0."""
     import signal
 
-    # rclpy's own handlers would end the context before a last stop could be published. Waiting for
-    # messages holds Python's back, so the wait is short; a launch may send several.
+    # rclpy's own handlers would end the context before a last stop could be published. Python's run
+    # only after a wait for messages, so the wait is short. A launch may send several signals.
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     ros.rclpy.init(signal_handler_options=ros.SignalHandlerOptions.NO)
     node = lifecycle_node(ros, policy, drive=drive)
-    executor = ros.MultiThreadedExecutor(num_threads=2)  # the watchdog has its own
+    executor = ros.MultiThreadedExecutor(num_threads=2)  # one for the watchdog
     executor.add_node(node)
     try:
         if activate:

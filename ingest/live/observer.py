@@ -1,9 +1,9 @@
-"""The observation on a running robot: messages as they come, by the same code as a recording's.
+"""Computes observations from live messages, with the same code as for recordings.
 
 A recording is read in columns, and all its steps are made at once. On a robot there are only the
 last few messages of each topic and the current tick. Both use the same holds, fills and
-`restock.ingest.task.task.observe`; only the source of the columns differs. `LiveClock` computes
-from the last messages what `align` computes from a whole recording: the median offset.
+`restock.ingest.task.task.observe`; only the source of the columns differs. `LiveClock` computes the
+median offset from the last messages, as `align` does from a whole recording.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from restock.ingest.task.task import Signals, nearest_action, observe
 from restock.ingest.task.task_sql import Past
 from restock.ingest.task.tracks import Tracker
 
-_DELAYS = 200  # of each topic, of which the median counts
+_DELAYS = 200  # last delays of each topic, whose median is used
 
 
 class LiveClock:
-    """Takes the times of stamped messages as they come, in order of log time.
+    """Estimates log time less the robot's time, from stamped messages in the order of log time.
 
-    A message whose stamp is more than `jump_ns` from where the clock has it is off the clock.
+    A message is off the clock if its stamp is more than `jump_ns` from what this offset gives.
     """
 
     def __init__(self, jump_ns: int) -> None:
@@ -47,7 +47,7 @@ class LiveClock:
         self._offset_ns: int | None = 0  # None: to be computed
 
     def receive(self, topic: str, log_time_ns: int, stamp_ns: int) -> bool:
-        """Return whether a message is on the clock; one that is also sets it."""
+        """Return whether a message is on the clock; if so, use it for the offset."""
         if not self.agrees(log_time_ns, stamp_ns):
             return False
         delays = self._delays_ns.setdefault(topic, deque(maxlen=_DELAYS))
@@ -56,13 +56,13 @@ class LiveClock:
         return True
 
     def agrees(self, log_time_ns: int, stamp_ns: int) -> bool:
-        """Return whether a stamp is near the clock; any is before the first message."""
+        """Return whether a stamp is on the clock; before the first message, every stamp is."""
         away_ns = abs(log_time_ns - stamp_ns - self.offset_ns)
         return not self._delays_ns or away_ns <= self._jump_ns
 
     @property
     def offset_ns(self) -> int:
-        """Return log time less the robot's time: that of the topic with the least delay.
+        """Return log time less the robot's time: the median of the topic with the least delay.
 
         It is 0 before the first message.
         """
@@ -72,20 +72,20 @@ class LiveClock:
         return self._offset_ns
 
 
-# No robot acts by these.
+# Inputs that observations do not use.
 PROVENANCE = ("behaviour_policy", "true_condition", "true_exposure", "perturbation")
-_MOST = 2000  # messages of a topic between two ticks
+_MOST = 2000  # limit of a topic's messages that wait for a tick
 
 
 @dataclass(frozen=True)
 class Observed:
-    """Knowledge of the robot at a tick."""
+    """An observation at a tick, and whether it can be used."""
 
     observation: NDArray[np.float32]  # (D,)
     stamp_ns: int  # of the tick on the alignment clock
-    previous_action: int  # in force since the tick before; 0, stop, where there was none
-    problem: str  # why it must not be acted on, or ""
-    signals: Signals  # at the tick, one row each; none where nothing could be observed
+    previous_action: int  # nearest to the command since the last tick; 0 (stop) without one
+    problem: str  # why the robot must not act on it, or ""
+    signals: Signals  # at the tick, one row each; empty if nothing could be observed
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,18 @@ class _Message:
 
 
 class LiveObserver:
-    """Takes messages as they are received, and makes the observation of a tick.
+    """Takes messages as they are received, and computes the observation at a tick.
 
     A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags'). Older
     messages than the last tick needed are dropped, so memory does not grow.
 
     Args:
-        profile: what to take, and how. max_ahead_s: refuse a message whose stamp is ahead of its
-        log time by more. None: accept it, as in a recording, whose log time may be another
-        computer's.
+        profile: which topics to observe, and how.
+        max_ahead_s: refuse messages whose stamp is ahead of their log time by more than this. None:
+            accept them, as in a recording, whose log time may come from another computer.
 
     Raises:
-        ConfigError: the profile takes what is `not_live`.
+        ConfigError: the profile uses something that is `not_live`.
     """
 
     def __init__(self, profile: Profile, max_ahead_s: float | None = None) -> None:
@@ -122,16 +122,16 @@ class LiveObserver:
         for name, source in profile.inputs.items():
             if name not in PROVENANCE:
                 self._inputs.setdefault(source.topic, []).append(source)
-        self.left_out: dict[str, int] = {}  # messages whose stamps are off the clock, per topic
-        self.ahead: dict[str, int] = {}  # … or ahead of log time
+        self.left_out: dict[str, int] = {}  # topic -> messages off the clock
+        self.ahead: dict[str, int] = {}  # topic -> messages ahead of log time
         self._max_ahead_ns = None if max_ahead_s is None else round(max_ahead_s * NS)
         self.reset()
 
     def reset(self) -> None:
-        """Discard all messages: the clock was set, or the robot was moved."""
+        """Discard all messages; needed if the clock was set or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
         self._clock = LiveClock(round(JUMP_S * NS))
-        self._command: _Message | None = None  # the first since the last tick, or the last before
+        self._command: _Message | None = None  # the first since the last tick, or an earlier one
         self._ticked = True
         self._before_ns: int | None = None
         self._tracker = Tracker(self.task) if self.task.tracks else None
@@ -152,8 +152,8 @@ class LiveObserver:
         """Take a message of one of `topics`, received at `log_time_ns`.
 
         Raises:
-            KeyError: the profile takes nothing from this topic.
-            AttributeError, TypeError: it has not the fields of its type; nothing of it is kept.
+            KeyError: the profile does not use this topic.
+            AttributeError, TypeError: it lacks fields of its type. Nothing of it is kept.
         """
         sources = self._inputs[topic]
         paths = dict.fromkeys(path for source in sources for path in field_paths(source))
@@ -166,13 +166,13 @@ class LiveObserver:
         taken = _Message(log_time_ns, stamp_ns, fields)
         if topic != self.profile.inputs.command.topic:
             self._buffers[topic].append(taken)
-            if len(self._buffers[topic]) > _MOST:  # nobody observes
+            if len(self._buffers[topic]) > _MOST:  # nobody calls `observe`
                 del self._buffers[topic][: _MOST // 2]
         elif self._ticked:
             self._command, self._ticked = taken, False
 
     def observe(self, now_ns: int) -> Observed:
-        """Make the observation of a tick at `now_ns`, by the clock of the messages' log times."""
+        """Compute the observation at a tick; `now_ns` is by the clock of the log times."""
         offset_ns = 0 if self.profile.clock.alignment == "log_time" else self.offset_ns
         stamp_ns = now_ns - offset_ns
         ticks = [stamp_ns] if self._before_ns is None else [self._before_ns, stamp_ns]
@@ -214,7 +214,7 @@ class LiveObserver:
         return Observed(nothing, stamp_ns, 0, problem, {})
 
     def _tick(self, stamp_ns: int) -> None:
-        """Let go of what neither this tick holds nor a later one will."""
+        """Drop messages that neither this tick nor a later one needs."""
         self._before_ns, self._ticked = stamp_ns, True
         motion, pose = self.profile.motion, self.profile.inputs.pose
         for topic, messages in self._buffers.items():
@@ -222,7 +222,7 @@ class LiveObserver:
             if known:
                 newest = max(known)
                 if motion is not None and pose is not None and topic == pose.topic:
-                    newest -= round(2 * motion.window_s * NS)  # speeds are of the poses before
+                    newest -= round(2 * motion.window_s * NS)  # earlier poses give the speed
                 self._buffers[topic] = [m for m in messages if m.stamp_ns >= newest]
 
     def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:
@@ -237,7 +237,7 @@ class LiveObserver:
         return columns, Samples(stamps, np.zeros(len(stamps), np.intp))
 
     def _stamp(self, topic: str, message: Any, log_time_ns: int, latched: bool) -> int | None:
-        """Return when a message was measured, on the alignment clock; None, counted, if unknown."""
+        """Return a message's time on the alignment clock; None if it is refused, and count it."""
         if self.profile.clock.alignment == "log_time":
             return log_time_ns
         received_ns = log_time_ns - self.offset_ns
@@ -246,10 +246,10 @@ class LiveObserver:
             return received_ns
         stamp_ns = int(header.stamp.sec) * NS + int(header.stamp.nanosec)
         ahead = self._max_ahead_ns is not None and stamp_ns - log_time_ns > self._max_ahead_ns
-        if latched:  # it may have been published long ago: it does not tell the time
+        if latched:  # it may have been published long ago, so it must not set the clock
             known = not ahead and self._clock.agrees(log_time_ns, stamp_ns)
             return stamp_ns if known else received_ns
-        # One that is ahead would set the clock ahead, and what is held back would look fresh.
+        # A stamp that is ahead would set the clock ahead, and delayed messages would look fresh.
         if not ahead and self._clock.receive(topic, log_time_ns, stamp_ns):
             return stamp_ns
         refused = self.ahead if ahead else self.left_out
@@ -270,7 +270,7 @@ def value_of(message: Any, path: str) -> Any:
 
 
 def _said(message: Any, sources: Sequence[Input]) -> dict[str, FieldColumn]:
-    """Return the fields by which a message says that it has no estimate, as columns of one row."""
+    """Return the fields that mark a message as having no estimate, as columns of one row."""
     rules = (
         rule
         for source in sources
@@ -278,7 +278,7 @@ def _said(message: Any, sources: Sequence[Input]) -> dict[str, FieldColumn]:
         for rule in conventions_of(source.type, path)
         if rule.of_messages
     )
-    with suppress(AttributeError):  # the type of another package, by the same name
+    with suppress(AttributeError):  # another package's type with the same name
         return {path: _column(message, path) for rule in rules for path in rule.fields}
     return {}
 

@@ -1,11 +1,11 @@
-"""Decisions of an exported policy, message by message: observation, proposal, limiter, takeovers.
+"""Decides by an exported policy from live messages: observation, proposal, limiter, takeovers.
 
-`restock export RUN --to onnx` writes the policy. The file holds all that the robot needs: the
+`restock export RUN --to onnx` writes the policy. The file contains all that the robot needs: the
 profile as TOML, with the topics to subscribe to, the observation, actions and limits. Neither ROS
 nor PyTorch is needed: the node, a played recording and the tests all use this module.
 
 The decision is to stop, with a reason, if an input is silent, stale or unreadable, a clock went
-back, no beam of a scan says anything, or the policy's output is not a number.
+back, no beam of a scan is valid, or the policy's output is not a number.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ from restock.ingest.steps.align import NS
 from restock.ingest.task.robot import NONE, RULES, UNKNOWN, Limits, limit
 from restock.ingest.task.task import nearest_action
 
-OPERATORS = ("operator", "teleop", "joystick")  # sources of commands that are people
+OPERATORS = ("operator", "teleop", "joystick")  # command sources that are people
 BOOL = "std_msgs/msg/Bool"
-ACTIVE_S = 0.5  # after the last message of a person's commands
-OTHER_TYPE = (AttributeError, IndexError, TypeError, ValueError)  # reading it raises
+ACTIVE_S = 0.5  # a person drives for this long after their last command
+OTHER_TYPE = (AttributeError, IndexError, TypeError, ValueError)  # raised by reading such messages
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision of the policy at a tick."""
+    """The policy's decision at a tick."""
 
     observed: Observed
-    action: int | None  # that it proposes; None: nothing could be decided
-    proposal: tuple[float, float]  # speed m/s, yaw rate rad/s; stop where there is none
-    command: tuple[float, float]  # what of it may be driven
-    rule: int  # of `restock.ingest.task.robot.RULES`
+    action: int | None  # index of the proposed action; None: nothing could be decided
+    proposal: tuple[float, float]  # speed m/s, yaw rate rad/s; a stop without an action
+    command: tuple[float, float]  # the proposal within the limits
+    rule: int  # index in `restock.ingest.task.robot.RULES`
     reason: str  # why it is a stop, or ""
-    taken_over: bool  # a person drives: it is not to be published
+    taken_over: bool  # a person drives, so the command must not be published
 
 
 class Pilot:
-    """Takes messages as they are received, and decides when it is asked.
+    """Takes messages as they are received, and decides when `decide` is called.
 
     Args:
-        policy: with its profile.
+        policy: the policy, with its profile.
         limits: of the limiter; None: no limiter, but an unknown input still stops the robot.
         takeover_topic: a Bool that is true while a person drives; "": none. The profile's
-            `command_sources` of OPERATORS count as well: a button that is pressed, or commands of
-            the last ACTIVE_S.
-        max_ahead_s: as of `LiveObserver`.
+            `command_sources` in OPERATORS count as well: a pressed button, or commands within the
+            last ACTIVE_S.
+        max_ahead_s: as in `LiveObserver`.
 
     Raises:
         ConfigError: the profile cannot be observed live.
@@ -75,10 +75,10 @@ class Pilot:
         ]
         if takeover_topic:
             self._people.append(Input(takeover_topic, BOOL, {"pressed": "data"}))
-        self._active_ns: dict[str, int | None] = {}  # a person's topic -> when it last said so
+        self._active_ns: dict[str, int | None] = {}  # a person's topic -> when they last drove
         self._now_ns: int | None = None
-        self.counts: Counter[str] = Counter()  # decisions, and each kind of stop and intervention
-        self.unreadable: Counter[str] = Counter()  # messages of another type, by topic
+        self.counts: Counter[str] = Counter()  # of decisions, and of each kind of stop and limit
+        self.unreadable: Counter[str] = Counter()  # topic -> messages of another type
         self._was_taken = False
         self.reason = "no decision yet"  # why the last decision was a stop, or ""
 
@@ -89,13 +89,13 @@ class Pilot:
 
     @property
     def latched(self) -> set[str]:
-        """Return topics whose last message counts at any age, such as goals, plans and maps."""
+        """Return topics whose last message is valid at any age, such as goals, plans and maps."""
         inputs = [source for _, source in self.profile.inputs.items()]
         aging = {source.topic for source in inputs if source.max_age_s is not None}
         return {source.topic for source in inputs} & self.observer.topics.keys() - aging
 
     def receive(self, topic: str, message: Any, now_ns: int) -> None:
-        """Take a message of one of `topics`; one of another type is counted and left out."""
+        """Take a message of one of `topics`; count and ignore one of another type."""
         try:
             for source in self._people:
                 if source.topic == topic:
@@ -122,7 +122,7 @@ class Pilot:
         return False
 
     def decide(self, now_ns: int) -> Decision:
-        """Decide what to do at a tick, by the clock that messages were received by."""
+        """Decide what to do at a tick; `now_ns` is by the same clock as in `receive`."""
         observed, reason = self._observe(now_ns)
         action, proposal = None, (0.0, 0.0)
         if not reason:
@@ -184,11 +184,13 @@ class Played:
     log_time_ns: int
     decision: Decision
     took_s: float
-    drove: int | None  # the action nearest to that command; None: it says none
+    drove: int | None  # the action nearest to that command; None if it cannot be read
 
 
 def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
-    """Decisions just before each command of a recording, its messages in the order of log time.
+    """Play a recording in the order of log time; yield a decision just before its commands.
+
+    A command that comes less than 3/4 of a control period after the last decision gives none.
 
     Raises:
         RecordingError: it cannot be read, or has no commands.
@@ -208,7 +210,7 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
     command, task = profile.inputs.command, profile.task
     period_ns, fired_ns = round(task.control_period_s * NS), None
     try:
-        # Bags of old say nothing of their types: Humble's are taken, as ingest does.
+        # Old bags have no definitions: Humble's are used, as in ingest.
         with AnyReader([recording], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = pilot.topics
             chosen = [c for c in reader.connections if topics.get(c.topic) == c.msgtype]
@@ -240,7 +242,7 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
 
 
 def summary(pilot: Pilot, played: list[Played]) -> dict[str, Any]:
-    """Summarise counts, latency of decisions (ms) and agreement with what drove."""
+    """Summarise counts, latency of decisions (ms) and agreement with the recorded commands."""
     took_ms = np.array([one.took_s for one in played]) * 1e3
     both = [
         (one.decision.action, one.drove)

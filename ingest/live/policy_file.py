@@ -1,11 +1,11 @@
-"""A policy as an ONNX file, and what is checked before ONNX Runtime gets it.
+"""A policy as an ONNX file, and the checks before ONNX Runtime gets it.
 
 A file may come from a stranger, or be damaged. `OnnxFile` reads it with protobuf and refuses what
-a policy network does not need: operators beyond `ONNX_OPERATORS`, subgraphs, weights elsewhere,
-more numbers than the limits allow. The runtime gets only the fields of `_MESSAGES`, so nothing
-unchecked reaches it. A file of Restock's also has a digest of all its bytes.
+a policy network does not need: operators beyond `ONNX_OPERATORS`, subgraphs, weights in other
+files, more numbers than the limits allow. The runtime gets only the fields of `_MESSAGES`, so
+nothing unchecked reaches it. A file written by Restock also has a digest of all its bytes.
 
-The digest finds damage. It is no signature: whoever changes a file can compute it again.
+The digest detects damage. It is not a signature: anyone who changes a file can compute it again.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from restock.process import import_extra
 FORMAT = "restock-policy/2"
 MAX_BYTES = 16 << 20  # of a file: 4 million weights. Parsed, it takes at most .8 GB
 MAX_PARTS = 256  # nodes, constants, metadata entries
-MAX_WIDTH = 1 << 16  # numbers that a node computes of one observation
+MAX_WIDTH = 1 << 16  # numbers that a node computes from one observation
 _TOO_LONG = f"is longer than {MAX_BYTES >> 20} MiB"
-ROWS = "N"  # the first dimension of what is computed from observations
+ROWS = "N"  # first dimension of values that are computed from observations
 _EXPORT = "restock export RUN --to onnx --out policy.onnx"
 _DIGEST = "sha256"
 
-Shape = tuple[int | str, ...]  # (N, k) of what is computed, numbers only of constants
+Shape = tuple[int | str, ...]  # (N, k) of computed values; only numbers for constants
 
 
 class PolicyFile:
     """A policy and its profile.
 
     Raises:
-        ConfigError: no such file, not a policy of Restock, damaged, or its profile cannot be read
-            or is of another task; or the extra `onnx` is not installed.
+        ConfigError: the file does not exist, is not a policy of Restock, or is damaged; its profile
+            cannot be read or defines another task; or the extra `onnx` is not installed.
     """
 
     def __init__(self, path: Path, profile: Path | str | None = None) -> None:
-        """`profile` is a file or a name in place of the profile that the policy carries."""
+        """`profile`, a file or a name, replaces the profile in the policy file."""
         self.path, self._file = path, OnnxFile(path)
         metadata = self._file.metadata
         if not self._file.of_restock:
@@ -71,17 +71,17 @@ class PolicyFile:
     def act(self, observation: F32) -> int | None:
         """Return the best action for an observation (D,); None if its value is not finite."""
         (values,) = self._file.values(observation[None])
-        # Of values that are not numbers the first is the largest: the action would mean nothing.
+        # `argmax` returns the first NaN, an action without meaning.
         action = int(values.argmax())
         return action if np.isfinite(values[action]) else None
 
 
 class OnnxFile:
-    """A checked ONNX model that computes action values (N, A) of observations (N, D).
+    """A checked ONNX model that computes action values (N, A) from observations (N, D).
 
     Raises:
-        ConfigError: no such file, not ONNX, damaged, something in it that a policy network does not
-            need, or the runtime is not installed.
+        ConfigError: the file does not exist, is not ONNX, is damaged or contains something that a
+            policy network does not need; or the runtime is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,10 +101,10 @@ class OnnxFile:
             raise _refusal(path, str(error)) from error
         self._input = model.graph.input[0].name
         self._outputs = [value.name for value in model.graph.output]
-        self._values = ""  # the output to use
+        self._values = ""  # name of the output with action values
         model.DiscardUnknownFields()
         options = runtime.SessionOptions()
-        options.intra_op_num_threads = 1  # a small network: handing it out costs more
+        options.intra_op_num_threads = 1  # the network is too small for more
         options.inter_op_num_threads = 1
         options.log_severity_level = 4
         options.graph_optimization_level = runtime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -132,7 +132,7 @@ class OnnxFile:
             )
 
     def expect(self, task: Task, who: str) -> None:
-        """Raise ConfigError unless it is a policy of the task, which `who` defines."""
+        """Raise ConfigError unless it is a policy for this task, which `who` defines."""
         metadata, again = self.metadata, f"export it again from a run of this task: {_EXPORT}"
         if self.of_restock and metadata.get("task_hash") != task.hash:
             why = f"was made for task {metadata.get('task_hash')}, {who} defines {task.hash}"
@@ -153,20 +153,20 @@ class OnnxFile:
             raise _refusal(self.path, why, again)
         try:
             self.values(np.zeros((1, task.observation_size), np.float32))
-        except Exception as error:  # of the runtime's own classes
+        except Exception as error:  # the runtime has its own classes of errors
             raise _refusal(self.path, f"cannot be run: {first_line(error)}") from error
 
     def values(self, observation: F32) -> F32:
-        """Return action values (N, A) of observations (N, D), once `expect` has passed."""
+        """Return action values (N, A) for observations (N, D); call `expect` before."""
         (values,) = self._session.run([self._values], {self._input: observation})
         return np.asarray(values, np.float32)
 
 
 def with_digest(data: bytes) -> bytes:
-    """Append the digest of a serialised model's bytes to it, as its last metadata entry.
+    """Append the digest of a serialised model to its bytes, as the last metadata entry.
 
     Raises:
-        ValueError: `OnnxFile` would not read it.
+        ValueError: `OnnxFile` would refuse it.
     """
     graph_shapes(_Model.FromString(data))
     if len(data) + len(_digest_entry(b"")) > MAX_BYTES:
@@ -175,7 +175,7 @@ def with_digest(data: bytes) -> bytes:
 
 
 def _digest_entry(data: bytes) -> bytes:
-    # A protobuf message may be continued by appending fields: 75 bytes here, whatever the data.
+    # Appended fields continue a protobuf message: here with 75 bytes, whatever the data.
     entry = {"key": _DIGEST, "value": hashlib.sha256(data).hexdigest()}
     content: bytes = _Model(metadata_props=[entry]).SerializeToString()
     return content
@@ -194,11 +194,11 @@ def _read(path: Path) -> bytes:
 def _refusal(
     path: Path, why: str, remedy: str = f"give a file that `{_EXPORT}` wrote"
 ) -> ConfigError:
-    """Return the error of a file; names in a hostile one may be millions of characters long."""
+    """Return the error about a file; shorten it, as names in a hostile file may be very long."""
     return ConfigError(why[:400], where=str(path), remedy=remedy[:400])
 
 
-# The part of onnx.proto that a policy needs. Fields that are not here never reach the runtime.
+# The part of onnx.proto that a policy needs. Other fields never reach the runtime.
 _MESSAGES = {
     "Model": "1 int64 ir_version, 2 string producer_name, 3 string producer_version, 7 Graph graph,"
     " 8 Opset* opset_import, 14 Entry* metadata_props",
@@ -216,7 +216,7 @@ _MESSAGES = {
     "Shape": "1 Dim* dim",
     "Dim": "1 int64 dim_value, 2 string dim_param",
 }
-_FLOAT, _INT = 1, 2  # of an attribute
+_FLOAT, _INT = 1, 2  # types of attributes
 _TYPES: dict[int, np.dtype[Any]] = {
     1: np.dtype("<f4"),
     7: np.dtype("<i8"),
@@ -243,10 +243,10 @@ _Model = _model_class()
 
 
 def graph_shapes(model: Any) -> dict[str, Shape]:
-    """Return the shape of everything in a model's graph.
+    """Return the shape of every value in a model's graph, by name.
 
     Raises:
-        ValueError: an operator that is not in ONNX_OPERATORS, or more than the limits allow.
+        ValueError: an operator is not in ONNX_OPERATORS, shapes do not fit, or a limit is exceeded.
     """
     graph = model.graph
     if [(opset.domain, opset.version > 0) for opset in model.opset_import] != [("", True)]:
@@ -302,7 +302,7 @@ def graph_shapes(model: Any) -> dict[str, Shape]:
 
 
 def _constant(tensor: Any) -> NDArray[Any]:
-    """Return the numbers of a tensor, all in the file and finite; a scalar may be -inf."""
+    """Return a tensor's numbers, which must be in the file and finite (a scalar may be -inf)."""
     kind, dims = _TYPES.get(tensor.data_type), tuple(tensor.dims)
     if kind is None or len(dims) > 2 or min(dims, default=1) < 1:
         raise ValueError(f"has {tensor.name!r}: neither a matrix nor a vector of float32 or int64")
@@ -315,8 +315,9 @@ def _constant(tensor: Any) -> NDArray[Any]:
     return value
 
 
-# What computes the shape of a node's output from its inputs' shapes, its attributes, and the
-# values of those inputs that are constants. ValueError or IndexError: the inputs do not fit.
+# A function that computes the shape of a node's output from the shapes of its inputs, its
+# attributes, and the values of its inputs (None unless constant). It raises ValueError or
+# IndexError if the inputs do not fit.
 Rule = Callable[[Sequence[Shape], Mapping[str, float], Sequence[NDArray[Any] | None]], Shape]
 
 
@@ -335,7 +336,7 @@ def _broadcast(shapes: Sequence[Shape], settings: Mapping[str, float], values: A
 
 
 def _product(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
-    """Return the shape of (N, k) @ (k, m) [+ (m,)], the second of which may be transposed."""
+    """Return the shape of (N, k) @ (k, m) [+ (m,)]; the second matrix may be transposed."""
     (rows, inner), (taken, width) = shapes[0], shapes[1][:: -1 if settings.get("transB") else 1]
     if inner != taken or settings.get("transA") or (len(shapes) == 3 and shapes[2] != (width,)):
         raise ValueError
@@ -350,7 +351,7 @@ def _reduced(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any
     return (shapes[0][0], 1) if settings.get("keepdims", 1) else shapes[0][:1]
 
 
-ONNX_OPERATORS: dict[str, Rule] = {  # all that a policy may have
+ONNX_OPERATORS: dict[str, Rule] = {  # all operators that a policy may have
     "Gemm": _product,
     "MatMul": _product,
     "LayerNormalization": _same,
