@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Choose on the situation: use a stratum for the exposure in the row in place of this condition's (`[each_condition]` with `kind = "exposure"` does so for all), so that episodes that handled it well are replayed, too.
--- doc: Conditions whose episodes succeed much less often than all episodes in the same situation (the exposure that most of them met): a stratum of them is chosen on its outcome.
+-- advice: Replace this condition's stratum by one for the row's exposure (`[each_condition]` with `kind = "exposure"` does so for all), so that episodes that handled the situation well are replayed, too.
+-- doc: Conditions whose episodes succeed much less often than all episodes in the same situation (an exposure that most of them met): a stratum for such a condition selects rows by their outcome.
 SELECT
     condition,
     exposure,

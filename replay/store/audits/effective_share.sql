@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: run.fed
--- advice: Too few rows: ingest more of it, let the twin drive more of it (practice), lower its share, or raise max_replays_per_row. Undone by weights: change its correction in the mixture.
--- doc: Strata of which the run's critic was fed less than half of their quota, over all its batches; and strata of the logs whose share of the gradient, after weights, was smaller than their share of the panel's rows, although they were drawn at least as often.
+-- advice: If rows are too few: ingest more of them, let the twin drive more of them (practice), lower the stratum's share, or raise max_replays_per_row. If weights undid the draws: change the stratum's correction in the mixture.
+-- doc: Strata with less than half of their quota in the run's batches; and strata of the logs whose share of the gradient, after weights, was smaller than their share of the panel's rows, although they were drawn at least as often.
 WITH intervals AS (
     SELECT *, sum(drawn_rows) OVER (PARTITION BY gradient_steps, phase) AS fed_rows
     FROM run.fed

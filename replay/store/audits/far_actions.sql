@@ -1,5 +1,5 @@
 -- severity: info
--- advice: Here the robot did not do what the row says: add an action, or leave out such rows with the mixture's `where`.
+-- advice: In such rows the command differs from the row's action: add an action to the task, or leave the rows out with the mixture's `where`.
 -- doc: Behaviour policies whose commands are often far from all discrete actions.
 SELECT
     behaviour_policy,

@@ -1,6 +1,6 @@
 -- severity: info
 -- advice: Their successes are not counted. Returns and actions can be learned from, but returns say little about the driver, as the goal was set afterwards to where the robot arrived. Record the goal topic if there is one.
--- doc: Recordings whose goals are where the robot arrived, as none were recorded: every mission arrives by construction.
+-- doc: Recordings without recorded goals: each goal was set to where the robot arrived, so every mission arrives by construction.
 SELECT
     source_file,
     recording_id,

@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: These rows do not tell what other actions lead to, so a policy cannot learn them: ingest drives that turn and stop, or check `actions` of the profile against the commands.
+-- advice: These rows do not show what other actions lead to, so a policy cannot learn it: ingest drives that turn and stop, or compare `actions` in the profile with the recorded commands.
 -- doc: Recordings in which (almost) all rows have the same action.
 SELECT recording_id, source_file, action, name AS action_name, rows, rows / of_recording AS share
 FROM (

@@ -1,6 +1,6 @@
 -- severity: info
--- advice: Of one robot, they hold what happened in that time twice: take one out with `restock store remove STORE RECORDING`. Of several, tell them apart with `restock ingest RECORDING --tag robot=…`: [tags] in docs/ingest.md.
--- doc: Recordings of one robot, or of one profile where no tag names the robot, that cover the same time as an earlier one, by log time.
+-- advice: If one robot recorded both, the store has that time twice: remove one with `restock store remove STORE RECORDING`. If they are from several robots, tag them with `restock ingest RECORDING --tag robot=…`: [tags] in docs/ingest.md.
+-- doc: Recordings of one robot (of one profile, if no tag names the robot) that cover the same log time as an earlier recording.
 WITH beside AS (
     SELECT
         recording_id,

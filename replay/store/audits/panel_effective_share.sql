@@ -1,6 +1,6 @@
 -- severity: error
 -- needs: panel
--- advice: Its correction undoes its quota: set unit = "episode" or [correction] post = "density_ratio" in the mixture, or "none".
+-- advice: The stratum's correction undoes its quota: set unit = "episode" in the mixture, or [correction] post = "density_ratio" or "none".
 -- doc: Strata of the panel whose share of the gradient, after weights, is smaller than in the plain logs, although they are drawn at least as often; or whose own correction reduces it further.
 WITH of_source AS (
     SELECT

@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: panel
--- advice: Audit the panel with the store, or the version of it, that it was made from (`STORE@VERSION`; a panel's `panel.json` names both), or mix it again from this one.
--- doc: Recordings of the panel of which rows are not in this store: it was made from another store, or from a version that held more. Rows of a mixture's other stores do not count.
+-- advice: Audit the panel with the store and version that it was made from (`STORE@VERSION`; the panel's `panel.json` names both), or mix the panel again from this store.
+-- doc: Recordings of the panel with rows that are not in this store: the panel was made from another store, or from a version with more rows. Rows from a mixture's other stores do not count.
 WITH drawn AS (
     SELECT recording_id, transition_id
     FROM panel.rows

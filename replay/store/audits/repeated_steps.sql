@@ -1,5 +1,5 @@
 -- severity: error
--- advice: A bag and a part of it, a differently cut copy, or the same drive recorded twice were both ingested: take one of the two out with `restock store remove STORE RECORDING`, or these steps count twice.
+-- advice: A bag and a part of it, a differently cut copy, or the same drive recorded twice were both ingested: remove one of the two with `restock store remove STORE RECORDING`, or these steps count twice.
 -- doc: Recordings that contain the same steps as another one: equal action, observation and pose, at one constant shift of their clocks (`repeated_rows`).
 SELECT
     repeated.same_as AS recording_id,

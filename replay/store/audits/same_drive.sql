@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: One drive, or the `share` of it, was probably recorded twice (replayed, cut, or read with another profile): take one of the two out with `restock store remove STORE RECORDING`, or those steps count twice.
+-- advice: This drive, or `share` of it, was probably recorded twice (replayed, cut, or read with another profile): remove one of the two with `restock store remove STORE RECORDING`, or those steps count twice.
 -- doc: Recordings with the same commands and wheel speeds as another one, at one constant shift of their clocks, whatever their profiles use as pose, goal and actions.
 SELECT
     one.recording_id,

@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: The logs contain only this policy's actions here: what other actions lead to must come from the twin.
+-- advice: In this condition, the logs have only this policy's actions: explore other actions in the twin.
 -- doc: Conditions that one behaviour policy drove (almost) alone.
 SELECT condition, behaviour_policy, rows, rows / of_condition AS share
 FROM (

@@ -1,6 +1,6 @@
 -- severity: warning
 -- advice: If only conditions changed, run `restock store label STORE --profile PROFILE`; otherwise ingest these recordings again.
--- doc: Recordings that were labelled or read with another version of the conditions or the profile than the newest ingest with a profile of that name.
+-- doc: Recordings with another version of the conditions or of the profile than the newest ingest with a profile of the same name.
 WITH newest AS (
     FROM recordings
     QUALIFY row_number() OVER (PARTITION BY profile ORDER BY ingested_at DESC, ingest_id) = 1

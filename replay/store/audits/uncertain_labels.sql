@@ -1,6 +1,6 @@
 -- severity: info
--- advice: Leave such rows out of strata, let people review them (restock store label --review), or log a better sensor.
--- doc: Conditions with a large share of uncertain rows, by their probability, among all rows that are labelled or uncertain.
+-- advice: Leave such rows out of strata, let people review them (`restock review STORE`), or log a better sensor.
+-- doc: Conditions with an uncertain probability in a large share of the rows that are labelled or uncertain.
 WITH doubted AS (
     SELECT
         condition,
