@@ -158,7 +158,7 @@ def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
         return StoreError(
             "cannot be written: there is no space left on its disk",
             where=str(place),
-            remedy="free some space, then run the same command again: what the store has is kept",
+            remedy="free some space, then run the same command again: no stored data is lost",
         )
     # Delta's library puts the cause on the last line, after an arrow.
     causes = [line.rsplit("↳\x1b[0m ")[-1].strip() for line in said.splitlines() if "↳" in line]
@@ -462,7 +462,7 @@ class TableCommits(StoreReader):
                 raise StoreError(
                     f"recording {recording} was ingested again or removed in the meantime",
                     where=str(self.path),
-                    remedy="try again; the store is in the state after that",
+                    remedy="try again; the store keeps the result of the other command",
                 )
 
     def again_on_conflict(self, work: Callable[[], T]) -> T:

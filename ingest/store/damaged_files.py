@@ -177,7 +177,7 @@ def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
     if len(damaged) > 1:
         count = counted(len(damaged) - 1, "more file")
         more = f"; `restock store verify {quoted(place)}` lists {count}"
-    why = "cannot be read: it was cut, or a page does not match its checksum"
+    why = "cannot be read: it is truncated, or a page does not match its checksum"
     if damaged[0] not in _stamps(place):
         why = "is missing"
     return StoreError(

@@ -129,7 +129,7 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
     files = [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
     if damaged := next((path for path, *_ in files if "\0" in path), None):
         raise StoreError(
-            f"its log names a file that cannot be: {damaged}",
+            f"its log names an impossible file: {damaged}",
             where=table.table_uri,
             remedy="restore the newest commits of its _delta_log from a copy",
         )
@@ -158,7 +158,7 @@ def damage_named(place: Location, path: str) -> Iterator[None]:
             f"its file {path} "
             + ("is missing" if missing else f"cannot be read: {first_line(error)}"),
             where=str(place),
-            remedy="make the file readable: it need not be damaged"
+            remedy="make the file readable: it may be undamaged"
             if by_system(error) or isinstance(error, pa.ArrowNotImplementedError)
             else damage_remedy(place, path),
         ) from error
@@ -182,8 +182,8 @@ def damage_remedy(place: Location, path: str) -> str:
     if name == FRAMES or (name == TRANSITIONS and OWN_PATH.fullmatch(file)):
         return "restore the file from a copy, or ingest its recording again with --force"
     return (
-        f"restore the file from a copy, or let `restock store compact {quoted(place)}"
-        " --drop-damaged` take it out of the store: it names the recordings to ingest again"
+        f"restore the file from a copy, or run `restock store compact {quoted(place)}"
+        " --drop-damaged`, which removes it and names the recordings to ingest again"
     )
 
 

@@ -400,7 +400,7 @@ class Location:
                 raise StoreError(
                     f"permission denied: {denied['file'] or 'its files'} cannot be read",
                     where=self.text,
-                    remedy="let this user read the store, and to ingest also write in it",
+                    remedy="give this user permission to read the store (and to write, to ingest)",
                 ) from error
             if self.folder is not None or not re.search("S3|AWS", text):
                 raise

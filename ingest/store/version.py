@@ -144,7 +144,7 @@ def _problem_of_commit(file: Path) -> str | None:
     except (ValueError, RecursionError):
         return "is damaged: it is not lines of JSON"
     if not all(isinstance(action, dict) for action in actions):
-        return "is damaged: it is no commit of Delta"
+        return "is damaged: it is not a Delta commit"
     if not actions:
         return "is empty"
     said = actions[0].get("commitInfo")
@@ -152,7 +152,7 @@ def _problem_of_commit(file: Path) -> str | None:
         ours = str(said.get("operation_name", "")).startswith("restock")
         # Others write commits that change nothing.
         if ours or said.get("operation") in ("ADD COLUMN", "CREATE TABLE"):
-            return "is cut: it does not say what it changed"
+            return "is truncated: it does not list its changes"
     return None
 
 
@@ -186,7 +186,7 @@ def _damaged(
     return StoreError(
         f"its file {table}/{LOG}/{file.name} {problem}",
         where=where,
-        remedy=f"restore it from a copy{'; ' if remedy.startswith('where') else ', '}{remedy}",
+        remedy=f"restore it from a copy{'; ' if remedy.startswith('if ') else ', '}{remedy}",
     )
 
 
@@ -226,7 +226,7 @@ def expect_format(table: DeltaTable, *, where: str) -> None:
     found = table.metadata().description
     if found != FORMAT:
         raise StoreError(
-            f"the format of this store is {found or 'not known'}; this Restock reads {FORMAT}",
+            f"the format of this store is {found or 'unknown'}; this Restock reads {FORMAT}",
             where=where,
             remedy="make a new store of its recordings: `restock ingest RECORDINGS --store NEW`",
         )

@@ -420,7 +420,7 @@ SELECT
     arg_max(size, period) AS size,
     max(q) AS q,
     any_value(robot) || ': ' || any_value(part) || ': '
-    || any_value(signal) || CASE WHEN any_value(part) = 'conditions' THEN ' events an hour' ELSE '' END
+    || any_value(signal) || CASE WHEN any_value(part) = 'conditions' THEN ' events per hour' ELSE '' END
     || coalesce(' in ' || any_value(zone), '')
     || CASE arg_max(compared, period)
         WHEN 'ratio' THEN printf(
@@ -447,7 +447,7 @@ SELECT
         ELSE 'unclear whether the other robots at this site changed alike'
     END
     || CASE arg_max(samples, period)
-        WHEN 'episodes' THEN '; compared episode by episode, as recordings are few: these may differ as much'
+        WHEN 'episodes' THEN '; compared by episode, because recordings are few: these may differ as much'
         ELSE ''
     END AS finding
 FROM (

@@ -50,7 +50,7 @@ class CameraFrame:
         where = f"frame {self.frame_index} of {self.topic}, recording {self.recording_id}"
         if hashlib.sha256(self.data).hexdigest() != self.sha256:
             raise StoreError(
-                "its bytes are not those that were recorded",
+                "its bytes differ from those that were recorded",
                 where=where,
                 remedy="restore the store's file from a copy, or ingest the recording again",
             )
@@ -60,7 +60,7 @@ class CameraFrame:
             raise StoreError(
                 str(problem),
                 where=where,
-                remedy=f"it was recorded like this: leave out its rows ({self.source_file})",
+                remedy=f"the recording has it like this: leave out its rows ({self.source_file})",
             ) from problem
 
 
@@ -83,7 +83,7 @@ def camera_frames(
     have = cameras_of(store)
     if camera is not None and camera not in have:
         raise StoreError(
-            f"no frames of a camera {camera!r}",
+            f"it has no frames of a camera {camera!r}",
             where=str(store.path),
             remedy=f"it has {', '.join(have)}"
             if have

@@ -212,8 +212,8 @@ def novel_rows(store: Store) -> dict[str, Any]:
 def novel_rows_said(found: Mapping[str, Any]) -> str:
     """Return a sentence that explains the result of `novel_rows`."""
     return (
-        f"Novel are the {NOVEL_SHARE:.0%} of the rows whose observations are furthest from those of"
-        f" other episodes: {found['nominal_rows']:,} of {found['rows_held']:,} hold no condition."
+        f"Novel rows are the {NOVEL_SHARE:.0%} whose observations are furthest from those of other"
+        f" episodes: in {found['nominal_rows']:,} of {found['rows_held']:,}, no condition holds."
     )
 
 

@@ -42,7 +42,7 @@ _FILE = re.compile(
 _NAMELESS = re.compile(
     r"TProtocolException|[Dd]ecompress|[Tt]hrift|[Pp]arquet (?:file|page|reader)"
 )
-REMAKE = "restore the file from a copy, or make it again with the verb that wrote it"
+REMAKE = "restore the file from a copy, or make it again with the command that wrote it"
 _OTHER = (
     *(duckdb.CatalogException, duckdb.BinderException, duckdb.ParserException),
     *(duckdb.OutOfMemoryException, duckdb.InterruptException),
@@ -156,8 +156,8 @@ def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | Non
     return StoreError(
         f"is damaged or cannot be read: {first_line(error)}",
         where=where,
-        remedy="restore its files from a copy, or let `restock store compact STORE --drop-damaged`"
-        " find the file: it names the recordings to ingest again",
+        remedy="restore its files from a copy, or run `restock store compact STORE --drop-damaged`,"
+        " which finds the file and names the recordings to ingest again",
     )
 
 

@@ -308,7 +308,7 @@ _NO_CONDITION = re.compile(r'column(?: named)? "condition"', re.IGNORECASE)
 OF_CONDITIONS = (
     "a row can hold several conditions: `FROM held_conditions WHERE condition = '…'` has every row"
     " that holds it, as has `FROM transitions WHERE list_contains(conditions, '…')`;"
-    " `primary_condition` is the one of highest priority alone"
+    " `primary_condition` is only the one of highest priority"
 )
 
 

@@ -125,8 +125,8 @@ SELECT
     CASE
         WHEN verdict <> 'undetermined' THEN NULL
         WHEN least(episodes, episodes_less) < min_episodes THEN 'too few episodes'
-        WHEN success_low > 0 THEN 'it may earn more or less'
-        ELSE 'either may succeed more'
+        WHEN success_low > 0 THEN 'its return may be higher or lower'
+        ELSE 'either driver may succeed more'
     END AS why,
     episodes,
     episodes_less AS other_episodes,

@@ -463,7 +463,7 @@ def set_memory_limit(
         connection.execute(f"SET memory_limit = '{limit}'")
     except duckdb.Error as error:
         raise StoreError(
-            f"no memory limit {limit!r}", where=str(where), remedy=_MEMORY_REMEDY
+            f"the memory limit {limit!r} is not a size", where=str(where), remedy=_MEMORY_REMEDY
         ) from error
 
 
@@ -547,7 +547,8 @@ def export_views(store: Store, out: str | Path) -> Path:
     """
     out = Path(out)
     if out.suffix not in (".sql", ".duckdb"):
-        raise StoreError(f"no export to {out.suffix or 'a file without an ending'}", where=str(out),
+        ending = out.suffix or "a file without an ending"
+        raise StoreError(f"cannot export to {ending}", where=str(out),
                          remedy="name it .sql (for `duckdb -init`) or .duckdb; or give a query,"
                          " whose rows go to a .parquet, .csv or .json file")  # fmt: skip
     if out.exists():

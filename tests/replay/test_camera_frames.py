@@ -79,7 +79,7 @@ def test_a_frame_whose_bytes_changed_is_not_shown(store_path):
     with Store(store_path) as store:
         frame = next(camera_frames(store, "FROM transitions", "rear"))
     changed = dataclasses.replace(frame, data=b"\0" + frame.data[1:])
-    with pytest.raises(StoreError, match="not those that were recorded"):
+    with pytest.raises(StoreError, match="differ from those that were recorded"):
         changed.image()
 
 

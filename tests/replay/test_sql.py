@@ -217,7 +217,7 @@ def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, shell, name):
         assert not other.sql("FROM columns WHERE contains(view, 'frames')").fetchall()
     for words, problem in (
         (["--export", out], "already there"),
-        (["--export", tmp_path / "views.db"], "no export to .db"),
+        (["--export", tmp_path / "views.db"], "cannot export to .db"),
         (["FROM coverage", "--export", tmp_path / "v.sql"], "runs no query"),
     ):
         assert problem in shell.err("sql", store_path, *words)
