@@ -1,9 +1,9 @@
-"""Checkpoints: one file, tensors and JSON only, written so that a kill leaves the old or the new.
+"""Checkpoints: one file of tensors and JSON; a kill while it is written leaves the old one.
 
-A checkpoint is a safetensors file whose metadata carries a JSON document, and a checksum over it
-and every tensor: one that changed since is refused. Loading one executes nothing. State is a nested
-mapping whose leaves are tensors, numpy arrays, numbers, strings, booleans, None or lists of those;
-`save` takes the arrays out into tensors named by their path and `load` puts them back.
+A checkpoint is a safetensors file. Its metadata has a JSON document, and a checksum over the
+document and all tensors, so that a file that changed since is refused. Loading executes no code.
+State is a nested mapping whose leaves are tensors, numpy arrays, numbers, strings, booleans, None
+or lists of those; `save` stores arrays as tensors named by their path, and `load` puts them back.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _RESTORE = "restore it from a copy, or train again"
 
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
-    """Write `state` to `path`, replacing what is there in one step.
+    """Write `state` to `path`, replacing an existing file in one step.
 
     Raises:
-        TypeError: a leaf of another kind than those above; names its path.
+        TypeError: a leaf has another type than the module's docstring lists; names its path.
     """
     tensors: dict[str, torch.Tensor] = {}
     document = json.dumps(_take_apart(state, "", tensors))
@@ -50,10 +50,10 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Load what `save` was given: arrays as numpy if they were numpy, else as CPU tensors.
+    """Load the state that `save` wrote: numpy arrays as numpy arrays, tensors as CPU tensors.
 
     Raises:
-        RunError: no such file, or not one that `save` wrote.
+        RunError: there is no such file, or it is damaged, or `save` did not write it.
     """
     if not path.is_file():
         raise RunError(
@@ -103,7 +103,7 @@ def _checksum(document: str, tensors: Mapping[str, torch.Tensor]) -> str:
 
 def _take_apart(value: Any, path: str, tensors: dict[str, torch.Tensor]) -> Any:
     if isinstance(value, torch.Tensor):
-        # A copy: safetensors refuses tensors that share memory.
+        # A copy, because safetensors refuses tensors that share memory.
         tensors[path] = value.detach().to("cpu", copy=True).contiguous()
         return {_ARRAY: path}
     if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
--- What the critic was fed over a whole run, a row a stratum. `fed` is the run's table.
+-- Sum the run's table `fed` over all intervals: one row per stratum, with its shares of all rows.
 WITH intervals AS (
     SELECT *, row_number() OVER () AS place,
            sum(drawn_rows) OVER (PARTITION BY gradient_steps, phase) AS fed_rows

@@ -1,11 +1,11 @@
 """Keep the episodes that `restock eval` drove in `RUN/eval/episodes.parquet`, and measure them.
 
-An episode is identified by its policy, floor, perturbation and seed. If it is driven again, it
-replaces the earlier one; all others are kept. Pages show the newest floors, the newest version of
-the run's own policy, and the newest limits of a limited one.
+An episode is identified by its policy and version, floors, perturbation, condition and seed. If it
+is driven again, it replaces the earlier one; all others are kept. Pages show the floors of the last
+evaluation, the newest version of the run's own policy, and the newest limits of a limited policy.
 
-Intervals of measures are 95 %: Wilson's of success, a bootstrap over episodes of the rest. They
-cover what other episodes of the kind would have changed, not what another training seed would have.
+Intervals of measures are 95 %: Wilson's for success, a bootstrap over episodes for the rest. They
+include the effect of other episodes of the kind, not that of another training seed.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
-LIMITED = "limited:"  # a policy with the limiter in front of it
+LIMITED = "limited:"  # prefix of a policy whose commands pass the limiter
 _NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
 
 def read_evaluations(run: Path) -> pa.Table:
-    """Read all episodes that a run's evaluations drove; no rows if there are none.
+    """Read all episodes that a run's evaluations drove; the table is empty without any.
 
     Raises:
         RunError: the file is damaged.
@@ -58,8 +58,8 @@ def read_evaluations(run: Path) -> pa.Table:
 def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
     """Add an evaluation to the earlier ones, replacing episodes that were driven again.
 
-    Time lost is against the planner as it last drove the mission, of all that was ever driven.
-    Returns what was added, with it.
+    Time lost is computed for all episodes, against the planner's last drive of the same mission.
+    Returns the added rows with their time lost.
     """
     earlier, new = read_evaluations(run), set(_names(driven))
     kept = [name not in new for name in _names(earlier)]
@@ -89,13 +89,13 @@ def planner_times(rows: Iterable[Mapping[str, Any]]) -> dict[Mission, float]:
 
 
 def mission_of(row: Mapping[str, Any]) -> Mission:
-    """Return what identifies a mission: floors, condition, seed, and parameters in force."""
+    """Return the key of a mission: floors, condition, seed, and parameters in force."""
     values = str(sorted(row["perturbation_values"] or ()))
     return row["layouts"], row["condition"], row["episode_seed"], values
 
 
 def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
-    """Return the episodes to show and compare, and a text that counts them.
+    """Return the episodes to show and compare, and a sentence that counts them.
 
     Raises:
         RunError: the file is damaged.
@@ -123,14 +123,14 @@ def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
 
 
 def trained_step(shown: pa.Table) -> int | None:
-    """Return the environment steps of training after which the run's own policy was taken."""
+    """Return the environment steps of training after which the run's own policy was saved."""
     own = shown.filter(pc.equal(shown["policy"], "agent"))
     step: int | None = own["trained_env_steps"][-1].as_py() if own.num_rows else None
     return step
 
 
 def _floors(layouts: str) -> str:
-    """Shorten a run's floors: files by name, of many only the first and last."""
+    """Shorten a list of floors: file names without folders; of more than 3 the first and last."""
     names = [part.rpartition("/")[2].strip() for part in layouts.split(",")]
     some = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
     return ", ".join(some)
@@ -151,7 +151,7 @@ CLONES = Path("eval") / "clones.parquet"  # in a run
 
 @dataclass(frozen=True)
 class CloneQuality:
-    """The quality of a clone: a row of `RUN/eval/clones.parquet`, whose columns explain it."""
+    """The quality of a clone, a row of `RUN/eval/clones.parquet`: see the columns' meanings."""
 
     policy: str
     drivers: list[str]
@@ -169,7 +169,7 @@ class CloneQuality:
 
     @property
     def poor(self) -> str | None:
-        """Return why it is a poor stand-in for the drivers; None if nothing shows that."""
+        """Return why the clone may not stand in for the drivers; None if nothing shows that."""
         if self.log_likelihood is None or self.agreement is None:
             return "the quality of the clone is not known: no row of its drivers is held out"
         if self.log_likelihood <= (self.frequencies_log_likelihood or 0.0):
@@ -183,7 +183,7 @@ class CloneQuality:
 
     @property
     def text(self) -> str:
-        """Return a warning in a sentence or two."""
+        """Describe the clone and its quality in a sentence or two."""
         said = (
             f"{self.policy} is behaviour cloning of {', '.join(self.drivers) or 'unnamed drivers'}"
             f" ({counted(self.rows, 'row')} of"
@@ -209,7 +209,7 @@ def read_clones(run: Path) -> list[CloneQuality]:
 
 
 def keep_clone(run: Path, quality: CloneQuality) -> None:
-    """Add a clone's quality, replacing one of the same name."""
+    """Add a clone's quality to the run, replacing that of the same policy."""
     others = [row for row in read_clones(run) if row.policy != quality.policy]
     rows = [asdict(row) for row in (*others, quality)]
     write_table(pa.Table.from_pylist(rows, schema=EVAL_CLONES), run / CLONES)
@@ -219,7 +219,7 @@ Row = Mapping[str, Any]
 
 
 def cell_name(condition: str, block: str) -> str:
-    """Name a cell: `blocked_aisle (partial)`, but `nominal`."""
+    """Name a cell: `blocked_aisle (partial)`, or the condition alone if it has no blocks."""
     return condition if block in ("none", "") else f"{condition} ({block})"
 
 
@@ -242,9 +242,8 @@ def summary_rows(episodes: Iterable[Row]) -> list[dict[str, Any]]:
 def measures(episodes: Sequence[Row]) -> dict[str, Any]:
     """Compute the measures of one cell's episodes; None if no episode has the value.
 
-    Success is unknown of a task without a goal, the closest approach where nobody was about, time
-    lost where the planner did not arrive or was not driven, the rest in files from before it was
-    measured.
+    Success is unknown if the task has no goal, the closest approach if nobody was about, and time
+    lost if the planner did not arrive or was not driven. Files of an earlier Restock lack others.
     """
 
     def known(name: str) -> list[float]:
@@ -276,7 +275,7 @@ def measures(episodes: Sequence[Row]) -> dict[str, Any]:
 
 
 def measured_row(row: Row) -> dict[str, Any]:
-    """Return the measures of a cell as people read them: docs/eval.md explains each."""
+    """Return a cell's measures as texts for a table: docs/eval.md explains each."""
 
     def text(name: str, form: str) -> str:
         ends = row.get(f"{name}_low"), row.get(f"{name}_high")
@@ -298,7 +297,7 @@ def measured_row(row: Row) -> dict[str, Any]:
 
 
 def _limited(episodes: Sequence[Row]) -> dict[str, float | None]:
-    """Return the share of driven time that a limiter held commands back, and of that to a stop."""
+    """Return the shares of driven time in which a limiter reduced commands, and stopped them."""
     behind = [row for row in episodes if row.get("limited_s") is not None]
     time_s = sum(row["time_s"] for row in behind)
     return {
@@ -308,9 +307,9 @@ def _limited(episodes: Sequence[Row]) -> dict[str, float | None]:
 
 
 def _bumps_per_km(episodes: Sequence[Row]) -> ConfidenceInterval:
-    """Return all bumps over all kilometres: an episode counts by how far it went.
+    """Return all bumps over all kilometres, so that an episode counts by its distance.
 
-    Where nothing was touched resamples do not vary: the upper end is then that of a Poisson rate.
+    Without any bump, resamples do not vary: the upper end is then that of a Poisson rate.
     """
     reported = [row for row in episodes if row["distance_m"] is not None]
     km = np.array([row["distance_m"] / 1000 for row in reported])

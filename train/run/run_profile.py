@@ -1,7 +1,7 @@
 """Find the profile and the panel of a run by its `config.json`.
 
-A run carries the text of its profile, so that it can be read anywhere. Its panel is a folder
-elsewhere, which must still be the one that the run learned from.
+A run contains the text of its profile, so that it can be read anywhere. Its panel is a folder
+elsewhere, which must still be the panel that the run learned from.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from restock.train.run.run import Run
 
 
 def profile_document(profile: Profile) -> dict[str, object]:
-    """Return the part of a run's `config.json` about its profile, for every library."""
+    """Return the part of `config.json` about the profile, for runs of every library."""
     return {
         "task_hash": profile.task.hash,
         "actions": profile.task.action_names,
@@ -34,11 +34,11 @@ def profile_document(profile: Profile) -> dict[str, object]:
 
 
 def profile_of_run(run: Run) -> Profile:
-    """Return the profile that a run was trained with: the text that it keeps.
+    """Return the profile that a run was trained with, from the text that the run contains.
 
     Raises:
-        RunError: that text cannot be read.
-        ConfigError: the run keeps none, as one of an older Restock, and its profile is not at hand.
+        RunError: that text cannot be read, or the run has no profile at all.
+        ConfigError: an older Restock wrote the run, without the text, and there is no such profile.
     """
     text, config = run.document.get("profile_toml", ""), run.document["config"]
     if not text and "profile" not in config:
@@ -57,17 +57,16 @@ def profile_of_run(run: Run) -> Profile:
 
 
 def carries_profile(panel: Panel, name: str) -> bool:
-    """Return whether `name` is the profile that the panel carries."""
+    """Return whether `name` means the profile that the panel contains, and no other."""
     own = panel.header.profile_toml and name == panel.header.profile
     return bool(own) and name not in shipped_profiles() and not Path(name).is_file()
 
 
 def profile_of_panel(panel: Panel) -> Profile:
-    """Return the profile of the task of a panel's rows, if no other is named.
+    """Return the profile of a panel's task, for users who name no other.
 
     Raises:
-        PanelError: the panel carries none that can be used, and none that comes with Restock has
-            its task.
+        PanelError: the panel contains no usable profile, and no shipped profile has its task.
     """
     header = panel.header
     name, text = header.profile, header.profile_toml
@@ -78,9 +77,9 @@ def profile_of_panel(panel: Panel) -> Profile:
 def carried_profile(
     name: str, text: str, task_hash: str, where: str, option: str, error: type[RestockError]
 ) -> Profile:
-    """Return the profile of a task: the `text` that its rows carry, else one that Restock ships.
+    """Return the profile of a task: from the `text` kept with its rows, else a shipped one.
 
-    `option` says how another is given.
+    `option` is the command-line option for another profile, for the error's remedy.
 
     Raises:
         error: neither has this task.
@@ -117,7 +116,7 @@ def run_panel(document: Mapping[str, Any]) -> Panel | None:
     """Open the panel that a run learnt from, by its `config.json`; None if it had none.
 
     Raises:
-        PanelError: it cannot be read, or another one is in its place.
+        PanelError: it is gone or cannot be read, or another panel is in its place.
     """
     fed = document.get("panel")
     if fed is None:

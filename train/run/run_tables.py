@@ -1,8 +1,8 @@
 """The Parquet tables of a run directory: their columns, types and meanings.
 
-Every table is there from the first flush on, if only with no rows, so that a reader of a young or
-killed run finds what it expects. The meanings go into the files: `restock sql RUN "FROM columns"`
-lists them.
+The file of every table exists from the first flush on, even without rows, so that a reader of a
+young or killed run finds all tables. The meanings are stored in the files:
+`restock sql RUN "FROM columns"` lists them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _STEPS = [
     ("env_steps", _I, "environment steps so far, all environments together"),
     ("gradient_steps", _I, "updates so far"),
 ]
-_OUTCOME = [  # of an evaluation's episode
+_OUTCOME = [  # columns about the outcome of an evaluation's episode
     ("success", _B, "reached the goal without a bump; null: no goal"),
     ("bumps", _I, "number of times that a contact began"),
     ("time_s", _F, "simulated time of the episode"),
@@ -27,7 +27,7 @@ _OUTCOME = [  # of an evaluation's episode
         "discounted return from the first step, with the run's `loss.discount`",
     ),
     ("distance_m", _F, "distance driven over ground"),
-    ("closest_person_m", _F, "least true distance to a person or forklift; null: there was none"),
+    ("closest_person_m", _F, "least true distance to a person or forklift; null: none was there"),
 ]
 
 
@@ -49,7 +49,7 @@ TABLES: dict[str, pa.Schema] = {
         ("q_abs_max", _F, "the largest |Q| of an action taken"),
         ("reward_mean", _F, "mean reward of the rows drawn (n-step returns)"),
         ("epsilon", _F, "probability of a random action; null while offline"),
-        ("target_rule", _S, "how the target network follows, in words"),
+        ("target_rule", _S, "rule of the target network, such as `polyak tau 0.005`"),
         ("target_param_distance", _F, "|online - target| / |online|, over all parameters"),
         ("target_q_lag", _F, "mean |Q - Q_target| / mean |Q| on the probe"),
         (
@@ -63,8 +63,8 @@ TABLES: dict[str, pa.Schema] = {
         ("ring_rows", _I, "number of fresh rows in the ring"),
         ("planned_env_steps", _I, "environment steps that the shares of batches are planned for"),
         ("episodes", _I, "episodes finished in the interval, while exploring"),
-        ("success", _F, "share of those that reached the goal without a bump; null: no goal"),
-        ("return_mean", _F, "mean undiscounted return of those"),
+        ("success", _F, "share of them that reached the goal without a bump; null: no goal"),
+        ("return_mean", _F, "mean undiscounted return of these episodes"),
         ("env_steps_per_s", _F, "environment steps per second, over the interval"),
         ("updates_per_s", _F, "updates per second, over the interval"),
     ),
@@ -102,8 +102,8 @@ TABLES: dict[str, pa.Schema] = {
         (
             "available_share",
             _F,
-            "share of the source's rows; of the logs, those in the panel, after the caps of the "
-            "mixture, whose natural shares count the rows before them",
+            "share of the source's rows; for logs, of the panel's rows, after the mixture's caps "
+            "(its natural shares count rows before the caps)",
         ),
         ("drawn_rows", _I, "number of rows drawn in the interval"),
         ("drawn_share", _F, "share of the source's drawn rows"),
@@ -130,7 +130,7 @@ TABLES: dict[str, pa.Schema] = {
     ),
     "actions": _schema(
         "one interval x source x stratum x condition x action: what the batches contained, and "
-        "what the policy wants",
+        "which actions the policy would take",
         *_STEPS,
         ("phase", _S, "offline | warmup | online"),
         ("source", _S, "logs | fresh"),
@@ -141,7 +141,7 @@ TABLES: dict[str, pa.Schema] = {
             pa.int16(),
             "index of the discrete action, including actions that were never drawn",
         ),
-        ("name", _S, "of the action"),
+        ("name", _S, "name of the action"),
         ("drawn_rows", _I, "number of rows drawn in the interval"),
         ("drawn_share", _F, "share of the rows drawn of that stratum and condition"),
         ("unique_rows", _I, "number of different rows among those drawn"),
@@ -159,13 +159,13 @@ TABLES: dict[str, pa.Schema] = {
         ("source", _S, "logs, or the name of another store of the mixture"),
         ("stratum", _S, "stratum of the logs"),
         ("share", _F, "share of the logged rows of a batch, in force at the end of the interval"),
-        ("planned_share", _F, "the same when the run began"),
+        ("planned_share", _F, "the same share when the run began"),
         ("logs_share", _F, "share of logged rows, of all strata together, in an online batch"),
         ("rows", _I, "number of rows in the panel"),
         ("drawn_rows", _I, "number of rows drawn since the run began"),
         ("replays_per_row", _F, "drawn_rows / rows"),
         ("replays_max", _I, "largest number of draws of one row; null if there is no limit"),
-        ("max_replays_per_row", _I, "the limit"),
+        ("max_replays_per_row", _I, "limit of the draws of one row; null: there is none"),
         ("replaced_rows", _I, "number of draws beyond the limit that were given to other rows"),
         ("exhausted", _B, "all rows reached the limit of draws: other strata get this share"),
     ),
@@ -175,7 +175,7 @@ TABLES: dict[str, pa.Schema] = {
         ("source", _S, "logs | fresh"),
         ("unit", _S, "days for logs; env_steps and gradient_steps for fresh rows"),
         ("bucket", pa.int32(), "ages in [2**bucket, 2**(bucket + 1)); -1: below 1"),
-        ("count", _I, "rows drawn"),
+        ("count", _I, "number of rows drawn"),
         ("p50", _F, "median age, over all buckets"),
         ("p90", _F, "90th percentile"),
         ("p99", _F, "99th percentile"),
@@ -236,7 +236,8 @@ TABLES: dict[str, pa.Schema] = {
         (
             "logs_unexplained",
             _F,
-            "share of the variance of their next observations that is unexplained",
+            "share of the variance of those rows' next observations that a linear model leaves "
+            "unexplained",
         ),
     ),
     "off_policy": _schema(
@@ -247,7 +248,7 @@ TABLES: dict[str, pa.Schema] = {
         ("estimator", _S, "logged | fqe | pdwis"),
         ("value", _F, "the estimate; null if it is refused"),
         ("low", _F, "lower end of its 95 % interval, over episodes; null for fqe"),
-        ("high", _F, "upper end"),
+        ("high", _F, "upper end of that interval"),
         ("refused", _S, "why it is refused, or null"),
         ("episodes", _I, "number of episodes of the logs"),
         ("ess", _F, "smallest effective sample size of the weights at any step, in episodes"),
@@ -272,7 +273,7 @@ TABLES: dict[str, pa.Schema] = {
             _I,
             "seed that, with true_condition and perturbation, generates the episode again",
         ),
-        ("perturbation", _S, "its name"),
+        ("perturbation", _S, "name of the perturbation"),
         ("layout", _S, "name of the floor"),
         ("perturbation_values", VALUES, "parameters that are not nominal"),
         ("true_condition", _S, "kind of episode that the twin drew"),
@@ -291,18 +292,18 @@ TABLES: dict[str, pa.Schema] = {
     "practice": _schema(
         "one interval of practice x arm: the missions that the twin should give, and gave",
         *_STEPS,
-        ("rule", _S, "natural | even | missions | success"),
+        ("rule", _S, "natural | even | success"),
         ("arm", _S, "kind of missions, with its block, floor or part of a range"),
         ("condition", _S, "kind of episode of the arm"),
-        ("natural_share", _F, "share of the missions by `env`"),
+        ("natural_share", _F, "share of the missions that the config's `env` gives"),
         ("wanted_share", _F, "share in force in the interval"),
-        ("given_share", _F, "share of the episodes that ended in it; null if there were none"),
-        ("episodes", _I, "number of episodes that ended in it, while exploring"),
-        ("success", _F, "success of those; null if there were none"),
+        ("given_share", _F, "share of the episodes that ended in the interval; null: none ended"),
+        ("episodes", _I, "number of the arm's episodes that ended in the interval, exploring"),
+        ("success", _F, "share of these episodes that succeeded; null if there were none"),
         (
             "success_rate",
             _F,
-            "success over episodes, with decreasing weights of older ones; null: too few",
+            "success rate over all episodes, in which older ones count less; null: too few",
         ),
         (
             "weight",
@@ -323,22 +324,23 @@ TABLES: dict[str, pa.Schema] = {
             "share of the most probable action's",
         ),
         ("rows", _I, "number of rows in the random sample"),
-        ("asked_rows", _I, "number of those for which the teacher gave an action"),
-        ("loss", _F, "mean -log G(a|s) of its action; null if it gave none"),
+        ("asked_rows", _I, "number of these rows for which the teacher gave an action"),
+        ("loss", _F, "mean -log G(a|s) of the teacher's action; null if it gave none"),
         (
             "agreement",
             _F,
-            "share in which its action is the most probable one of the behaviour network",
+            "share of asked_rows in which the behaviour network's most probable action is the "
+            "teacher's",
         ),
         ("plausible_actions", _F, "mean number of plausible actions"),
-        ("teacher_plausible", _F, "share in which its action is plausible"),
-        ("changed", _F, "share in which the filter changed the action chosen by Q"),
-        ("chosen_agreement", _F, "share in which the filtered choice is its action"),
+        ("teacher_plausible", _F, "share of asked_rows in which the teacher's action is plausible"),
+        ("changed", _F, "share of rows in which the filter changed the action chosen by Q"),
+        ("chosen_agreement", _F, "share of asked_rows whose filtered choice is the teacher's"),
     ),
     "audit": _schema(
         "one drawn row of a seeded sample of batches",
         ("gradient_step", _I, "gradient step of its batch"),
-        ("batch_row", pa.int32(), "its position in the batch"),
+        ("batch_row", pa.int32(), "position of the row in its batch"),
         ("source", _S, "logs | fresh"),
         (
             "transition_id",
@@ -348,8 +350,8 @@ TABLES: dict[str, pa.Schema] = {
         ("panel_row", _I, "of a logged row: its row number in the panel"),
         ("ring_slot", _I, "of a fresh row: its slot in the ring"),
         ("episode", _S, "logs: episode_id; fresh: the key in the ring"),
-        ("episode_step", _I, "of a fresh row; of a logged one the store has it"),
-        ("age_days", _F, "of a logged row, when training began (`created_ns` of config.json)"),
+        ("episode_step", _I, "of a fresh row: step in its episode; for a logged row see the store"),
+        ("age_days", _F, "of a logged row: age at the start (`created_ns` of config.json)"),
         ("age_env_steps", _I, "of a fresh row: environment steps since it was collected"),
         (
             "age_gradient_steps",
@@ -365,8 +367,12 @@ TABLES: dict[str, pa.Schema] = {
         ),
         ("behaviour_policy", _S, "who acted"),
         ("behaviour_version", _S, "version of that policy"),
-        ("perturbation", _S, "of the twin; null for hardware"),
-        ("perturbation_values", VALUES, "of a fresh row; of a logged one the store has them"),
+        ("perturbation", _S, "name of the twin's perturbation; null for hardware"),
+        (
+            "perturbation_values",
+            VALUES,
+            "of a fresh row: parameters that are not nominal; for a logged row see the store",
+        ),
         ("action", pa.int16(), "index of the discrete action"),
         ("greedy_action", pa.int16(), "action that the policy at that time would take"),
         ("reward", _F, "the row's n-step return"),
@@ -388,7 +394,7 @@ TABLES: dict[str, pa.Schema] = {
         ("condition", _S, "kind of the fixed episode"),
         ("block", _S, "none | partial | full"),
         ("episode_seed", _I, "seed of the fixed episode"),
-        ("perturbation", _S, "its name"),
+        ("perturbation", _S, "name of the perturbation"),
         ("layout", _S, "name of the floor"),
         ("perturbation_values", VALUES, "parameters that are not nominal"),
         *_OUTCOME,
@@ -396,11 +402,11 @@ TABLES: dict[str, pa.Schema] = {
     ),
 }
 
-# Of RUN/eval/episodes.parquet, which `restock eval` writes.
+# The table RUN/eval/episodes.parquet, which `restock eval` writes.
 EVAL_EPISODES = _schema(
     "one episode that `restock eval` drove",
-    ("policy", _S, "dqn, or a policy with which it is compared"),
-    ("perturbation", _S, "its name"),
+    ("policy", _S, "agent (the run's), or a policy with which it is compared"),
+    ("perturbation", _S, "name of the perturbation"),
     ("layout", _S, "name of the floor"),
     ("perturbation_values", VALUES, "parameters that are not nominal"),
     ("condition", _S, "kind of the fixed episode"),
@@ -419,7 +425,7 @@ EVAL_EPISODES = _schema(
     (
         "trained_env_steps",
         _I,
-        "environment steps of its training; null: scripted, cloned, or a file's",
+        "environment steps of its training; null: a scripted or cloned policy, or a file's",
     ),
     ("layouts", _S, "floors that were requested; null: from an earlier Restock"),
     (
@@ -427,10 +433,10 @@ EVAL_EPISODES = _schema(
         _F,
         "time in which the limiter reduced a command; null: there was no limiter",
     ),
-    ("stopped_s", _F, "time in which it reduced the command to a stop"),
+    ("stopped_s", _F, "time in which the limiter reduced a command to a stop"),
 )
 
-# Of RUN/eval/clones.parquet, beside it.
+# The table RUN/eval/clones.parquet, which `restock eval` writes if it drives clones.
 EVAL_CLONES = _schema(
     "one clone of the logs' drivers that an evaluation drove, and its quality",
     ("policy", _S, "cloned | cloned:DRIVER"),
@@ -441,9 +447,9 @@ EVAL_CLONES = _schema(
     ("training_log_likelihood", _F, "mean log probability of its rows' actions, nats"),
     ("held_out_rows", _I, "number of rows of the same drivers that the panel holds out"),
     ("log_likelihood", _F, "the same for the held-out rows; null: there are none"),
-    ("frequencies_log_likelihood", _F, "the same, with only the frequency of each action"),
-    ("agreement", _F, "share of held-out rows whose action is its most probable one"),
-    ("repeating", _F, "share in which the action equals the previous one"),
+    ("frequencies_log_likelihood", _F, "the same under the frequency of each action alone"),
+    ("agreement", _F, "share of held-out rows whose action is the clone's most probable one"),
+    ("repeating", _F, "share of held-out rows whose action equals the previous one"),
     ("changed_agreement", _F, "agreement in the rows in which the driver changed the action"),
     ("note", _S, "why held-out rows could not be read, or null"),
 )
