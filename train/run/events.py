@@ -1,10 +1,10 @@
 """One stream of scalars by environment step, and its sinks: TensorBoard, W&B and MLflow.
 
 A sink that fails never ends a run: its failed calls are counted, the first reason is printed, and
-after some failures in a row it is disabled. `RUN/tracking.json` has the counts and the ids by
-which W&B and MLflow know the run.
+after some failures in a row it is disabled. `RUN/tracking.json` has the counts, and the run's ids
+in W&B and MLflow.
 
-Both stay on this machine unless their own environment variables say otherwise: W&B is offline
+W&B and MLflow write only to this machine unless you set their environment variables: W&B is offline
 (`WANDB_MODE=online`, or `wandb sync` later), MLflow's store is a file in the run's directory
 (`MLFLOW_TRACKING_URI`).
 """
@@ -25,7 +25,7 @@ from restock.toml import by_path
 from restock.train.run.run import Run
 
 TRACKING = "tracking.json"
-GIVE_UP_AFTER = 3  # failures in a row: a server that is gone would cost its timeout every time
+GIVE_UP_AFTER = 3  # failures in a row: an unreachable server would cost its timeout every time
 
 
 class Sink(Protocol):
@@ -34,7 +34,7 @@ class Sink(Protocol):
     name: str
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Write numbers by `group/name`, after `step` environment steps."""
+        """Write numbers by `group/name`, measured after `step` environment steps."""
 
     def flush(self) -> None:
         """Make everything written so far readable."""
@@ -54,7 +54,7 @@ class TensorBoard:
     def __init__(self, folder: Path, from_step: int | None) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        # After a resume, what was written past the checkpoint is purged.
+        # After a resume, points later than the checkpoint are removed.
         self._writer: Any = SummaryWriter(str(folder), purge_step=from_step)
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
@@ -73,7 +73,7 @@ class TensorBoard:
 
 @dataclass
 class _Count:
-    """The failed calls of a sink."""
+    """The number of a sink's failed calls, and the first error."""
 
     failed: int = 0
     in_a_row: int = 0
@@ -85,8 +85,8 @@ class Events:
 
     Args:
         run: the run's directory.
-        sinks: name -> what opens it.
-        say: called when one fails for the first time, and at the end with the count.
+        sinks: name -> a function that opens the sink.
+        say: called when a sink first fails, when it is disabled, and at the end with the counts.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Events:
         self._write()
 
     def scalars(self, step: int, prefix: str, values: Mapping[str, Any]) -> None:
-        """Write every number among `values` as `prefix/name`."""
+        """Write every number in `values` as `prefix/name`; other values are ignored."""
         numbers = {
             f"{prefix}/{name}": float(value)
             for name, value in values.items()
@@ -113,7 +113,7 @@ class Events:
             self._try(sink.name, lambda sink=sink: sink.scalars(step, numbers))  # type: ignore[misc]
 
     def flush(self) -> None:
-        """Have every sink write what it holds."""
+        """Flush every sink, and update `tracking.json`."""
         for sink in list(self._open):
             self._try(sink.name, sink.flush)
         self._write()
@@ -176,14 +176,14 @@ def _to_stderr(text: str) -> None:
 
 PROJECT = "restock"  # unless WANDB_PROJECT or MLFLOW_EXPERIMENT_NAME names another
 _PANEL = ("id", "path", "store", "store_version", "others")
-_MAX_PARAMS = 100  # that MLflow takes at a time
-_MAX_VALUE = 500  # characters that every MLflow store takes
+_MAX_PARAMS = 100  # per call of MLflow
+_MAX_VALUE = 500  # characters that every MLflow store accepts
 
 
 def tracker_sinks(
     run: Run, names: Sequence[str], from_step: int | None = None
 ) -> dict[str, Callable[[], Sink]]:
-    """Return a function per tracker that opens it; `from_step` is where a run is resumed."""
+    """Return a function per tracker that opens it; `from_step` is the step of a resumed run."""
     kinds: dict[str, Callable[[], Sink]] = {
         "tensorboard": lambda: TensorBoard(run.path / "tensorboard", from_step),
         "wandb": lambda: WandbSink(run),
@@ -233,13 +233,13 @@ class WandbSink:
 
 
 class MlflowSink:
-    """A run of MLflow, in `RUN/mlflow.db` or where MLFLOW_TRACKING_URI says."""
+    """A run of MLflow, in `RUN/mlflow.db` or at MLFLOW_TRACKING_URI."""
 
     name = "mlflow"
 
     def __init__(self, run: Run) -> None:
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        # With a server that is gone, its default is seven attempts of two minutes each.
+        # By default, MLflow tries an unreachable server seven times, two minutes each.
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
         from mlflow.entities import Param

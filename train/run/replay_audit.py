@@ -1,4 +1,4 @@
-"""Read what a run's critic was fed: its batches summed by stratum, and each audited transition."""
+"""Read what a run's critic was fed: sums by stratum, and the audited transitions one by one."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class ReplayAuditRecord(msgspec.Struct, frozen=True):
     """
 
     transition_id: int  # of a logged row as in the store; of a fresh row negative
-    age_steps: int  # updates since it was collected; of a logged row since the run began
+    age_steps: int  # updates since it was collected; for a logged row, since the run began
     age_days: float | None  # of a logged row: days before training began
-    condition: str | None  # None: the episode of a fresh row had not ended with the run
+    condition: str | None  # None: a fresh row whose episode had not ended when the run did
     behavior_policy: str  # behaviour policy
     action: str  # its name
     reward: float  # the n-step return
@@ -34,7 +34,7 @@ class ReplayAuditRecord(msgspec.Struct, frozen=True):
 
 
 class ReplayAudit(Sequence[ReplayAuditRecord]):
-    """The audited rows of a run, by batch and place in it."""
+    """The audited rows of a run, ordered by batch and by position in the batch."""
 
     def __init__(self, table: pa.Table) -> None:
         self._table = table
@@ -66,7 +66,7 @@ def replay_audit(run: Path | str) -> ReplayAudit:
     """Return the replay audit of a run: `restock sql RUN "FROM replay_audit"` in Python.
 
     Raises:
-        RunError: no run there, or one without audited rows' table.
+        RunError: there is no run, or it has no table `audit`.
     """
     path = Path(run)
     Run.open(path)
@@ -77,14 +77,14 @@ def replay_audit(run: Path | str) -> ReplayAudit:
         return ReplayAudit(connection.sql(f"SELECT {fields} FROM replay_audit").to_arrow_table())
 
 
-SHORT = 0.02  # of the rows fed: less is not worth a word
-LOW_PART = 0.5  # of a quota: a run that fed less warns
+SHORT = 0.02  # share of the rows fed; a smaller shortfall is not mentioned
+LOW_PART = 0.5  # part of a quota; a run that fed less warns
 
 
 def fed_shares(run: Run) -> list[dict[str, Any]]:
     """Return a row per stratum: its natural, wanted, drawn and short share of all rows fed.
 
-    `logs_share` and `fresh_share` say where the drawn rows came from, `reason` why it was short.
+    `logs_share` and `fresh_share` are the sources of the drawn rows, `reason` is why it was short.
     Empty for a run without a panel.
     """
     sql = (files("restock.train.run") / "fed_shares.sql").read_text(encoding="utf-8")
@@ -105,7 +105,7 @@ def shortfalls(fed: list[dict[str, Any]]) -> list[str]:
 
 
 def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows for people of what the critic was fed, in % of all rows (`fed_shares`)."""
+    """Return the rows of `fed_shares` as texts for a table, in % of all rows fed."""
     shares = ("natural", "wanted", "drawn", "logs", "fresh", "short")
     return [
         {"stratum": row["stratum"]}

@@ -5,11 +5,11 @@ progress.parquet …     the tables of `run_tables`, each replaced in one step a
 checkpoints/           latest.safetensors (all state) and best.safetensors (the policy kept)
 tensorboard/           the same curves as events; tracking.json: ids of other trackers
 eval/                  results of `restock eval`
-.lock                  the process that trains it, while it does
+.lock                  names the process that trains the run, while it does
 
-The policy that drives is the best by the run's evaluations. A run that stopped before it evaluated
-what it learned in the twin has only evaluated the policy that it began with: then the latest
-drives, that of its last checkpoint.
+The policy that drives is the best by the run's evaluations. If a run stopped before it evaluated
+what it learned in the twin, these evaluations are only of the policy that it began with: then the
+latest policy drives, that of the last checkpoint.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
 
 FORMAT = "restock-run/3"
-MEAN_OF = "mean_of"  # in config.json: the policies whose mean this run's is; it learned nothing
+MEAN_OF = "mean_of"  # key of config.json: the policies that this run averages, untrained
 _EARLIER = ("restock-run/1", "restock-run/2")
 _LONG_TABLE = 4096  # rows
-_UNKNOWN = -1  # rows on disk: others than those in memory, so the next flush writes them
+_UNKNOWN = -1  # number of rows on disk, if they differ from memory: the next flush writes them
 _AGAIN = "restore the file from a copy, or train the run again"
 Rows = Sequence[Mapping[str, Any]]
 
@@ -78,7 +78,7 @@ class Run:
         """Create a directory with `config.json`.
 
         Raises:
-            RunError: there is something at `path` already.
+            RunError: something is at `path` already.
         """
         path = Path(path)
         check_free(path)
@@ -95,8 +95,8 @@ class Run:
         """Open an existing run.
 
         Raises:
-            RunError: there is none at `path`, or of a format this version does not know. What is
-            wrong with one of its tables is said when that is asked for.
+            RunError: there is no run at `path`, or one in a format that this version cannot read.
+                A damaged table is only found when it is read.
         """
         path = Path(path)
         config = path / "config.json"
@@ -122,7 +122,7 @@ class Run:
         return f"<Run {self.path}>"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled run: the next flush writes all tables, without later rows."""
+        """Restore a pickled run; the next flush replaces all tables, which may have later rows."""
         vars(self).update(state)
         self._on_disk = dict.fromkeys(TABLES, _UNKNOWN)
 
@@ -136,7 +136,7 @@ class Run:
 
     @property
     def absent(self) -> list[str]:
-        """Return the files of missing tables."""
+        """Return the names of missing table files."""
         files = [f"{name}.parquet" for name in TABLES]
         return [file for file in files if not (self.path / file).exists()]
 
@@ -156,14 +156,14 @@ class Run:
         self.append_columns(table, columns)
 
     def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
-        """Add rows given as columns (arrays, lists or scalars that hold for all rows)."""
+        """Add rows given as columns (arrays, lists, or one scalar for all rows)."""
         self._pending[table].append(_to_table(columns, TABLES[table]))
 
     def table(self, name: str) -> pa.Table:
         """Return a table with all rows appended so far, flushed or not.
 
         Raises:
-            RunError: its file is damaged, or a run has no such table.
+            RunError: its file is damaged, or runs have no such table.
         """
         if name not in TABLES:
             has = ", ".join(TABLES)
@@ -176,7 +176,7 @@ class Run:
         return written
 
     def _flushed(self, name: str) -> pa.Table:
-        """Return a table without what was appended since; an opened run reads it on request."""
+        """Return a table without the pending rows; read it from its file the first time."""
         if name not in self._written:
             file, schema = self.path / f"{name}.parquet", TABLES[name]
             self._written[name] = (
@@ -188,10 +188,10 @@ class Run:
         return self._written[name]
 
     def flush(self, *, everything: bool = True) -> None:
-        """Write every table that has new rows, or is not there yet; each in one step.
+        """Write every table that has new rows or no file yet, each in one step.
 
-        Without `everything` a long table waits until it has grown by a sixteenth, so that a run
-        of any length spends little on writing; a checkpoint always writes everything.
+        Without `everything`, a long table is not written until it has grown by a sixteenth, so that
+        a run of any length spends little on writing; a checkpoint always writes everything.
         """
         for name in TABLES:
             path = self.path / f"{name}.parquet"
@@ -221,10 +221,10 @@ class Run:
         return {name: self.table(name).num_rows for name in TABLES}
 
     def truncate(self, counts: Mapping[str, int]) -> None:
-        """Drop rows that were written after the checkpoint of `counts`; `flush` removes them.
+        """Drop each table's rows beyond `counts` from memory; `flush` drops them from the files.
 
         Raises:
-            RunError: a table has fewer rows than the checkpoint knew of.
+            RunError: a table has fewer rows than `counts`, which a checkpoint recorded.
         """
         for name in TABLES:
             table, count = self.table(name), int(counts.get(name, 0))
@@ -242,7 +242,7 @@ class Run:
 def check_free(path: Path, remedy: str | None = None) -> None:
     """Raise RunError if `path` is taken, or no run can be made there.
 
-    `remedy` is what to do about a run that is there.
+    `remedy` replaces the usual advice if something is there.
     """
     expect_place(path, RunError)
     if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
@@ -255,12 +255,12 @@ def check_free(path: Path, remedy: str | None = None) -> None:
 
 
 def resuming(path: Path) -> str:
-    """Return the command that continues a run, to be pasted in a shell."""
+    """Return the command that continues a run, to paste into a shell."""
     return f"`restock train --resume {quoted(path)}`"
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions that decide a run's numbers besides its config."""
+    """Return the versions of Python and of the packages that affect a run's numbers."""
     from platform import python_version
 
     from restock import __version__
@@ -274,7 +274,7 @@ def software_versions() -> dict[str, str]:
 
 
 def panel_document(panel: Panel) -> dict[str, Any]:
-    """Return the part of a run's `config.json` about its panel, for every library."""
+    """Return the part of `config.json` about the panel, for runs of every library."""
     header = panel.header
     return {
         "path": str(panel.path.resolve()),
@@ -292,7 +292,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
 
 
 def now_ns() -> int:
-    """Return the wall time, ns; at a run's start it is the reference for ages of logged rows."""
+    """Return the wall time, ns; that of a run's start is the reference for ages of logged rows."""
     return time.time_ns()
 
 
@@ -320,11 +320,11 @@ def _is_column(value: Any) -> bool:
     return hasattr(value, "__len__") and not isinstance(value, str | bytes)
 
 
-LOCK = ".lock"  # in a run; says who writes it: process and machine
+LOCK = ".lock"  # file in a run that names the process and machine which write it
 
 
 class RunLock:
-    """The lock of a run: taken when it is made, until `release`."""
+    """The lock of a run, held from its construction until `release`."""
 
     def __init__(self, run: Path) -> None:
         """Take the lock; raise RunError if another process trains this run."""
@@ -345,7 +345,7 @@ class RunLock:
                 return
             if _is_at(file, self._path):
                 self._file = file
-            else:  # whoever held it has removed the file since it was opened
+            else:  # the last holder has removed the file since it was opened here
                 os.close(file)
         os.ftruncate(self._file, 0)
         os.write(self._file, f"{os.getpid()} {platform.node()}".encode())
@@ -379,10 +379,10 @@ def _refused(run: Path, holder: str) -> RunError:
 
 @dataclass(frozen=True)
 class PolicyOrigin:
-    """The training step that a policy is from, and why it is the one that drives."""
+    """The training step of the policy that drives, and why this policy was chosen."""
 
     chosen: Literal["best", "latest", "mean"]
-    env_steps: int  # of several runs together for their mean
+    env_steps: int  # for a mean of runs, the sum over the runs
     gradient_steps: int
     run_env_steps: int  # of the run so far; 0: it never drove
 
@@ -417,14 +417,14 @@ def kept_policy(run: Run) -> PolicyOrigin | None:
 
 
 def chosen_policy(run: Run) -> Literal["best", "latest", "mean"]:
-    """Return which of its policies a run drives by."""
+    """Return which of its policies a run drives with."""
     if MEAN_OF in run.document:
         return "mean"
     return "latest" if latest_drives(run) else "best"
 
 
 def latest_drives(run: Run) -> bool:
-    """Return whether the run has learned but never evaluated that in the twin."""
+    """Return whether the run learned something that it never evaluated in the twin."""
     latest, best = _values(run.latest), _values(run.best)
     if not latest:
         return False
@@ -450,7 +450,7 @@ def run_clocks(run: Run) -> dict[str, Any]:
 
 
 def env_steps_of(run: Run) -> int:
-    """Return the environment steps of a run so far, by its last checkpoint and its tables."""
+    """Return the environment steps of a run so far, the most in its checkpoint and tables."""
     steps: list[int] = [run_clocks(run).get("env_steps", 0)]
     for name in ("progress", "evaluations"):
         steps += run.table(name)["env_steps"].to_pylist()
@@ -458,7 +458,7 @@ def env_steps_of(run: Run) -> int:
 
 
 def _values(path: Path) -> dict[str, Any]:
-    """Return the numbers and texts of a checkpoint without arrays; empty if it cannot be read."""
+    """Return a checkpoint's state without loading arrays; empty if it cannot be read."""
     try:
         with safe_open(path, framework="numpy") as opened:
             values = json.loads((opened.metadata() or {})["state"])
