@@ -1,1 +1,1 @@
-"""Other libraries trained in the twin and on the mixtures."""
+"""Training with other libraries, in the twin and on mixtures."""

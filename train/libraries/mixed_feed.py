@@ -1,12 +1,12 @@
 """Draw, label and record the rows of Stable-Baselines3's replay buffer: logs by quota, and fresh.
 
-The library owns the training loop. Its buffer (`restock.train.libraries.sb3_buffer`) asks this
-class for rows of the panel, tells it every step and every batch, and so leaves a run directory with
-the same tables as `restock train` does: `strata`, `ages`, `policies`, `sampled_episodes`,
+The library runs the training loop. Its buffer (`restock.train.libraries.sb3_buffer`) draws rows of
+the panel from this class, and passes every step and every batch to it. So the run directory gets
+the same tables as that of `restock train`: `strata`, `ages`, `policies`, `sampled_episodes`,
 `episodes`, `audit` and `progress`.
 
 The twin's single environment gives the signals at t and at t + 1 in the `info` of each step, so an
-episode that ended is labelled by the very conditions, over the very signals, that label logs.
+episode that ended is labelled by the same conditions, over the same signals, as logs.
 """
 
 from __future__ import annotations
@@ -58,30 +58,31 @@ class FeedOptions:
     """Keyword options of the buffer."""
 
     run: str | Path | None = None  # the run directory to make; None: no record is kept
-    logs_share: float | None = None  # of a batch; None: the panel's own
-    # Whose task and conditions the environment has; None: the panel's, without one warehouse_amr's.
+    logs_share: float | None = None  # share of a batch; None: as the panel's mixture
+    # Profile whose task and conditions the environment has. None: the panel's; without a panel
+    # warehouse_amr.
     profile: str | None = None
-    seed: int = 0  # of the draws and of which batches are audited
-    audit_share: float = 0.01  # of all batches, each row of which is written down
-    log_every: int = 500  # batches summed into one row of each table
-    # What else makes the run what it is, by the keys of `restock train`: target, loss, optimizer, …
+    seed: int = 0  # of the draws, and of the choice of batches to audit
+    audit_share: float = 0.01  # share of batches whose rows are all recorded
+    log_every: int = 500  # batches per logging interval
+    # Other settings to record in the run, by the keys of `restock train`: target, loss, …
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 class MixedFeed:
-    """The rows of a panel and of a ring of fresh ones, drawn as the panel's mixture says.
+    """A source of batches: rows of a panel and of a ring of fresh rows, by the panel's mixture.
 
     Args:
         capacity, num_envs, observation_size, n_step: of the ring, `ring`.
-        discount: of its rows; None: the panel's, without one .99.
+        discount: of the ring's rows; None: the panel's, or .99 without a panel.
         panel: None for fresh rows alone.
 
-    A panel of a table of any task has no profile: of fresh rows, the environment then names the
-    condition of each step in `info["condition"]`.
+    A panel made from a table of any task has no profile. The environment then names the condition
+    of each step in `info["condition"]`.
 
     Raises:
-        ConfigError: a share outside [0, 1].
-        PanelError: a panel of another task than the environment's.
+        ConfigError: `logs_share` is outside [0, 1].
+        PanelError: the panel's task is not the environment's.
         RunError: something is at `run` already.
     """
 
@@ -109,7 +110,7 @@ class MixedFeed:
         self.env_steps = self.batches = self.invalid_steps = 0
         self.episode_labels = EpisodeLabels()
         self._sampler: LoggedSampler | None = None
-        self._td_missing = False  # of the TD errors of the batch before
+        self._td_missing = False  # whether the last batch came without TD errors
         self._phase = "offline"
         self._open = 0  # batches since the last rows were written
         self._episodes: dict[int, dict[str, Any]] = {}
@@ -141,7 +142,7 @@ class MixedFeed:
             )
 
     def take(self, envs: Ints, keys: Ints, ended: NDArray[Any], infos: Sequence[Any]) -> None:
-        """Take one step of `envs` (n,) in episodes `keys` (n,), and label those that ended."""
+        """Add one step of `envs` (n,) in episodes `keys` (n,), and label episodes that ended."""
         self.env_steps += len(envs)
         for env, key, over, info in zip(
             envs.tolist(), keys.tolist(), np.asarray(ended).tolist(), infos, strict=True
@@ -164,11 +165,11 @@ class MixedFeed:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
 
     def draw_logs(self, batch_size: int) -> BatchDraw:
-        """Draw the logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
+        """Draw the logged rows (L,) of a batch, by the mixture; all of it while the ring is empty.
 
         Raises:
-            MixtureError: nothing is fresh, and the panel's rows were drawn as often as they may be;
-                or the draws follow TD errors and those of the last batch were not given.
+            MixtureError: the ring is empty and the panel's rows have reached their limit of draws;
+                or the draws depend on TD errors, and the last batch came without them.
         """
         if self.logs is None:
             return NO_LOGS
@@ -196,10 +197,10 @@ class MixedFeed:
         return drawing
 
     def draw_fresh(self, count: int) -> Ints:
-        """Draw `count` slots of the ring uniformly, of those young enough for the mixture.
+        """Draw `count` slots of the ring uniformly, of rows within the mixture's limit of age.
 
         Raises:
-            MixtureError: there is none.
+            MixtureError: there is no such row.
         """
         if not count:
             return _NO_ROWS
@@ -223,10 +224,10 @@ class MixedFeed:
         td: F32 | None = None,
         q: F32 | None = None,
     ) -> None:
-        """Record the batch of one update, logs first: packed rows (B, W) and what is known of them.
+        """Record the batch of one update, packed rows (B, W) with those from logs first.
 
-        `td` (Q - target) and `q` (B,) are null in the tables if they are unknown. Priorities follow
-        `td` where it is known.
+        `td` (Q - target) and `q`, (B,), are null in the tables if they are None. Priorities are
+        updated by `td` if it is given.
 
         Raises:
             NotFinite: a row or a TD error is NaN or infinite; names the rows.
@@ -236,7 +237,7 @@ class MixedFeed:
         try:
             check_fed(packed, td, lambda: self._row_ids(drawing, slots), run=path, steps=steps)
         except NotFinite:
-            self.flush()  # the tables up to here are whole
+            self.flush()  # the tables are complete up to here
             raise
         if self._sampler is not None and self._sampler.needs_td and len(drawing.rows):
             self._td_missing = td is None
@@ -245,7 +246,7 @@ class MixedFeed:
                 self._sampler.update(drawing.rows, td_abs)
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
-            self._close_interval()  # an interval is of one phase
+            self._close_interval()  # an interval has one phase
             self._phase = phase
         self.batches += 1
         if self.record is None:
@@ -272,8 +273,8 @@ class MixedFeed:
     def evaluated(self, episodes: Rows = (), steps: Rows = ()) -> None:
         """Record an evaluation: rows of the run's tables `evaluations` and `evaluation_buffer`.
 
-        `compare` needs each episode's condition, episode_seed, success and return; `diagnose` needs
-        rows, td_abs_mean, td_online_abs_mean and q_lag of each condition's steps.
+        `compare` needs condition, episode_seed, success and return of each episode. `diagnose`
+        needs condition, rows, td_abs_mean, td_online_abs_mean and q_lag, a row per condition.
         """
         if self.run is None:
             return
@@ -290,10 +291,7 @@ class MixedFeed:
         return row_ids(self.logs, drawing.rows, meta["episode"][slots], meta["episode_step"][slots])
 
     def flush(self) -> None:
-        """Write the rows of the open interval, and those whose episodes go on without conditions.
-
-        The run's files are whole after it.
-        """
+        """Write all rows to the run's files, those of running episodes without their conditions."""
         self._close_interval()
         if self.record is not None and self.run is not None:
             self.record.write_held()
@@ -321,13 +319,13 @@ class MixedFeed:
         self.run.flush()
 
     def begin_episodes(self) -> None:
-        """Expect no more steps of the episodes that were under way."""
+        """Give up the running episodes: none of them will get another step or labels."""
         self.labels.forget()
         for key in self.ring.begin_episodes().tolist():
             self.episode_labels.give_up(key)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Save how long it ran, since this process's clock means nothing in another."""
+        """Save how long it ran in place of its start: another process has another clock."""
         return vars(self) | {"_begun": time.monotonic() - self._begun}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -336,9 +334,9 @@ class MixedFeed:
 
 
 def environment_profile(name: str | None, panel: Panel | None) -> Profile | None:
-    """Return the profile of this name; without one the panel's, without a panel warehouse_amr.
+    """Return the profile `name`; without a name the panel's, without a panel warehouse_amr.
 
-    None for a panel of a table of any task.
+    None if the panel was made from a table of any task, which has no profile.
     """
     if name is None and panel is not None:
         return None if panel.task_hash.startswith("table-") else profile_of_panel(panel)
@@ -346,7 +344,7 @@ def environment_profile(name: str | None, panel: Panel | None) -> Profile | None
 
 
 def labels_of(profile: Profile | None, panel: Panel | None, num_envs: int) -> FreshLabels:
-    """Return what labels fresh episodes: the profile's conditions, else the environment itself."""
+    """Make the labeller of fresh episodes: by the profile's conditions, or by infos without one."""
     if profile is None:
         names = panel.header.conditions if panel is not None else [NOMINAL]
         return FreshLabels(None, num_envs, names)
@@ -375,7 +373,7 @@ def _check(panel: Panel, profile: Profile | None, observation_size: int) -> None
         )
 
 
-# Of an episode that ended, by the info of its last step.
+# Columns of `episodes` that the info of an episode's last step has under the same name.
 _INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
 
 
@@ -386,7 +384,7 @@ def _create_run(
     num_envs: int,
     options: FeedOptions,
 ) -> Run:
-    """Make the run and write its `config.json`. Raises RunError when something is at `path`."""
+    """Make the run and write its `config.json`; raise RunError if something is at `path`."""
     check_free(path, _GO_ON)
     mixed = None
     if panel is not None:
@@ -421,7 +419,7 @@ def _create_run(
 
 
 class PartialTables:
-    """A run's tables in which missing values and NaN are null."""
+    """A writer to a run's tables that writes missing values and NaN as null."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
@@ -435,7 +433,7 @@ class PartialTables:
 
 
 def column(values: Any) -> Any:
-    """Return a column, or one value for all rows, without NaNs."""
+    """Return a column, or one value for all rows, with None for NaN."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
         values = values.tolist()
     return [known(value) for value in values] if isinstance(values, list) else known(values)
@@ -447,7 +445,7 @@ def known(value: Any) -> Any:
 
 
 def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row of `episodes`, as far as the last step's info tells."""
+    """Return a row of `episodes`, with the columns that the last step's info has."""
     columns = set(TABLES["episodes"].names)
     row = {"env": env, "episode": key, "conditions": []}
     row |= {name: _plain(info[name]) for name in _INFO if name in info}
@@ -464,28 +462,28 @@ def _plain(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
-EPISODES_PER_QUERY = 8  # at most: as many as there are environments
+EPISODES_PER_QUERY = 8  # at most; fewer if there are fewer environments
 _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")
 _NAMES = tuple(signal.name for signal in STORED_SIGNALS)
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """An episode's labels: the code of each step's condition, nominal last."""
+    """The labels of an episode."""
 
     key: int
-    codes: Ints  # (T,)
-    conditions: list[str]  # that held at some step
+    codes: Ints  # (T,) of each step's condition; the last code is nominal
+    conditions: list[str]  # conditions that held at some step
 
 
 class FreshLabels:
-    """Labels of N environments' episodes, by the infos of their steps.
+    """The labeller of N environments' episodes, by the infos of their steps.
 
     Args:
-        conditions: that label the infos' signals; None: each info names its step's `condition`.
-        names: of the conditions that infos may name.
+        conditions: evaluated on the infos' signals; None: each info names its step's `condition`.
+        names: the conditions that infos may name.
 
-    An episode with a step whose info lacks signals, or names no known condition, has no labels.
+    An episode gets no labels if the info of a step lacks signals, or names no known condition.
     """
 
     def __init__(
@@ -499,12 +497,12 @@ class FreshLabels:
             self.names = (*(condition.name for condition in self.conditions), NOMINAL)
             self._enough = min(EPISODES_PER_QUERY, num_envs)
         self._running: list[list[Any]] = [[] for _ in range(num_envs)]
-        self._ended: list[tuple[int, list[Any]]] = []  # key, and what is known of each step
+        self._ended: list[tuple[int, list[Any]]] = []  # key, and the signals or name of each step
 
     def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> bool:
-        """Take one environment's step; `key` names its episode.
+        """Add one environment's step; `key` names its episode.
 
-        Returns whether the episode will have labels, as far as is known.
+        Returns False if the episode has ended and cannot be labelled, else True.
         """
         steps = self._running[env]
         steps.append(self._known(info))
@@ -530,11 +528,11 @@ class FreshLabels:
         return row | {name: after[name] for name in _COMMANDS}
 
     def forget(self) -> None:
-        """Forget the episodes under way: they stay unlabelled."""
+        """Forget the running episodes: they stay unlabelled."""
         self._running = [[] for _ in self._running]
 
     def label(self, *, all_of_them: bool = False) -> list[Labelled]:
-        """Label the ended episodes, once enough wait to be worth a query."""
+        """Label the ended episodes once enough wait for a query; return their labels."""
         waiting = self._ended
         if not waiting or (len(waiting) < self._enough and not all_of_them):
             return []
@@ -571,7 +569,7 @@ class FreshLabels:
             codes = np.zeros(len(rows), np.int64)
         labelled, begin = [], 0
         for (key, _), length in zip(waiting, lengths, strict=True):
-            inside = slice(begin, begin + length - 1)  # the last step is no transition
+            inside = slice(begin, begin + length - 1)  # no transition begins at the last step
             begin += length
             names = [name for name, steps in held.items() if steps[inside].any()]
             labelled.append(Labelled(key, codes[inside], names))

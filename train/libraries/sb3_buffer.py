@@ -10,11 +10,11 @@
     model.replay_buffer.close()
 
 The panel is opened and the run is made when the first step is added or the first batch is drawn:
-`DQN.load` makes the buffer, too, and a model that is loaded to act needs neither.
+`DQN.load` creates the buffer, too, and a model that is loaded to act needs neither.
 
-Each batch is `logs_share` rows of the panel, by its quotas, and fresh rows for the rest; while
-nothing is fresh, all of it is logs, so `model.train` can be called before `model.learn`. Rows carry
-their own discount (gamma^n, n as the panel and `n_step` have it), which replaces the model's gamma.
+A batch has `logs_share` rows of the panel, by its quotas, and fresh rows for the rest. While there
+are no fresh rows, all are logged, so `model.train` can be called before `model.learn`. Each row has
+its own discount (gamma^n, with n of the panel or `n_step`), which replaces the model's gamma.
 """
 
 from __future__ import annotations
@@ -44,24 +44,25 @@ Critic = Callable[[ReplayBufferSamples], tuple[torch.Tensor, torch.Tensor]]
 
 
 class MixtureReplayBuffer(ReplayBuffer):
-    """A `replay_buffer_class` that mixes a panel of logs with what the algorithm collects.
+    """A `replay_buffer_class` that mixes a panel of logs with the rows that the algorithm collects.
 
     `replay_buffer_kwargs` may hold:
 
     - `panel`: a panel or its directory; without one all rows are fresh.
     - `n_step`, `discount`: of fresh rows; default 1, and the panel's discount or .99.
-    - `ignore_weights`: the panel's importance weights are not used: Stable-Baselines3's losses
-      have no place for any. Without it a panel that has weights is refused.
+    - `ignore_weights`: True accepts a panel with importance weights, and does not use them:
+      Stable-Baselines3's losses cannot. Without it, such a panel is refused.
     - `commands`: (n, 2), the command of every row of the panel, for a continuous action space; see
       `logged_commands`. Default: the task's action that was nearest to it.
     - `run`, `logs_share`, `profile`, `seed`, `audit_share`, `log_every`: see `FeedOptions`.
 
-    `critic`, if set, is asked for (Q, TD) of every batch, (B,) each, which are then recorded by
+    `critic`, if set, computes (Q, TD) of every batch, (B,) each, which are then recorded by
     condition; `dqn_critic(model)` makes one. It costs its forward passes.
 
     Raises:
-        MixtureError: `optimize_memory_usage`; at first use, weights that cannot be applied.
-        PanelError: at first use, no panel there, or one of another task or with other actions.
+        MixtureError: `optimize_memory_usage` is True; at first use, the panel has weights, or
+            `commands` has another shape.
+        PanelError: at first use, there is no such panel, or it has another task.
         RunError: at first use, something is at `run` already.
     """
 
@@ -84,7 +85,7 @@ class MixtureReplayBuffer(ReplayBuffer):
     ) -> None:
         if optimize_memory_usage:
             raise MixtureError("optimize_memory_usage is unsupported with a mixture")
-        # The rows are kept below, packed as the panel's are; the parent keeps next to nothing.
+        # The ring has the rows, packed like the panel's; the parent gets almost no memory.
         super().__init__(n_envs, observation_space, action_space, device, n_envs=n_envs)
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size, n_envs * n_step)
@@ -94,7 +95,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self._options = FeedOptions(**options)
         self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
         self._waiting_actions: dict[tuple[int, int], F32] = {}
-        self._steps = np.zeros(n_envs, np.int64)  # of the running episodes
+        self._steps = np.zeros(n_envs, np.int64)  # so far in the running episodes
         self._log_actions: F32 | None = None
         self.critic: Critic | None = None
 
@@ -129,7 +130,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         return self.feed.ring
 
     def _logged_actions(self, panel: Panel | None, commands: NDArray[Any] | None) -> F32 | None:
-        """Return actions (n, A) as Stable-Baselines3 keeps them: indices or scaled commands."""
+        """Return logged actions (n, A) in Stable-Baselines3's form: indices or scaled commands."""
         if panel is None:
             return None
         index = panel.rows[:, panel.columns["action"]]
@@ -166,7 +167,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         cut &= self.handle_timeout_termination
         chosen = action.reshape(self.n_envs, self.action_dim)
         index = chosen[:, 0]
-        if self.continuous:  # for the record: the task's action that was nearest
+        if self.continuous:  # the record has the task's action that was nearest
             index = np.array([info.get("action", 0) for info in infos])
         before = ring.appended
         keys = ring.append(
@@ -182,7 +183,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         )
         for key, step, taken in zip(keys.tolist(), self._steps.tolist(), chosen, strict=True):
             self._waiting_actions[key, step] = np.array(taken, np.float32)
-        # An n-step row comes out steps later: its episode and step say whose action it has.
+        # The ring adds an n-step row steps later: find its action by its episode and step.
         for slot in (np.arange(before, ring.appended) % ring.capacity).tolist():
             place = int(ring.meta["episode"][slot]), int(ring.meta["episode_step"][slot])
             self._fresh_actions[slot] = self._waiting_actions.pop(place)
@@ -242,15 +243,15 @@ class MixtureReplayBuffer(ReplayBuffer):
 
     def close(self) -> None:
         """Write the rest of the record; the run is complete after it."""
-        if "feed" in vars(self):  # a model that was only loaded made no run
+        if "feed" in vars(self):  # a model that was only loaded has made no run
             self.feed.flush()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the critic: it holds the model, which is saved by itself."""
+        """Leave out the critic: it refers to the model, which is saved by itself."""
         return vars(self) | {"critic": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin new episodes, as the environments do when a loaded model goes on."""
+        """Restore the buffer, and begin new episodes, as the environments of a loaded model do."""
         vars(self).update(state)
         if "feed" in vars(self):
             self.feed.begin_episodes()
@@ -259,7 +260,7 @@ class MixtureReplayBuffer(ReplayBuffer):
 
 
 def weighted(panel: Panel) -> bool:
-    """Return whether batches of a panel are to be weighted, by corrections or by a draw rule."""
+    """Return whether a panel's rows have importance weights, by a correction or a draw rule."""
     by_rule = any(RULES[stratum.within].has_weights for stratum in panel.strata)
     return by_rule or any(stratum.correction != "none" for stratum in panel.strata)
 
@@ -278,9 +279,7 @@ def dqn_critic(model: Any) -> Critic:
 
 
 def logged_commands(panel: Panel | str | Path, store: str | Path) -> F32:
-    """Read the command (m/s, rad/s) of every row of a panel (or its folder), (n, 2).
-
-    Commands come from the store of the panel.
+    """Read the command (m/s, rad/s) of every row of a panel, (n, 2), from the panel's store.
 
     Raises:
         MixtureError: the store lacks rows of the panel.

@@ -1,1 +1,1 @@
-"""Studies: methods x mixtures x seeds, ending in one comparison."""
+"""Studies: methods x mixtures x seeds, compared at the end."""
