@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
 
 FORMAT = "restock-run/3"
-MEAN_OF = "mean_of"  # key of config.json: the policies that this run averages, untrained
+MEAN_OF = "mean_of"  # key of config.json: policies whose mean this untrained run is
 _EARLIER = ("restock-run/1", "restock-run/2")
 _LONG_TABLE = 4096  # rows
 _UNKNOWN = -1  # number of rows on disk, if they differ from memory: the next flush writes them

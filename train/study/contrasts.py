@@ -1,10 +1,10 @@
-"""Measure each run of a study by one number, and contrast arms, paired by seed.
+"""Compute measures of each run of a study, and contrast arms in a measure, paired by seed.
 
-A measure is named `auc_WHAT` or `success_WHAT`. `auc` is the area under the run's own curve of
-success over environment steps (trapezoids, divided by the steps: a mean success on the way),
-`success` is the kept policy's, on the episodes that judge it and did not choose it. WHAT is a cell
-(`CELLS`), or `rare`, the mean over the rare conditions. Of blocked aisles the partly and
-the wholly blocked count by half each, however many of each were drawn.
+A measure is named `auc_WHAT` or `success_WHAT`. `auc` is the area under the run's curve of success
+over environment steps (by trapezoids, divided by the steps, so it is a mean success in training).
+`success` is that of the kept policy, on the episodes of the study's evaluation, which did not
+select it. WHAT is a cell (`CELLS`), or `rare`, the mean over the rare conditions. Partly and wholly
+blocked aisles count half each, however many of each were drawn.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from restock.train.evaluation.paired import agent_episodes
 from restock.train.run.run import Run
 from restock.train.twin.missions import MISSIONS
 
-CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {  # what a measure may name
+# WHAT of a measure -> the (condition, block) pairs whose mean success it is; block None: none.
+CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {
     **{
         name: tuple((name, block) for block in one.blocks or (None,))
         for name, one in MISSIONS.items()
@@ -41,7 +42,7 @@ KINDS_OF_MEASURE = ("auc", "success")
 
 
 def unknown_measure(name: str) -> str | None:
-    """Return what is wrong with the name of a measure, or None."""
+    """Return what is wrong with the name of a measure; None if it is valid."""
     kind, _, what = name.partition("_")
     if kind in KINDS_OF_MEASURE and what in (*CELLS, "rare"):
         return None
@@ -59,23 +60,23 @@ class Contrast:
     baseline: str
     measure: str
     primary: bool
-    pairs: int  # seeds of which both runs are there
+    pairs: int  # seeds with both runs
     arm_mean: float
     baseline_mean: float
     difference: float
-    low: float | None  # of its 95 % interval, Student's t; None: see `no_interval`
+    low: float | None  # end of its 95 % interval, Student's t; None: see `no_interval`
     high: float | None
     sd: float | None  # of the paired differences
-    p: float | None  # of no difference
-    p_holm: float | None = None  # adjusted for all contrasts that are not the primary one
-    no_interval: str | None = None  # why there is neither an interval nor a p
+    p: float | None  # under the hypothesis of no difference
+    p_holm: float | None = None  # adjusted for all contrasts except the primary one
+    no_interval: str | None = None  # why there is neither an interval nor a p value
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
 
 
 class RunCurve:
-    """A finished run's success by cell, over training and of the kept policy."""
+    """A finished run's success by cell, in training and of the kept policy."""
 
     def __init__(self, path: Path) -> None:
         self._run = Run.open(path)
@@ -91,7 +92,7 @@ class RunCurve:
     def conditions(self) -> list[tuple[str, int, float]]:
         """Return condition, environment steps and success of each evaluation in training.
 
-        Partly and wholly blocked aisles count by half each, however many of each were drawn.
+        Partly and wholly blocked aisles count half each, however many of each were drawn.
         """
         found = []
         for step, cells in self._at.items():
@@ -101,14 +102,14 @@ class RunCurve:
         return found
 
     def value(self, measure: str, reach: tuple[float, float] | None = None) -> float:
-        """Return the run's value of a measure over a range of steps; NaN if not known."""
+        """Return the run's value of a measure, an `auc` over the steps `reach`; NaN if unknown."""
         kind, _, what = measure.partition("_")
         if kind == "success":
             return self._of(self.end, what)
         return area(self.steps, np.array(list(self.curve(what).values())), reach)
 
     def curve(self, what: str) -> dict[int, float]:
-        """Return success at each periodic evaluation, by ascending environment steps."""
+        """Return success in `what` by environment steps, one value per periodic evaluation."""
         return {step: self._of(self._at[step], what) for step in self.steps.tolist()}
 
     def _of(self, success: Mapping[tuple[str, str], float], what: str) -> float:
@@ -119,17 +120,18 @@ class RunCurve:
                 success.get((condition, block or "none"), float("nan"))
                 for condition, block in CELLS[what]
             ]
-        # A study may leave out kinds, and a few episodes may all be blocked alike: that half then
-        # stands for both.
+        # A study may leave out kinds, and all of a few aisles may be blocked alike: the mean is
+        # then over the cells that were driven.
         known = [value for value in own if not np.isnan(value)]
         return _mean(known) if known else float("nan")
 
 
 def area(steps: F64, values: F64, reach: tuple[float, float] | None = None) -> float:
-    """Return the area under a curve by trapezoids over its range of steps; NaN from one point.
+    """Return the mean of a curve over a range of steps, by trapezoids; NaN if it has one point.
 
     Args:
-        steps, values: (n,); `reach` is the range, where the curve is cut or None for all of it.
+        steps, values: (n,) the points of the curve.
+        reach: lower and upper end of the range; None: all of the curve.
     """
     low, high = reach if reach is not None else (float(steps[0]), float(steps[-1]))
     if len(steps) < 2 or high <= low:
@@ -149,8 +151,8 @@ def contrast(
 ) -> Contrast | None:
     """Return one contrast; None if no pair of runs has the measure.
 
-    Runs are (the arm's, the baseline's) of each seed. Curves are compared at steps where all have
-    evaluations.
+    `runs` are the arm's and the baseline's run of each seed. Areas under curves are taken over the
+    range of steps that all curves cover.
     """
     if not runs:
         return None
@@ -186,14 +188,14 @@ def contrast(
 
 
 def _why_no_interval(ahead: F64) -> str | None:
-    """Return what `paired_t` lacks in paired differences (n,), or None."""
+    """Return why `paired_t` gives no interval for paired differences (n,); None if it does."""
     if (seeds := len(ahead)) < MIN_PAIRS:
         return f"{counted(seeds, 'seed')}, at least {MIN_PAIRS} are needed"
     return "the same in every seed: nothing varies" if nothing_varies(ahead) else None
 
 
 def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:
-    """Return the contrasts with p adjusted (Holm) for all but the primary one."""
+    """Return the contrasts with Holm's adjusted p for all but the primary one."""
     places = [i for i, one in enumerate(contrasts) if not one.primary and one.p is not None]
     adjusted = holm([float(contrasts[i].p or 0.0) for i in places])
     found = list(contrasts)
@@ -238,7 +240,7 @@ def _curve_of(path: Path) -> list[tuple[str, int, float]]:
 
 
 def training_cost(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
-    """Return per arm the mean environment steps, updates and seconds of a run."""
+    """Return a row per arm: the mean environment steps, updates and seconds of its runs."""
     rows = []
     for arm, paths in arms.items():
         last = [row for path in paths if (row := _last_progress(path)) is not None]
@@ -259,7 +261,7 @@ def _last_progress(path: Path) -> dict[str, Any] | None:
 
 
 def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
-    """Return success by cell at each evaluation; of two at one step, the later one."""
+    """Return success by cell for each evaluation; of two at the same steps, the later one."""
     by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
     for row in table.to_pylist():
         step, update = int(row["env_steps"]), int(row["gradient_steps"])

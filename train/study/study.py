@@ -1,4 +1,4 @@
-"""A study: arms x seeds as its TOML file describes them, and the jobs to do."""
+"""A study: the arms and seeds of its TOML file, and the runs to make of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from restock.train.twin.missions import KINDS
 
 
 class ArmConfig(Checked, frozen=True):
-    """One method: a panel (or a mixture of the study's store, or none) and settings."""
+    """One method: settings, and a panel, a mixture of the study's store, or neither."""
 
     name: str
     mixture: str | None = None  # name of a shipped mixture, or a TOML file
@@ -51,9 +51,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class StudyEvaluation(Checked, frozen=True):
-    """What every run drives at its end, with the planner and the operator beside it once."""
+    """The episodes that every run's policy drives at its end; planner and operator do so once."""
 
-    # Of each kind, or by kind; a kind that a table leaves out is not driven.
+    # Number per kind, or a table by kind; a kind that the table leaves out is not driven.
     episodes: Count | dict[str, Count] = 40
     perturbations: tuple[str, ...] = ("none",)
 
@@ -66,16 +66,16 @@ class StudyEvaluation(Checked, frozen=True):
 
     @property
     def of_kind(self) -> Mapping[str, int]:
-        """Return the episodes by kind."""
+        """Return the number of episodes by kind."""
         if isinstance(self.episodes, dict):
             return self.episodes
         return dict.fromkeys(KINDS, self.episodes)
 
 
 class Primary(Checked, frozen=True):
-    """The one contrast that a study tests, named before its runs."""
+    """The one contrast that a study tests, chosen before its runs."""
 
-    arm: str  # compared with its baseline
+    arm: str  # it is compared with its baseline
     measure: str
 
 
@@ -89,17 +89,17 @@ class Pair:
 
 
 class Study(Checked, frozen=True):
-    """The whole file."""
+    """The content of a study's TOML file."""
 
-    arms: tuple[ArmConfig, ...]  # the first is the baseline of those that name none
+    arms: tuple[ArmConfig, ...]  # the first is the baseline of arms that name none
     doc: str = ""
     store: str | None = None  # store from which mixtures are made
     seeds: tuple[int, ...] = (0, 1, 2)
-    treatment: Treatment = "mixture"  # where an arm names none
+    treatment: Treatment = "mixture"  # of arms that name none
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of all arms
     evaluation: StudyEvaluation = StudyEvaluation()
     primary: Primary | None = None
-    # Of the other contrasts, whose p values are adjusted for their number.
+    # Measures of the other contrasts, whose p values are adjusted for their number.
     measures: tuple[str, ...] = ("auc_rare", "success_rare", "success_nominal")
 
     def check(self) -> None:
@@ -149,7 +149,7 @@ class Study(Checked, frozen=True):
 
     @property
     def pairs(self) -> list[Pair]:
-        """Return the comparisons, in the order of the arms."""
+        """Return the comparisons, one per arm after the first, in the order of the arms."""
         return [
             Pair(
                 arm,
@@ -167,7 +167,7 @@ def load_study(path: Path | str) -> Study:
     """Load a study from a TOML file.
 
     Raises:
-        ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
+        ConfigError: the file is missing or not TOML, a key is unknown or a value invalid; names it.
     """
     remedy = "docs/compare.md lists every key with its meaning"
     document = read_toml(Path(path))
@@ -183,7 +183,7 @@ def load_study(path: Path | str) -> Study:
 
 
 def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str) -> None:
-    """Refuse an arm that makes no update, before its runs are trained."""
+    """Raise ConfigError if the runs of an arm would make no update."""
     has_logs = arm.mixture is not None or arm.panel is not None
     if (has_logs and schedule.offline_updates) or schedule.env_steps > schedule.warmup_env_steps:
         return
@@ -197,7 +197,7 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
 
 
 def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
-    """Raise ConfigError if a run could not be evaluated after training."""
+    """Raise ConfigError if the evaluation names an unknown perturbation."""
     names = evaluation.perturbations
     refuse_unknown("perturbations", names, where=f"{where}: evaluation.perturbations")
 
@@ -205,7 +205,7 @@ def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
 def _refuse_shared_episodes(
     arm: ArmConfig, chosen: EvaluationConfig, evaluation: StudyEvaluation, where: str
 ) -> None:
-    """Refuse to judge the kept policy on the episodes that chose it."""
+    """Raise ConfigError if an arm's policy would be judged on the episodes that select it."""
     judged = FIRST_SEED, FIRST_SEED + max(evaluation.of_kind.values())
     if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
         raise ConfigError(
@@ -216,7 +216,7 @@ def _refuse_shared_episodes(
         )
 
 
-DONE = "study.json"  # in a run that was trained and evaluated as the study asks
+DONE = "study.json"  # file in a run that was trained and evaluated as the study requests
 
 
 @dataclass(frozen=True)
@@ -229,21 +229,21 @@ class StudyJob:
 
     @property
     def done(self) -> Path:
-        """Return the file that exists once the run was trained and evaluated as requested."""
+        """Return the file that exists once the run is trained and evaluated as requested."""
         return self.path / DONE
 
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A study and its folders: the runs to do."""
+    """A study with its folders."""
 
     study: Study
-    folder: Path  # of the TOML: its paths are relative to it
+    folder: Path  # the TOML file's folder; paths in the file are relative to it
     out: Path
 
     @property
     def jobs(self) -> list[StudyJob]:
-        """Return the jobs, seed by seed: an interrupted study has fewer seeds of all arms."""
+        """Return the jobs seed by seed: an interrupted study then has all arms of some seeds."""
         return [
             StudyJob(arm, seed, self.out / "runs" / f"{arm.name}-{seed}")
             for seed in self.study.seeds
@@ -251,11 +251,11 @@ class StudyPlan:
         ]
 
     def runs(self, arm: ArmConfig) -> list[Path]:
-        """Return the run directories of an arm, one a seed."""
+        """Return the run directories of an arm, one per seed."""
         return [job.path for job in self.jobs if job.arm.name == arm.name]
 
     def panel(self, arm: ArmConfig) -> Path | None:
-        """Return the path of an arm's panel."""
+        """Return the path of an arm's panel; None without logs."""
         if arm.panel is not None:
             return self.folder / arm.panel
         return self.out / "panels" / arm.name if arm.mixture is not None else None
@@ -265,11 +265,11 @@ class StudyPlan:
         return [*as_overrides(self.study.settings), *as_overrides(arm.settings), f"seed={seed}"]
 
     def fingerprint(self, job: StudyJob) -> str:
-        """Return the request of a finished run as JSON."""
+        """Return what a job requests, as JSON, for the run's `study.json`."""
         return json.dumps(self._request(job), indent=1) + "\n"
 
     def _request(self, job: StudyJob) -> dict[str, Any]:
-        """Return a run's request with the panel by its name, so that a study may be moved."""
+        """Return what a job requests, with its panel's relative path: a study may be moved."""
         own = None if job.arm.mixture is None else f"panels/{job.arm.name}"
         return {
             "settings": self.settings(job.arm, job.seed),
@@ -279,7 +279,12 @@ class StudyPlan:
 
 
 def check_jobs(plan: StudyPlan) -> None:
-    """Raise RunError if a finished run was made by another request, ConfigError without a panel."""
+    """Check the jobs before any of them begins.
+
+    Raises:
+        RunError: a finished run was made with other settings.
+        ConfigError: an arm's panel does not exist.
+    """
     for job in plan.jobs:
         if not job.done.exists():
             if job.arm.panel and not (plan.folder / job.arm.panel / "panel.json").is_file():
@@ -301,7 +306,7 @@ def check_jobs(plan: StudyPlan) -> None:
 
 
 def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Return the items of one request that the other lacks."""
+    """Describe the items of request `one` that request `other` lacks."""
     reported = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
     reported += [
         f"{key} = {json.dumps(value)}"

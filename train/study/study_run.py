@@ -1,8 +1,8 @@
 """Run a study, every arm with every seed, then compare.
 
-A study is a TOML file and a directory. What already exists is not done again: a panel that was
-built, a run that has ended, an evaluation that was driven. So a study that was interrupted, or got
-another seed or arm, goes on where it was.
+A study is a TOML file and a directory. Panels, finished runs and evaluations that already exist are
+not made again. So a study continues where it stopped after an interruption, or after you added a
+seed or an arm.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from restock.train.study.study import (
 )
 
 Say = Callable[[str], None]
-REFERENCES = ("planner", "operator")  # drive the episodes of the runs once
+REFERENCES = ("planner", "operator")  # policies that drive the episodes of the runs once
 
 
 def run_study(
@@ -61,11 +61,11 @@ def run_study(
 ) -> list[Comparison | RunError]:
     """Run the open jobs, then compare every arm with its baseline, in the order of the arms.
 
-    A comparison that cannot be made is its error:
-    the others of a study that has run count all the same.
+    In place of a comparison that cannot be made, the list has its error; the others are still made.
 
     Raises:
-        RunError: a run failed (its log says why), or was made by another version of the study.
+        RestockError: a run failed; its log shows why.
+        RunError: a finished run was made with other settings than the study now has.
     """
     check_jobs(plan)
     for arm in plan.study.arms:
@@ -85,7 +85,7 @@ def _compare(plan: StudyPlan, pair: Pair) -> Comparison | RunError:
 
 
 def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:
-    """Train and evaluate; after a failure start nothing more, and wait for running jobs."""
+    """Train and evaluate the jobs; after a failure, start no more and wait for the running ones."""
     failed = Event()
 
     def run(job: StudyJob) -> None:
@@ -109,7 +109,7 @@ def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) 
             raise error
     except BaseException as stop:
         pool.shutdown(wait=False, cancel_futures=True)
-        if isinstance(stop, KeyboardInterrupt):  # what runs checkpoints and ends
+        if isinstance(stop, KeyboardInterrupt):  # running jobs write a checkpoint and end
             interrupt_running()
         raise
     finally:
@@ -117,7 +117,7 @@ def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) 
 
 
 def _wait(pool: ThreadPoolExecutor) -> None:
-    """Wait until the running jobs have ended, or an interrupt."""
+    """Wait until the running jobs have ended; interrupt them if the user interrupts."""
     try:
         pool.shutdown()
     except KeyboardInterrupt:
@@ -127,7 +127,7 @@ def _wait(pool: ThreadPoolExecutor) -> None:
 
 
 def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
-    """Build an arm's panel, if it is a mixture that is not packed yet."""
+    """Build an arm's panel if the arm has a mixture that is not packed yet."""
     out = plan.panel(arm)
     if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
         return
@@ -139,7 +139,7 @@ def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
 
 
 def _packed_from(plan: StudyPlan, mixture: str) -> tuple[str, str]:
-    """Return the store and a mixture as `restock mix` takes them; paths start at the study."""
+    """Return the arguments of `restock mix` for a mixture: paths start at the study's folder."""
     store = str(plan.study.store)
     if "://" not in store:
         store = str(plan.folder / store)
@@ -151,7 +151,7 @@ def check_mixtures(plan: StudyPlan) -> None:
     """Plan every mixture that is still to pack, as `restock mix --dry-run` does.
 
     Raises:
-        RestockError: there is no such store or mixture, or a mixture does not fit the store.
+        RestockError: the store or a mixture does not exist, or a mixture does not fit the store.
     """
     to_pack = [
         job.arm.mixture
@@ -195,9 +195,9 @@ def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
 
 
 def _drive_references(plan: StudyPlan, say: Say) -> None:
-    """Drive the planner and the operator on the episodes of the runs, once.
+    """Drive the episodes of the runs with the planner and the operator, once.
 
-    The first run keeps them.
+    The first run keeps the results.
     """
     evaluation, path = plan.study.evaluation, plan.jobs[0].path
     done, requested = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
@@ -210,9 +210,9 @@ def _drive_references(plan: StudyPlan, say: Say) -> None:
 
 
 def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) -> list[str]:
-    """Return the command that trains the run at a path, from its checkpoint if there is one.
+    """Return the arguments of `restock` that train the run at `path`, from a checkpoint if any.
 
-    A run that was cut before its first checkpoint is removed, and begins again.
+    A run that stopped before its first checkpoint is removed, and begins again.
     """
     if (path / "checkpoints" / "latest.safetensors").exists():
         return ["train", "--resume", str(path)]
@@ -224,7 +224,7 @@ def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) 
 
 
 def restock_verb(arguments: Sequence[str], log: Path) -> None:
-    """Run a verb in its own process, with its output in a log."""
+    """Run a verb of `restock` in its own process, and append its output to a log."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with kill_as_interrupt(), log.open("a", encoding="utf-8") as file:
         file.write(f"$ restock {' '.join(arguments)}\n")
@@ -235,7 +235,7 @@ def restock_verb(arguments: Sequence[str], log: Path) -> None:
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env={**os.environ, "NO_COLOR": "1"},
-            start_new_session=True,  # Ctrl-C reaches it through here alone: twice is "at once"
+            start_new_session=True,  # Ctrl-C reaches it only through us: twice would end it at once
         )
         with ended_with_us(process):
             process.wait()
@@ -251,13 +251,13 @@ def restock_verb(arguments: Sequence[str], log: Path) -> None:
         )
 
 
-NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")
+NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")  # measures that are never below 0
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
     """Return the study and its results as JSON values.
 
-    `comparisons` are those of `run_study`; an error is why there is none.
+    `comparisons` are those of `run_study`.
     """
     compared = [
         _compared(pair, comparison)
@@ -278,7 +278,7 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
 
 
 def _compared(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
-    """Return a comparison as JSON values, with why it has no outcomes, or ""."""
+    """Return a comparison as JSON values; in place of an error, one with the error as reason."""
     names = {"arm": pair.arm.name, "baseline": pair.baseline.name}
     if isinstance(comparison, RunError):
         why = f"{comparison.where}: {comparison.what}" if comparison.where else comparison.what
@@ -296,9 +296,9 @@ def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:
 
 
 def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
-    """Return the primary contrast, then those of every comparison in the study's measures.
+    """Return the primary contrast, then one per comparison and measure of the study.
 
-    Refused comparisons have none.
+    The comparisons in `refused`, (arm, baseline), are left out.
     """
     study, curves = plan.study, _Curves(plan)
     wanted = [
@@ -321,8 +321,8 @@ def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
 def arms(plan: StudyPlan) -> list[dict[str, Any]]:
     """Return a row for each arm and reference: success by cell, and safety and return.
 
-    Safety and return are those of rare missions, unperturbed. A value is [mean, low, high] over the
-    seeds; the ends are None if `paired_t` has none.
+    Only unperturbed missions count, for safety and return only rare ones. A value is
+    [mean, low, high] over the seeds; low and high are None if `paired_t` gives no interval.
     """
     planner_s, references = _references(plan)
     rows = []
@@ -348,7 +348,7 @@ class _Curves:
         self._read: dict[Path, RunCurve] = {}
 
     def pairs(self, arm: ArmConfig, baseline: ArmConfig) -> list[tuple[RunCurve, RunCurve]]:
-        """Return the pairs of the seeds that both arms have finished."""
+        """Return the pair of runs of each seed that both arms have finished."""
         both = zip(self._plan.runs(arm), self._plan.runs(baseline), strict=True)
         return [
             (self._curve(first), self._curve(second))
@@ -363,7 +363,7 @@ class _Curves:
 
 
 def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
-    """Return unperturbed episodes."""
+    """Return the unperturbed episodes that `policy` drove in a run's evaluations."""
     return [
         row
         for row in read_evaluations(path).to_pylist()
@@ -372,7 +372,7 @@ def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
 
 
 def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[str, Any]]]]:
-    """Return the planner's times where it arrived, and the references' episodes, by name."""
+    """Return the planner's times by mission, and the references' episodes by policy."""
     path = plan.jobs[0].path
     names = REFERENCES if path.is_dir() else ()
     episodes = {name: rows for name in names if (rows := _driven_by(path, name))}
@@ -380,7 +380,7 @@ def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[
 
 
 def _measured(episodes: list[dict[str, Any]], planner_s: dict[Any, float]) -> dict[str, float]:
-    """Return one run's measures; NaN if unknown."""
+    """Compute the measures of one run's episodes; NaN if unknown."""
     cells: dict[str, list[float]] = {}
     for row in episodes:
         if row["success"] is not None:
@@ -413,7 +413,7 @@ def _over_seeds(runs: Sequence[dict[str, float]]) -> dict[str, list[float | None
 
 
 def _range(name: str) -> tuple[float, float]:
-    """Return the range of a measure of `_measured`."""
+    """Return the lowest and the largest possible value of a measure of `_measured`."""
     if name.startswith("success "):
         return 0.0, 1.0
     return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf
