@@ -1,4 +1,4 @@
-"""Of `compiled/module.c`, whose docstrings say which float32 arrays are read and written."""
+"""Types of `compiled/module.c`; its docstrings say which float32 arrays are read and written."""
 
 from typing import Any
 

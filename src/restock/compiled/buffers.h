@@ -1,4 +1,4 @@
-/* What every part needs: the processor, sizes, and buffers of which whatever does not fit is refused. */
+/* Shared by all parts: the processor's instructions, sizes, and checked access to buffers. */
 #pragma once
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
@@ -28,7 +28,7 @@ static int has_wide(void) {
            __builtin_cpu_supports("avx512bw");
 }
 
-/* A float32 array of `ndim` dimensions whose last is contiguous; all of it, unless `strided`. */
+/* Get a contiguous float32 array of `ndim` dimensions; if `strided`, the rows may be apart. */
 static int get_floats(PyObject *from, Py_buffer *view, int ndim, int writes, int strided,
                       const char *name) {
     int flags = PyBUF_STRIDES | PyBUF_FORMAT | (writes ? PyBUF_WRITABLE : 0);
@@ -50,7 +50,7 @@ static int get_floats(PyObject *from, Py_buffer *view, int ndim, int writes, int
     return -1;
 }
 
-/* A contiguous array of one dimension: `kind` is 'l' for int64 or 'd' for float64. */
+/* Get a contiguous array of one dimension: `kind` is 'l' for int64 or 'd' for float64. */
 static int get_vector(PyObject *from, Py_buffer *view, char kind, int writes, const char *name) {
     if (PyObject_GetBuffer(from, view, PyBUF_ND | PyBUF_FORMAT | (writes ? PyBUF_WRITABLE : 0)) < 0)
         return -1;
@@ -64,8 +64,8 @@ static int get_vector(PyObject *from, Py_buffer *view, char kind, int writes, co
     return -1;
 }
 
-/* Vectors of float64, of which those from `written` on are filled. Returns how many there are: fewer
- * than `count` with an error. */
+/* Get vectors of float64; those from number `written` on must be writable. Returns how many were
+ * got: fewer than `count` if there was an error. */
 static int get_vectors(PyObject **from, Py_buffer *view, int count, int written,
                        const char *const *names) {
     int held = 0;
@@ -74,7 +74,7 @@ static int get_vectors(PyObject **from, Py_buffer *view, int count, int written,
     return held;
 }
 
-/* The answer, with the buffers that were held given back. */
+/* Release the buffers, and return the answer. */
 static PyObject *released(Py_buffer *view, int held, PyObject *answer) {
     while (held)
         PyBuffer_Release(&view[--held]);
@@ -86,7 +86,7 @@ static int wrong_shape(const char *name) {
     return -1;
 }
 
-/* The row stride in floats; that of a single row is of no use to anybody. */
+/* The row stride in floats. A buffer of a single row may have any stride, so its width is returned. */
 static Size row_of(const Py_buffer *view) {
     return view->shape[0] <= 1 ? view->shape[1] : view->strides[0] / 4;
 }

@@ -1,12 +1,12 @@
-/* What lies between the products of a network: bias, LayerNorm (arXiv:1607.06450) and ReLU.
+/* The layers between a network's matrix products: bias, LayerNorm (arXiv:1607.06450) and ReLU.
  *
- * Sums over a row are made in LANES parts that are then folded, sums over a batch row by row: the
- * order, and so the result, is the same with AVX2 and AVX-512.
+ * A sum over a row is computed as LANES partial sums that are then folded; a sum over a batch is
+ * computed row by row. So the order of additions, and the result, are the same with AVX2 and AVX-512.
  */
 #pragma once
 #include "buffers.h"
 
-#define LANES 16 /* partial sums of a row, and what parameters are aligned to */
+#define LANES 16 /* partial sums of a row; parameters are aligned to so many floats */
 
 typedef float Lanes __attribute__((vector_size(64), aligned(4), may_alias));
 typedef int Masks __attribute__((vector_size(64), aligned(4), may_alias));
@@ -14,7 +14,7 @@ typedef int Masks __attribute__((vector_size(64), aligned(4), may_alias));
 #define EACH_LANES(i, n, width)                                                                   \
     for (Size i = 0, n; i < (width) && (n = (width)-i < LANES ? (width)-i : LANES); i += LANES)
 
-/* n of LANES floats; the others are 0. */
+/* Load n floats; the rest of the LANES are 0. */
 INLINE Lanes load(const float *from, Size n) {
     if (n == LANES)
         return *(const Lanes *)from;
@@ -39,19 +39,19 @@ INLINE float fold(Lanes sums) {
     return part[0];
 }
 
-/* `value` where `by` is above 0 (or NaN, as PyTorch has it), else 0. */
+/* `value` where `by` is above 0 or NaN (as in PyTorch), else 0. */
 INLINE Lanes where_positive(Lanes value, Lanes by) {
     Masks keeps = ~(by <= 0);
     return (Lanes)((Masks)value & keeps);
 }
 
-/* The tensors of a hidden layer: z (n, H) without bias comes in. */
+/* The tensors of a hidden layer. Its input is z (n, H), without bias. */
 typedef struct {
     Size width;
     const float *bias, *gain, *shift; /* (H,); gain and shift NULL without LayerNorm */
     float *d_bias, *d_gain, *d_shift; /* (H,), their gradients */
-    float *normed;                    /* (n, H) z, then (z - mean) / deviation; NULL without */
-    float *after;                     /* (n, H), what comes out */
+    float *normed;                    /* (n, H) z, then (z - mean) / deviation; NULL: no LayerNorm */
+    float *after;                     /* (n, H), the output */
     float *inverse;                   /* (n,) 1 / deviation */
     float eps;
 } Hidden;
@@ -92,7 +92,7 @@ INLINE void activate(const Hidden *layer, Size rows) {
     }
 }
 
-/* The gradient of what came out, (n, H), to that of z in place; fills those of the parameters. */
+/* Turn the gradient of the output (n, H) into that of z, in place; fill the parameters' gradients. */
 INLINE void activate_back(const Hidden *layer, float *gradient, Size rows) {
     Size width = layer->width;
     size_t bytes = sizeof(float) * (size_t)width;

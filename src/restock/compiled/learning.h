@@ -1,13 +1,13 @@
-/* Adam with the average of weights, in one pass. */
+/* Adam and a moving average of the weights (the follower), in one pass. */
 #pragma once
 #include "buffers.h"
 
-/* Rounded where PyTorch's fused Adam and `lerp_` round, fused multiply-adds included: built for AVX2
- * or AVX-512 they give the same bits. */
+/* Rounds where PyTorch's fused Adam and `lerp_` round, including their fused multiply-adds, so that
+ * builds for AVX2 and AVX-512 give the same bits. */
 
 typedef struct {
     double first, second;              /* Adam's betas */
-    float step_size, root, eps, rate; /* lr / (1 - beta1^t), sqrt(1 - beta2^t); of the follower */
+    float step_size, root, eps, rate; /* lr / (1 - beta1^t), sqrt(1 - beta2^t), eps, follower's rate */
 } Moves;
 
 INLINE void move(float *restrict value, const float *restrict gradient, float *restrict mean,
@@ -41,9 +41,9 @@ MOVE(narrow_move, NARROW)
 
 PyDoc_STRVAR(adam_doc,
              "adam(values, gradient, exp_avg, exp_avg_sq, follower, settings)\n--\n\n"
-             "Adam's step on flat arrays; then `follower` (or None) goes towards `values`.\n\n"
+             "Take a step of Adam on flat arrays; then move `follower` (or None) towards `values`.\n\n"
              "`settings` are beta1, beta2, lr / (1 - beta1^t), sqrt(1 - beta2^t), eps and the rate\n"
-             "at which `follower` goes there.");
+             "of the follower.");
 
 static PyObject *adam(PyObject *Py_UNUSED(module), PyObject *args) {
     static const char *names[] = {"values", "gradient", "exp_avg", "exp_avg_sq", "follower"};

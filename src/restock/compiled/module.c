@@ -1,14 +1,15 @@
-/* `restock._native`: an update of a plain Q network, the drawing and the record of its batches, the
- * twin's lidar, what robots see of their plans and of who comes near, and gaps to boxes, compiled.
+/* `restock._native`: the update of a plain Q network, draws and records of its batches, the twin's
+ * lidar, what robots observe of their plans and of people nearby, and distances to boxes.
  *
- * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` and
- * `restock.ingest.task` with NumPy's and `restock.train.twin` with MuJoCo's rays, in fewer calls and
- * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/network.py`,
- * `train/feed/sampled_rows.py` and `batches.py`, `replay/sampling/rules.py`,
- * `train/twin/physics/scenery.py`, `train/twin/floors/state_lattice.py`,
- * `ingest/task/surroundings.py`. Compiled with -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
- * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
- * importing it fails, and these do the work. Stable ABI: one build serves Python 3.11 and later.
+ * It computes the same as PyTorch in `train/dqn/network.py`, as NumPy in `train/feed/batches.py`,
+ * `train/feed/sampled_rows.py`, `replay/sampling/rules.py`, `ingest/task/surroundings.py` and
+ * `train/twin/floors/state_lattice.py`, and as MuJoCo's rays in `train/twin/physics/scenery.py`, in
+ * fewer calls and fewer passes over memory. `restock/native.py` imports it.
+ *
+ * It is compiled with -ffp-contract=off and without fast-math: sums have one order, so every processor
+ * gives the same bits. It needs x86-64 with AVX2 and FMA, and GCC or Clang. Elsewhere it does not
+ * compile, or importing it fails, and the Python code above is used. Stable ABI: one build serves
+ * Python 3.11 and later.
  */
 #include "buffers.h"
 #include "learning.h"

@@ -1,23 +1,23 @@
-/* `Network`: a plain Q network on flat parameters, forward and backward, each in one call. */
+/* `Network`: a plain Q network with flat parameters; forward and backward pass are one call each. */
 #pragma once
 #include "layers.h"
 #include "products.h"
 
 #define MAX_LAYERS 64
-#define MAX_GIVEN ((Size)1 << 32) /* rows: sizes in bytes stay far below what overflows */
+#define MAX_GIVEN ((Size)1 << 32) /* rows at once, so that sizes in bytes do not overflow */
 
 typedef struct {
     PyObject_HEAD
-    Py_buffer values, gradient; /* flat, as `FlatParameters` lays parameters out */
+    Py_buffer values, gradient; /* flat, in the layout of `FlatParameters` */
     int has_values, has_gradient, busy, norm;
     const Tiles *tiles;
     const Rows *by_row;
-    int hidden;                         /* layers; the head is one more */
+    int hidden;                         /* number of hidden layers, without the head */
     Size width[MAX_LAYERS + 2];        /* observation, hidden layers, actions */
-    Size weight[MAX_LAYERS + 1];       /* where each layer's weight begins in `values` */
-    Size bias[MAX_LAYERS + 1], end;    /* … its bias, its gain and shift behind it */
+    Size weight[MAX_LAYERS + 1];       /* offset of each layer's weight in `values` */
+    Size bias[MAX_LAYERS + 1], end;    /* offset of its bias, which gain and shift follow */
     Hidden layer[MAX_LAYERS];
-    Size room, given; /* rows that `memory` is for; of the last first input, -1: none */
+    Size room, given; /* rows that `memory` has room for; rows of the last first input, or -1 */
     float *memory, *input, *down, *spare, *panel;
 } Network;
 
@@ -39,7 +39,7 @@ static void lay_out(Network *self) {
     }
 }
 
-/* Memory for `rows` rows. */
+/* Allocate memory for `rows` rows, if there is not enough. */
 static int make_room(Network *self, Size rows) {
     if (self->memory && rows <= self->room)
         return 0;
@@ -58,7 +58,7 @@ static int make_room(Network *self, Size rows) {
         if (l < self->hidden)
             floats += (1 + self->norm) * aligned(rows * above) + aligned(rows);
     }
-    Size deepest = rows > widest ? rows : widest; /* of a panel */
+    Size deepest = rows > widest ? rows : widest; /* largest depth of a panel */
     floats += aligned(rows * self->width[0]) + 2 * aligned(rows * widest) + deepest * PANEL + LANES;
     float *memory = malloc(sizeof(float) * (size_t)floats);
     if (!memory) {
@@ -144,7 +144,7 @@ static int claim(Network *self) {
 
 PyDoc_STRVAR(forward_doc,
              "forward(inputs, out)\n--\n\n"
-             "Action values (n B, A) of n inputs (B, D) into `out`; the first may be learnt from.");
+             "Write action values (n B, A) of n inputs (B, D) to `out`; keep the first input for `backward`.");
 
 static PyObject *network_forward(PyObject *object, PyObject *args) {
     Network *self = (Network *)object;
@@ -190,8 +190,8 @@ released:
 }
 
 PyDoc_STRVAR(backward_doc, "backward(gradient)\n--\n\n"
-                           "Fill every parameter's gradient from that of the first input's action "
-                           "values, (B, A).");
+                           "Compute the gradients of all parameters from the gradient (B, A) of the first "
+                           "input's action values.");
 
 static PyObject *network_backward(PyObject *object, PyObject *from) {
     Network *self = (Network *)object;
@@ -302,9 +302,9 @@ static void network_dealloc(PyObject *object) {
 
 PyDoc_STRVAR(network_doc,
              "Network(widths, eps, values, gradient, wide=True)\n--\n\n"
-             "A network of `widths` (D, H, ..., A) on flat parameters.\n\n"
-             "`eps` is LayerNorm's, below 0 without; `gradient` is None where it does not learn;\n"
-             "`wide` allows AVX-512.");
+             "A network of layers `widths` (D, H, ..., A) with flat parameters.\n\n"
+             "`eps` is LayerNorm's, or below 0 for no LayerNorm; `gradient` is None for a network that\n"
+             "does not learn; `wide` allows AVX-512.");
 
 static PyMethodDef network_methods[] = {
     {"forward", network_forward, METH_VARARGS, forward_doc},

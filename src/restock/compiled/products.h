@@ -1,15 +1,16 @@
-/* Products of matrices: tiles of a few rows by PANEL columns, in registers.
+/* Matrix products by tiles of a few rows and PANEL columns, which are held in registers.
  *
- * Every element adds its terms one after the other with a fused multiply-add, so that AVX2 and
+ * The terms of an element are added one after the other with fused multiply-adds, so that AVX2 and
  * AVX-512 give the same bits.
  */
 #pragma once
 #include "buffers.h"
 
-#define PANEL 32    /* columns of a product that are made together */
-#define MAX_ROWS 8 /* of a product that are made together */
+#define PANEL 32    /* columns of a tile */
+#define MAX_ROWS 8 /* rows of a tile, at most */
 
-/* Element (m, k) of the left matrix is a[m * row + k * column]; the right one is packed (K, PANEL). */
+/* Computes a tile. Element (m, k) of the left matrix is a[m * row + k * column]; the right matrix is
+ * packed to (K, PANEL). */
 typedef void Tile(const float *a, Size row, Size column, const float *b, Size depth, float *out,
                   Size stride);
 
@@ -63,8 +64,8 @@ WIDE_TILE(1)
 NARROW_TILE(6)
 NARROW_TILE(1)
 
-/* `count` columns of the right matrix, whose element (k, n) is b[k * row + n * column], to one panel
- * (depth, PANEL), filled up with zeros. One of `row` and `column` is 1. */
+/* Pack `count` columns of the right matrix, whose element (k, n) is b[k * row + n * column], into a
+ * panel (depth, PANEL); missing columns are zeros. `row` or `column` is 1. */
 static void pack(const float *b, Size row, Size column, Size depth, Size count, float *to) {
     if (count < PANEL)
         memset(to, 0, sizeof(float) * (size_t)(depth * PANEL));
@@ -101,15 +102,15 @@ static void pack(const float *b, Size row, Size column, Size depth, Size count, 
 }
 
 typedef struct {
-    Size rows; /* of `tile` */
+    Size rows; /* of `tile`; `single` has one */
     Tile *tile, *single;
 } Tiles;
 
 static const Tiles WIDE_TILES = {MAX_ROWS, wide_tile_8, wide_tile_1};
 static const Tiles NARROW_TILES = {6, narrow_tile_6, narrow_tile_1};
 
-/* out (rows, width) = left (rows, depth) right (depth, width); see `Tile` and `pack`. A panel at a
- * time is packed, into the same memory: more would push what follows an update out of the caches. */
+/* out (rows, width) = left (rows, depth) right (depth, width); see `Tile` and `pack`. Every panel is
+ * packed into the same memory: more memory would evict the data of the next steps from the caches. */
 static void multiply(const Tiles *by, const float *left, Size left_row, Size left_column,
                      const float *right, Size right_row, Size right_column, float *out, Size rows,
                      Size width, Size depth, float *panel) {

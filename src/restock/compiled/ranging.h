@@ -1,30 +1,31 @@
-/* What the beams of lidars hit first, in the plane at the lidars' height. */
+/* Lidar ranges: the distance at which each beam first hits a shape, in a horizontal plane. */
 #pragma once
 #include "buffers.h"
 #include <math.h>
 #include <stdint.h>
 
-#define SMALLEST 1e-15 /* of a direction's part: a ray with less is parallel; MuJoCo's mjMINVAL */
+#define SMALLEST 1e-15 /* a ray with a smaller component is parallel to that axis; MuJoCo's mjMINVAL */
 #define MARGIN 1e-6    /* radians, for the rounding of bearings */
 #define TURN 6.283185307179586
 
 PyDoc_STRVAR(
     ranges_doc,
     "ranges(origin, heading, direction, bearing, order, floor, first, standing, moving, out)\n--\n\n"
-    "Distances from n lidars to what each of their B beams hits first; inf where that is nothing.\n\n"
-    "All are flat. `origin` (n, 2), `heading` (n,), `direction` (n, B, 2) of unit length, `bearing`\n"
-    "(B,) ascending, from the heading, of the beams `order` (B,). `floor` (n,): which of the floors,\n"
-    "whose boxes are `standing` (G, 4) x, y, half sizes, from `first` (F + 1,) on. `moving` (n, M, 6):\n"
-    "x, y, cosine and sine of its heading, half sizes; where the second is 0, a circle of the first\n"
-    "as its radius. Fills `out` (n, B).");
+    "Compute the distance from n lidars to the first hit of each of their B beams; inf if none.\n\n"
+    "All arrays are flat. `origin` (n, 2), `heading` (n,), `direction` (n, B, 2) unit vectors. `bearing`\n"
+    "(B,) ascending, relative to the heading, of the beams `order` (B,). `floor` (n,) is the number of\n"
+    "each lidar's floor; boxes of floor f are rows `first`[f] to `first`[f + 1] of `standing` (G, 4):\n"
+    "x, y, half sizes. `moving` (n, M, 6): x, y, cosine and sine of the heading, half sizes; if the\n"
+    "second half size is 0, a circle whose radius is the first. Fills `out` (n, B).");
 
-/* Where a ray from (x, y) along (dx, dy) meets a box (half sizes a, b) about the origin, or -1. From
- * outside it enters by a face that it starts beyond; from inside it leaves by the nearest. */
+/* The distance at which a ray from (x, y) along (dx, dy) meets a box (half sizes a, b) centred at the
+ * origin, or -1. From outside, only faces that the ray starts beyond count; from inside, the nearest
+ * face ahead. */
 INLINE double meet_box(double x, double y, double dx, double dy, double a, double b) {
     double best = -1;
     int inside = fabs(x) <= a && fabs(y) <= b;
     if (inside && ((fabs(x) == a && fabs(dx) > SMALLEST) || (fabs(y) == b && fabs(dy) > SMALLEST)))
-        return 0; /* it starts on a face */
+        return 0; /* the ray starts on a face */
     if (fabs(dx) > SMALLEST && (inside || fabs(x) > a)) {
         double face = inside ? (dx > 0 ? a : -a) : (x > 0 ? a : -a);
         double at = (face - x) / dx;
@@ -40,7 +41,7 @@ INLINE double meet_box(double x, double y, double dx, double dy, double a, doubl
     return best;
 }
 
-/* The same of a circle of radius r. */
+/* The same for a circle of radius r. */
 INLINE double meet_circle(double x, double y, double dx, double dy, double r) {
     double a = dx * dx + dy * dy, b = dx * x + dy * y, c = x * x + y * y - r * r;
     double root = b * b - a * c;
@@ -51,7 +52,7 @@ INLINE double meet_circle(double x, double y, double dx, double dy, double r) {
     return near >= 0 ? near : far >= 0 ? far : -1;
 }
 
-/* The first of `count` ascending values that is not below `at`. */
+/* The index of the first of `count` ascending values that is not below `at`. */
 INLINE Size first_from(const double *value, Size count, double at) {
     Size low = 0;
     while (count > 0) {
@@ -73,7 +74,7 @@ typedef struct {
     double *out;
 } Lidar;
 
-/* Shorten the beams that meet one shape: (x, y) its middle, a and b as for `moving`. */
+/* Shorten the beams that hit a shape with centre (x, y); a and b are half sizes, as in `moving`. */
 INLINE void shorten(const Lidar *lidar, double x, double y, double cosine, double sine, double a,
                     double b) {
     double from_x = lidar->x - x, from_y = lidar->y - y;

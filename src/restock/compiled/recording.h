@@ -1,4 +1,4 @@
-/* The record of what a batch was made of: its rows appended to columns, in one pass. */
+/* Record a batch: append its rows to columns, in one pass. */
 #pragma once
 #include "buffers.h"
 #include <stdint.h>
@@ -6,16 +6,16 @@
 PyDoc_STRVAR(
     keep_rows_doc,
     "keep_rows(values, logged, logged_to, logged_at, ring, slots, fresh_to, fresh_at, clocks)\n--\n\n"
-    "Append a batch (B,), its logged rows first, to the columns of both sources.\n\n"
-    "`values` are td, q and weight (B,) float32, the last of them None where all are 1, and the tail\n"
-    "(B, 3) float32: action, reward, discount. `logged` are row and stratum (L,) int64; `ring` the\n"
-    "ring's condition and stratum int16, episode int64, episode_step int32, behaviour_policy int16, env_step and\n"
-    "gradient_step int64 (n,), of which the fresh rows are `slots` (B - L,) int64. Columns of\n"
-    "`logged_to` begin with row and stratum int64, those of `fresh_to` with condition and stratum\n"
-    "int16, episode int64, episode_step int32, policy int16 and both ages int64: those of `clocks` less the ring's.\n"
-    "Both end with td, q, weight float32, action int16, reward and discount float32; they are\n"
-    "written from `logged_at` and `fresh_at` on.\n\n"
-    "IndexError: a slot outside the ring, or no room in a column; nothing is written then.");
+    "Append a batch of B rows, of which the first L are logged, to the columns of both sources.\n\n"
+    "`values`: td, q and weight (B,) float32 (weight may be None: all 1), and tail (B, 3) float32:\n"
+    "action, reward, discount. `logged`: row and stratum (L,) int64. `ring`: the ring's columns (n,),\n"
+    "condition and stratum int16, episode int64, episode_step int32, behaviour_policy int16, env_step\n"
+    "and gradient_step int64; `slots` (B - L,) int64 are the fresh rows' places in the ring. Columns\n"
+    "of `logged_to` begin with row and stratum int64. Those of `fresh_to` begin with condition and\n"
+    "stratum int16, episode int64, episode_step int32, policy int16 and two ages int64: `clocks` minus\n"
+    "the ring's env_step and gradient_step. Both end with td, q, weight float32, action int16, reward\n"
+    "and discount float32. Writing begins at `logged_at` and `fresh_at`.\n\n"
+    "IndexError: a slot is outside the ring, or a column has no room; nothing is written then.");
 
 enum { OF_ROW, OF_STRATUM, OF_LOGS };
 enum { OF_CONDITION, OF_FRESH_STRATUM, OF_EPISODE, OF_EPISODE_STEP, OF_POLICY, OF_ENV_STEP, OF_GRADIENT_STEP, OF_RING };
@@ -27,7 +27,7 @@ typedef struct {
     int held;
 } Views;
 
-/* A contiguous vector of int16 'h', int32 'i', int64 'l' or float32 'f', of `least` values or more. */
+/* Get a contiguous vector of int16 'h', int32 'i', int64 'l' or float32 'f', of at least `least` values. */
 static void *get_column(Views *views, PyObject *from, char kind, Size least, int writes) {
     Py_buffer *view = &views->view[views->held];
     if (PyObject_GetBuffer(from, view, PyBUF_ND | PyBUF_FORMAT | (writes ? PyBUF_WRITABLE : 0)) < 0)
@@ -49,7 +49,7 @@ static void *get_column(Views *views, PyObject *from, char kind, Size least, int
     return view->buf;
 }
 
-/* Each of a tuple's columns, by their kinds. */
+/* Get all columns of a tuple; `kinds` has a letter for each. */
 static int get_columns(Views *views, PyObject *from, const char *kinds, Size least, int writes,
                        void **columns) {
     Size count = (Size)strlen(kinds);
@@ -139,7 +139,7 @@ static PyObject *keep_rows(PyObject *Py_UNUSED(module), PyObject *args) {
     int16_t *policy = (int16_t *)fresh_to[OF_POLICY] + fresh_at;
     int64_t *age = (int64_t *)fresh_to[OF_ENV_STEP] + fresh_at;
     int64_t *age_updates = (int64_t *)fresh_to[OF_GRADIENT_STEP] + fresh_at;
-    for (Size i = 0; i < fresh; i++) { /* no load waits for another: memory gives several at once */
+    for (Size i = 0; i < fresh; i++) { /* loads are independent, so several are in flight at once */
         int64_t from = slot[i];
         condition[i] = ((const int16_t *)ring[OF_CONDITION])[from];
         stratum[i] = ((const int16_t *)ring[OF_FRESH_STRATUM])[from];

@@ -1,17 +1,17 @@
-/* Rows of large tables by number, and draws in proportion to priorities. */
+/* Gather rows of large tables, and draw in proportion to priorities. */
 #pragma once
 #include "buffers.h"
 #include <stdint.h>
 
-#define AHEAD 16 /* rows that are fetched before they are copied */
-#define LINE 64  /* bytes that memory gives at once */
-#define CHUNK 16 /* priorities that are summed first; `CHUNK` of priorities.py */
+#define AHEAD 16 /* rows that are prefetched ahead of the copied one */
+#define LINE 64  /* bytes of a cache line */
+#define CHUNK 16 /* priorities with a common sum; `CHUNK` of replay/sampling/rules.py */
 
 PyDoc_STRVAR(gather_doc, "gather(rows, index, out)\n--\n\n"
-                         "Rows `index` (B,) int64 of `rows` (n, W) into `out` (B, W), all bits kept.\n\n"
-                         "IndexError: a row number outside the table; `out` is untouched then.");
+                         "Copy rows `index` (B,) int64 of `rows` (n, W) to `out` (B, W), bit by bit.\n\n"
+                         "IndexError: a row number is outside the table; `out` is unchanged then.");
 
-/* Into the second cache: of what is asked for in its name, more can be under way at once. */
+/* Prefetch a row into the L2 cache, which can have more requests in flight than L1. */
 INLINE void fetch(const float *row, Size width) {
     for (const char *at = (const char *)row, *end = (const char *)(row + width); at < end; at += LINE)
         __builtin_prefetch(at, 0, 2);
@@ -62,12 +62,12 @@ no_index:
 
 PyDoc_STRVAR(find_places_doc,
              "find_places(priority, sums, ends, at, out)\n--\n\n"
-             "Where `at` (n,) float64, ascending, fall among priorities laid end to end.\n\n"
-             "`priority` (m, 16) float32, of which `sums` (m,) float32 are the rows' sums and `ends`\n"
-             "(m,) float64 theirs, added up. Fills `out` (n,) int64: the first place whose own end is\n"
-             "beyond, the sums inside a row taken in float32 one after the other.");
+             "Find the place of each `at` (n,) float64, ascending, in the cumulative sum of priorities.\n\n"
+             "`priority` (m, 16) float32; `sums` (m,) float32 are the sums of its rows, `ends` (m,) float64\n"
+             "the cumulative sum of these. Fills `out` (n,) int64 with the first place at which the\n"
+             "cumulative sum is above `at`; within a row it is computed in float32, in order.");
 
-/* The first of `count` ends above `at`, from `begin` on; the last where there is none. */
+/* The index of the first of `count` ends above `at`, from `begin` on; the last index if none is. */
 INLINE Size first_above(const double *end, Size begin, Size count, double at) {
     Size step = 1, low = begin, high = begin;
     while (high < count - 1 && end[high] <= at) {

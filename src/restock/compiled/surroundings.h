@@ -1,36 +1,37 @@
-/* Where along their plans robots are, what lies on these, and who came nearer. */
+/* Where robots are on their plans, obstacles on the plans, and who came nearer. */
 #pragma once
 #include "buffers.h"
 #include <math.h>
 
-#define ROUNDING 1e-13 /* of squared distances: `surroundings.ROUNDING` */
+#define ROUNDING 1e-13 /* relative, of squared distances; `surroundings.ROUNDING` */
 
 PyDoc_STRVAR(
     view_plans_doc,
     "view_plans(plans, x, y, cosine, sine, ahead, look_ahead, remaining, offset)\n--\n\n"
-    "What robots see of their plans: `restock.ingest.task.surroundings.view_route`, to the last bit.\n\n"
-    "All are flat float64. `plans` (n, P, 2), P at least 2; poses `x`, `y`, `cosine` and `sine` of the\n"
-    "heading (n,); `ahead` (L,) metres along the plan. Fills `look_ahead` (n, L, 2) in the body frame,\n"
-    "`remaining` and `offset` (n,).");
+    "Compute `restock.ingest.task.surroundings.view_route` for n robots, bit for bit.\n\n"
+    "All arrays are flat float64. `plans` (n, P, 2), P at least 2; poses `x`, `y`, `cosine` and `sine`\n"
+    "of the heading (n,); `ahead` (L,) metres along the plan. Fills `look_ahead` (n, L, 2) in the body\n"
+    "frame, `remaining` and `offset` (n,).");
 
 PyDoc_STRVAR(
     find_returns_doc,
     "find_returns(x, y, clearance, plan, way, gap, limits)\n--\n\n"
-    "What lies on plans: `restock.ingest.task.surroundings.returns_on_plan`, to the last bit.\n\n"
-    "All are flat float64. Returns `x`, `y` and their `clearance` (n, K), points of the plan `plan`\n"
-    "(n, L, 2). Fills `way` and `gap` (n,). `limits`: the lidar's range and its square, the square of\n"
-    "how far off the plan counts as on it, and how far along it a gap is looked for.");
+    "Compute `restock.ingest.task.surroundings.returns_on_plan` for n robots, bit for bit.\n\n"
+    "All arrays are flat float64. Lidar returns `x`, `y` with their `clearance` (n, K); points of the\n"
+    "plan `plan` (n, L, 2). Fills `way` and `gap` (n,). `limits`: the lidar's range, its square, the\n"
+    "squared distance from the plan that counts as on it, and how far along the plan to look for a gap.");
 
 PyDoc_STRVAR(
     find_came_doc,
     "find_came(clearance, before, motions, walked, cosine, sine, reach, ends, came, limits)\n--\n\n"
-    "Who came nearer: `restock.ingest.task.surroundings.came_nearer`, to the last bit.\n\n"
-    "All are flat float64. `clearance` (n, K), and `before` (E, n, K) those of the steps before, the\n"
-    "last one first; `motions` (E, 4, n): from the body frame of each step to that of the one before,\n"
-    "as x, y, cosine and sine. `walked` (n,) metres at most. Of the sectors: `cosine`, `sine` and `reach` (K,), and their\n"
-    "`ends` (K - 1,). Fills `came` (n,). `limits`: what is near, what came back, the lidar's x.");
+    "Compute `restock.ingest.task.surroundings.came_nearer` for n robots, bit for bit.\n\n"
+    "All arrays are flat float64. `clearance` (n, K); `before` (E, n, K), the clearance in the earlier\n"
+    "steps, latest first; `motions` (E, 4, n), from the body frame of each step to that of the step\n"
+    "before, as x, y, cosine and sine; `walked` (n,), the largest distance in metres that counts.\n"
+    "Per sector: `cosine`, `sine`, `reach` (K,) and `ends` (K - 1,). Fills `came` (n,). `limits`: the\n"
+    "largest clearance that is near, the largest that is a return, and the lidar's x.");
 
-/* As NumPy has them, what is not a number comes out as it is: of the first of two, and of either. */
+/* NaN is treated as in NumPy: `at_least` and `at_most` return a NaN in `a`, `least_of` a NaN in either. */
 INLINE double at_least(double a, double bound) { return bound > a ? bound : a; }
 INLINE double at_most(double a, double bound) { return bound < a ? bound : a; }
 INLINE double least_of(double a, double b) { return a < b || a != a ? a : b; }
@@ -63,7 +64,7 @@ NARROW static void view_plan(const double *restrict plan, Size points, double x,
         at.arc[i + 1] = at.arc[i] + at.length[i];
         least = least_of(at.distance2[i], least);
     }
-    /* Where a plan comes by twice it is at the first time, whatever rounding makes of the two. */
+    /* If the plan passes here twice, take the first time, even if the second is nearer by rounding. */
     double within = least + ROUNDING * (least + 0.1);
     while (nearest < legs && !(at.distance2[nearest] <= within))
         nearest++;
@@ -134,7 +135,7 @@ done:
     return released(view, held, answer);
 }
 
-/* How far points (count,) are off a plan, squared, and how far along it that is. */
+/* The squared distance of points (count,) from a plan, and how far along the plan they are. */
 NARROW static void project(const double *x, const double *y, Size count, const double *plan,
                            Size points, double *off2, double *along) {
     double passed = 0.0;
@@ -206,7 +207,7 @@ done:
     return released(view, held, answer);
 }
 
-/* What grows with the bearing of (x, y) as that does: `surroundings._turned`. */
+/* A monotonic function of the bearing of (x, y), in place of atan2: `surroundings._turned`. */
 INLINE double turned(double x, double y) {
     double far = fabs(x) + fabs(y), part = y / (far > 0 ? far : 1.0);
     return x >= 0 ? part : y >= 0 ? 2.0 - part : -2.0 - part;
@@ -218,8 +219,8 @@ typedef struct {
     double near, range, lever;
 } Sectors;
 
-/* How far the return of one sector came, or 0 where it did not. `before` and `motions` are of this
- * robot, among `robots`. */
+/* How much nearer the return in one sector came, or 0. `before` and `motions` point to this robot's
+ * values in the arrays of all `robots`. */
 static double came_from(const Sectors *of, double clearance, Size sector, const double *before,
                         const double *motions, Size steps, Size robots) {
     double distance = clearance + of->reach[sector], came = INFINITY;
@@ -229,7 +230,7 @@ static double came_from(const Sectors *of, double clearance, Size sector, const 
         x = motions[0] + cosine * was_x - sine * y;
         y = motions[robots] + sine * was_x + cosine * y;
         double x_of_lidar = x - of->lever, bearing = turned(x_of_lidar, y), farther = INFINITY;
-        Size place = 0, left = of->count - 1; /* how many `ends` are not beyond it */
+        Size place = 0, left = of->count - 1; /* place: the number of `ends` up to the bearing */
         while (left > 0) {
             Size half = left / 2;
             if (bearing < of->ends[place + half])
@@ -287,11 +288,11 @@ static PyObject *find_came(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_BEGIN_ALLOW_THREADS
     for (Size n = 0; n < count; n++) {
         const double *now = clearance + n * sectors, *last = before + n * sectors;
-        int told = 0; /* the same scan again, of a lidar slower than the steps, tells nothing */
+        int is_new = 0; /* a lidar slower than the steps repeats its scan, which shows no motion */
         for (Size k = 0; k < sectors; k++)
-            told |= now[k] != last[k];
+            is_new |= now[k] != last[k];
         came[n] = 0.0;
-        for (Size k = 0; told && k < sectors; k++)
+        for (Size k = 0; is_new && k < sectors; k++)
             if (now[k] < of.near) {
                 double far = came_from(&of, now[k], k, last, motions + n, steps, count);
                 if (far <= walked[n] && far > came[n])
@@ -307,9 +308,9 @@ done:
 PyDoc_STRVAR(
     near_boxes_doc,
     "near_boxes(x, y, shared, own, room, robots, within)\n--\n\n"
-    "How far points are from boxes: `train.twin.floors.state_lattice.near_gap`, to the last bit.\n\n"
-    "All are flat float64. Lowers `room` (n, P) at `x` and `y` (n, P) of n `robots` to the gaps to the\n"
-    "`shared` boxes (R, 4) and to those of their `own` (n, K, 4), if they are less than `within`.");
+    "Compute `train.twin.floors.state_lattice.near_gap` for n robots, bit for bit.\n\n"
+    "All arrays are flat float64. Lowers `room` (n, P) to the gaps between points `x`, `y` (n, P) and\n"
+    "boxes, the `shared` (R, 4) and each robot's `own` (n, K, 4), if a gap is less than `within`.");
 
 static void lower(const double *box, const double *x, const double *y, double *room, Size points) {
     for (Size i = 0; i < points; i++) {
