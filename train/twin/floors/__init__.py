@@ -1,1 +1,1 @@
-"""Where a robot drives: generated floors, floors from files and maps, and plans on them."""
+"""The floors that robots drive on (generated, or from files and maps), and plans on them."""

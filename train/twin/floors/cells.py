@@ -1,9 +1,9 @@
-"""Floors known only as free cells: finds aisles, crossings, goals and racks in them.
+"""Find the aisles, crossings, goals and racks of a floor of which only the free cells are known.
 
-An aisle segment is a straight, narrow, free corridor between racks or walls on two sides: pallets
-can close it, and the lidar can tell that they do. Both directions are looked at. Racks are blocked
-cells as few rectangles, which may overlap; only cells that border free ones need to be covered:
-what lies behind them no robot meets and no lidar sees.
+An aisle segment is a straight, narrow, free corridor between racks or walls on two sides. Pallets
+can close it, and the lidar can detect that. Corridors are searched along both axes. Racks are a
+few rectangles, which may overlap, that cover the blocked cells. Only blocked cells beside free ones
+must be covered: no robot reaches the cells behind them, and no lidar sees them.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from restock.arrays import Bools, Ints
 from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
 
 Cells = Bools  # (X, Y)
-Box = tuple[int, int, int, int]  # first and last (exclusive) column, first and last row
+Box = tuple[int, int, int, int]  # columns first to last, rows first to last; lasts are exclusive
 
 WIDTH_M = (0.7, 2.6)  # of a corridor
-LENGTH_M = 1.8  # a pallet, and room before and behind it
+LENGTH_M = 1.8  # minimum length of a corridor: a pallet, and room before and behind it
 EDGE_M = 0.15  # how far a corridor's side may wander: a map's racks are not straight
-CROSSING_M = 2.0
-GOAL_ROOM_M = 0.5  # from a goal to the nearest obstacle, where there is that much
-GOALS = 200
+CROSSING_M = 2.0  # maximum length of a crossing beyond the end of an aisle segment
+GOAL_ROOM_M = 0.5  # minimum distance from a goal to the nearest obstacle
+GOALS = 200  # maximum number of goals
 
 
 @dataclass(frozen=True)
 class _Corridor:
-    """A corridor: its columns, first to last (exclusive), and its sides, in cells."""
+    """A corridor in cells: columns `first` to `last`, rows `low` to `high`; ends are exclusive."""
 
     first: int
     last: int
@@ -38,7 +38,7 @@ class _Corridor:
 
 
 def cells_of(floor: Warehouse, cell_m: float) -> Cells:
-    """Return the free cells (X, Y) of a floor: those whose centre is in no rack."""
+    """Return the free cells (X, Y) of a floor: those whose centre is outside all racks."""
     x = (np.arange(round(floor.width_m / cell_m)) + 0.5) * cell_m
     y = (np.arange(round(floor.depth_m / cell_m)) + 0.5) * cell_m
     free = np.ones((len(x), len(y)), np.bool_)
@@ -50,7 +50,10 @@ def cells_of(floor: Warehouse, cell_m: float) -> Cells:
 
 
 def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
-    """Find the aisle segments of a floor's free cells, from the south-west; keep the longest."""
+    """Find aisle segments in free cells; of overlapping ones, keep the longest.
+
+    They are sorted by axis (x first), then from south to north and from west to east.
+    """
     corridors: list[tuple[Axis, _Corridor]] = [("x", c) for c in _corridors(free, cell_m)]
     corridors += [("y", c) for c in _corridors(free.T, cell_m)]
     corridors.sort(key=lambda item: item[1].first - item[1].last)
@@ -73,10 +76,10 @@ def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
 
 
 def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
-    """Find corridors along the first axis: runs of free cells across it, joined if sides agree."""
+    """Find corridors along the first axis: free runs of cells in columns, joined if sides agree."""
     low, high = WIDTH_M[0] / cell_m - 1e-6, WIDTH_M[1] / cell_m + 1e-6
     wander = EDGE_M / cell_m + 1e-6
-    open_: list[tuple[_Corridor, int, int]] = []  # with the widest sides seen
+    open_: list[tuple[_Corridor, int, int]] = []  # corridor, outermost low and high side so far
     closed: list[_Corridor] = []
 
     def close(corridor: _Corridor) -> None:
@@ -119,7 +122,7 @@ def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
 def find_crossings(
     segments: tuple[AisleSegment, ...], free: Cells, cell_m: float
 ) -> tuple[Rect, ...]:
-    """Find free places beyond the ends of aisle segments, where others come from the side."""
+    """Find the free areas beyond the ends of aisle segments, where traffic comes from the side."""
     crossings: dict[Rect, None] = {}
     for segment in segments:
         turned = segment.along == "y"
@@ -145,7 +148,7 @@ def find_crossings(
 def find_goals(
     free: Cells, cell_m: float, spacing_m: float = 1.0, room_m: float = GOAL_ROOM_M
 ) -> tuple[tuple[float, float], ...]:
-    """Choose at most GOALS places with room around them, evenly over the free cells."""
+    """Choose up to GOALS places, evenly over the free cells, `room_m` or more from obstacles."""
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
     stride = max(round(spacing_m / cell_m), 1)
     places = []
@@ -163,10 +166,10 @@ def find_goals(
 
 
 def cover(blocked: Cells, limit: int) -> list[Box] | None:
-    """Cover all blocked cells (X, Y) beside free ones with rectangles; None if above `limit`.
+    """Cover the blocked cells (X, Y) beside free ones with rectangles; None if over `limit`.
 
-    Each grows from a cell not yet covered, along one axis first and then along the other, in
-    whichever order covers more.
+    Each rectangle grows from an uncovered cell, along one axis and then the other. Of the two
+    orders of axes, the one that covers more is used.
     """
     seen = ndimage.binary_dilation(~blocked, np.ones((3, 3), np.bool_)) & blocked
     total = np.zeros((blocked.shape[0] + 1, blocked.shape[1] + 1), np.int64)
@@ -186,12 +189,12 @@ def cover(blocked: Cells, limit: int) -> list[Box] | None:
 
 
 def _grow(total: Ints, i: int, j: int, order: tuple[int, int]) -> Box:
-    """Grow a rectangle of blocked cells along the axes in this order."""
+    """Grow a rectangle of blocked cells from cell (i, j), along the axes in this order."""
     box = [i, i + 1, j, j + 1]
     for axis in order:
         for side, step in ((2 * axis, -1), (2 * axis + 1, 1)):
             end = total.shape[axis] - 1
-            # How far: doubling strides, then halving ones, each tried whole.
+            # Double the stride while the rectangle stays blocked, then halve it down to 1.
             stride = 1
             while stride:
                 longer = box.copy()

@@ -3,13 +3,13 @@
 `docs/layouts.md` has an example and lists the keys of a floor. Aisles, goals and crossings that are
 not given are found from the racks.
 
-Occupancy maps are `map.yaml` and its image, read as `nav2_map_server` reads them
-(https://docs.nav2.org, map_io.cpp): with `p` a pixel's darkness in [0, 1], turned around by
-`negate`,
+An occupancy map is a `map.yaml` and its image, read as `nav2_map_server` reads them
+(https://docs.nav2.org, map_io.cpp). The `mode` decides what a pixel means:
 
-- `trinary`: occupied above `occupied_thresh`, free below `free_thresh`, else unknown;
-- `scale`: the same, and what is transparent is unknown;
-- `raw`: the pixel is the occupancy in percent; above 100, unknown; the thresholds hold on it.
+- `trinary`: occupied if its darkness in [0, 1] (inverted by `negate`) is above `occupied_thresh`,
+  free if below `free_thresh`, else unknown;
+- `scale`: the same, but transparent pixels are unknown;
+- `raw`: its value is the occupancy in percent, compared with the thresholds; unknown above 100.
 
 The image's lower left corner is `origin` (x, y, yaw) in the map's frame.
 """
@@ -55,7 +55,7 @@ from restock.train.twin.floors.occupancy_grid import (
 )
 
 Box = tuple[float, float, float, float]
-CELL_M = 0.05  # in which aisles are looked for
+CELL_M = 0.05  # size of the cells in which aisles, crossings and goals are searched
 
 
 class _NamedBox(Checked, frozen=True):
@@ -182,7 +182,7 @@ def write_floor(floor: Warehouse, path: Path, remarks: Sequence[str] = ()) -> No
 
 
 Mode = Literal["trinary", "scale", "raw"]
-FURTHEST_M = 1e6  # of an origin: beyond it a coordinate has no millimetres left
+FURTHEST_M = 1e6  # limit for an origin: float32 coordinates beyond it lose their millimetres
 MAX_YAML = 1 << 20  # bytes
 _FORMATS = ("PPM", "PNG", "BMP")  # PPM: Pillow's name for PGM and its kin
 
@@ -216,7 +216,7 @@ def read_map(path: Path) -> Warehouse:
     """Read the floor of an occupancy map.
 
     Raises:
-        ConfigError: as `read_grid`, or a map without room for the robot.
+        ConfigError: as in `read_grid`, or the map has no room for the robot.
     """
     return floor_of_grid(read_grid(path), name=path.name, where=str(path)).floor
 
@@ -225,8 +225,8 @@ def read_grid(path: Path) -> OccupancyGrid:
     """Read the occupancy grid of a `map.yaml`.
 
     Raises:
-        ConfigError: files that cannot be read, a key that is missing or out of range, an image
-            that lies elsewhere, or is none.
+        ConfigError: a file cannot be read, a key is missing or out of range, or the image is not
+            an image or is outside the map's folder.
     """
     description = _read_yaml(path)
     image = path.parent / description.image
@@ -283,7 +283,7 @@ def read_image(path: Path) -> tuple[F64, NDArray[np.bool_]]:
     """Read shades (H, W) in [0, 1], top row first, and which pixels are opaque (H, W).
 
     Raises:
-        ConfigError: no such file, one that is not a PGM, PNG or BMP, or is cut short or too large.
+        ConfigError: the file does not exist, is not a PGM, PNG or BMP, is cut short or too large.
     """
     try:
         with Image.open(path, formats=_FORMATS) as image:

@@ -1,15 +1,14 @@
 """The twin's floors: generated from seeds, split into training, validation and test.
 
-`open_floors` takes what a user writes:
+`open_floors` opens floors by what a user writes:
 
 - `default`: the floor that comes with Restock;
-- `generated:SEED`, `narrow:SEED`: one floor; narrow ones have aisles that a robot just passes;
-- `generated:train`, `…:validation`, `…:test`, with `:COUNT`: the first floors of that split;
-- `FILE.toml` (`restock.train.twin.floors.floor_files`) or `map.yaml`
-(`restock.train.twin.floors.floor_files`);
-- several of them, separated by commas.
+- `generated:SEED`, `narrow:SEED`: one floor; a robot barely fits the aisles of a narrow one;
+- `generated:train`, `…:validation`, `…:test`, optionally `:COUNT`: the first floors of a split;
+- `FILE.toml` or `map.yaml`: a floor from a file (`restock.train.twin.floors.floor_files`);
+- several of these, separated by commas.
 
-Every seed belongs to one split, by a hash of it: no floor is ever in two of them.
+A hash of the seed decides the split, so no floor is in two splits.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from restock.train.twin.floors.layout import (
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 _TENTHS = {"train": 7, "validation": 1, "test": 2}  # of all seeds
-FLOORS = 16  # of a split, where no count is given
+FLOORS = 16  # of a split, if no count is given
 MAX_FLOORS = 256
 MAX_SEED = 2**53 - 1
 
@@ -49,15 +48,15 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Recipe:
-    """The ranges that a generator draws from, in metres, rounded to .1 m."""
+    """The ranges that a floor is drawn from. Lengths are rounded to .1 m."""
 
     aisle_m: Range = (1.5, 2.3)  # width
-    cross_m: Range = (2.0, 2.6)
+    cross_m: Range = (2.0, 2.6)  # width of a cross-aisle
     rack_m: Range = (2.4, 3.6)  # along the aisle
     rack_deep_m: Range = (0.8, 1.4)
     aisles: tuple[int, int] = (3, 5)
     cross_aisles: tuple[int, int] = (3, 4)
-    one_way: float = 0.4  # probability that a floor's inner aisles are one-way, in turns
+    one_way: float = 0.4  # probability that inner aisles are one-way, in alternating directions
     gap: float = 0.1  # probability that a rack is missing
     turned: float = 0.5  # probability that aisles run north and south
     docks: tuple[int, int] = (2, 4)
@@ -85,7 +84,7 @@ def seeds_of(split: Split) -> Iterator[int]:
 
 
 def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None) -> Warehouse:
-    """Return the floor of a seed: the same for the same seed and recipe, always.
+    """Generate the floor of a seed; the same seed and recipe always give the same floor.
 
     Raises:
         ConfigError: a seed out of range, or a recipe whose floors would be too large.
@@ -133,7 +132,7 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
 def _strips(
     widths: list[float], recipe: Recipe, rng: np.random.Generator, way: Literal["deep", "long"]
 ) -> tuple[tuple[Range, ...], float]:
-    """Draw free strips with racks between them; return them and where the last one ends."""
+    """Lay free strips with drawn rack sizes between them; return them and the last one's end."""
     span = recipe.rack_deep_m if way == "deep" else recipe.rack_m
     strips, at = [], 0.0
     for width in widths:
@@ -170,11 +169,11 @@ def transposed(floor: Warehouse) -> Warehouse:
 
 
 def open_floors(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ...]:
-    """Open the floors of names, files or comma-separated lists; `docs/layouts.md` lists them.
+    """Open floors by name, file or comma-separated list; `docs/layouts.md` lists the names.
 
     Raises:
-        ConfigError: no such floor, or a file that is not a floor; says which and what to write. Or
-            none at all, or two of one name.
+        ConfigError: a floor does not exist, a file is not a floor, no floor is given, or two have
+            the same name.
     """
     floors: list[Warehouse] = []
     for part in [layouts] if isinstance(layouts, str) else layouts:
@@ -195,7 +194,7 @@ def open_floors(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ..
 
 
 def layouts_of_split(text: str, split: Split) -> str:
-    """Replace the training floors in a text for `open_floors` by those of another split."""
+    """Replace the training floors in a text for `open_floors` by the floors of another split."""
     parts = [part.strip() for part in text.split(",")]
     return ",".join(
         f"{kind}:{split}" if kind in RECIPES and rest.partition(":")[0] == "train" else part

@@ -28,30 +28,30 @@ PERSON_RADIUS_M = 0.25
 PERSON_HALF_HEIGHT_M = 0.85
 FORKLIFTS = 1
 FORKLIFT_HALF_M = (0.60, 0.40, 0.60)
-PARKED_M = (-50.0, -50.0, 1.0)  # where bodies wait that no episode uses
+PARKED_M = (-50.0, -50.0, 1.0)  # where bodies that an episode does not use are parked
 AGENTS = PEOPLE + FORKLIFTS  # the people first
 WAY_POINTS = 24
-PATCHES = 4  # at most, an episode: parts of the floor with a friction of their own
+PATCHES = 4  # maximum per episode; a patch is a part of the floor with its own friction
 NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
 
 
 @dataclass(frozen=True)
 class Walk:
-    """The path of a person or forklift, (WAY_POINTS, 2) evenly spaced, and its behaviour on it."""
+    """The path of a person or forklift, and its behaviour on the path."""
 
-    way_m: F64
+    way_m: F64  # (WAY_POINTS, 2), evenly spaced
     speed_mps: float
-    trigger: tuple[float, float, float]  # x, y, and how near the robot must come to it
-    attentive: bool
+    trigger: tuple[float, float, float]  # x, y, radius: the walk starts when the robot is inside
+    attentive: bool  # stops before a robot, even one that drives
 
 
 def no_pallets() -> F64:
-    """Return every pallet parked off the floor."""
+    """Return poses (PALLETS, 3) of pallets that are all parked off the floor."""
     return np.tile([PARKED_M[0], PARKED_M[1], 0.0], (PALLETS, 1))
 
 
 def pallet_half_m(yaw_rad: F64) -> F64:
-    """Return pallets' half sizes (..., 2) along x and y, exchanged if they stand across."""
+    """Return pallets' half sizes (..., 2) along x and y, exchanged if yaw is beyond 45 degrees."""
     across = np.abs(np.sin(yaw_rad))[..., None] > 0.7
     return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
 
@@ -68,10 +68,10 @@ HEADINGS: dict[str, tuple[int, int]] = {
 DEFAULT = "default"
 ELSEWHERE = "elsewhere"
 MIN_SIDE_M = 1.0
-MAX_SIDE_M = 60.0  # a plan of a floor larger than this takes seconds
+MAX_SIDE_M = 60.0  # planning on a larger floor takes seconds
 MAX_RACKS = 400
-ROOM_M = 0.3  # half the stand-in's width and a margin: its middle comes no nearer to a rack
-WAY_M = (4.0, 11.0)  # of a mission
+ROOM_M = 0.3  # minimum from the robot's middle to a rack: half the stand-in's width and a margin
+WAY_M = (4.0, 11.0)  # shortest and longest route of a mission
 BAY_M = 0.6  # between the goals along an aisle
 
 
@@ -106,15 +106,15 @@ class Rect:
 
     @property
     def transposed(self) -> Rect:
-        """Return it with x and y exchanged."""
+        """Return the rectangle with x and y exchanged."""
         return Rect(self.y_min, self.x_min, self.y_max, self.x_max)
 
 
 @dataclass(frozen=True)
 class AisleSegment:
-    """A part of an aisle between two cross-aisles, which one block closes.
+    """A part of an aisle between two cross-aisles. Pallets at one place in it close it.
 
-    It runs along `along` and is shut in by racks or walls on its two other sides.
+    It runs along the axis `along`, between racks or walls on its two other sides.
     """
 
     name: str  # aisle_2_west
@@ -124,7 +124,7 @@ class AisleSegment:
 
     @property
     def lengthwise(self) -> Rect:
-        """Return its area with x along the aisle: x and y are exchanged if it runs north."""
+        """Return the area with x along the aisle: x and y are exchanged if the aisle runs north."""
         return self.area if self.along == "x" else self.area.transposed
 
     @property
@@ -143,7 +143,7 @@ class Dock:
 
 @dataclass(frozen=True)
 class OneWay:
-    """A part of the floor where robots drive in one direction only, or turn, or cross it."""
+    """A part of the floor where robots may drive, turn and cross, but not against `heading`."""
 
     area: Rect
     heading: Heading
@@ -157,17 +157,17 @@ class Warehouse:
     depth_m: float
     racks: tuple[Rect, ...]
     segments: tuple[AisleSegment, ...]
-    goals_m: tuple[tuple[float, float], ...]  # where a robot may be sent, the docks aside
+    goals_m: tuple[tuple[float, float], ...]  # where a robot may be sent, besides the docks
     crossings: tuple[Rect, ...] = ()  # where traffic crosses: an aisle meets a cross-aisle
-    cross_zones: tuple[tuple[str, Rect], ...] = ()  # named parts beside aisles and docks
+    cross_zones: tuple[tuple[str, Rect], ...] = ()  # named parts besides aisles and docks
     docks: tuple[Dock, ...] = ()
     one_way: tuple[OneWay, ...] = ()
     name: str = DEFAULT
     wall_m: float = 0.1
     map_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, yaw of the corner, in the map
     room_m: float = ROOM_M  # plans keep a robot's middle this far off racks and walls
-    way_m: tuple[float, float] = WAY_M  # how long a mission's way is, from and to
-    starts_m: tuple[tuple[float, float], ...] = ()  # where missions begin, where that is known
+    way_m: tuple[float, float] = WAY_M  # shortest and longest route of a mission
+    starts_m: tuple[tuple[float, float], ...] = ()  # where missions begin, if known
 
     def __post_init__(self) -> None:
         """Raise ConfigError if the numbers do not make a floor."""
@@ -175,7 +175,7 @@ class Warehouse:
             raise ConfigError(wrong[0], where=f"layout {self.name}", remedy=wrong[1])
 
     def _wrong(self) -> tuple[str, str] | None:
-        """Return what is wrong with the numbers, and what to do; None if they make a floor."""
+        """Return what is wrong with the numbers, and the remedy; None if they make a floor."""
         size = f"0 to {self.width_m:g} m by 0 to {self.depth_m:g} m"
         for side in (self.width_m, self.depth_m):
             if not MIN_SIDE_M <= side <= MAX_SIDE_M:
@@ -207,13 +207,13 @@ class Warehouse:
 
     @cached_property
     def goals(self) -> F64:
-        """Return where a robot may be sent, (G, 2): bays, crossings and docks."""
+        """Return the places that a robot may be sent to, (G, 2): `goals_m`, then the docks."""
         docks = tuple(dock.area.center for dock in self.docks)
         return np.array(self.goals_m + docks, np.float64).reshape(-1, 2)
 
     @cached_property
     def starts(self) -> tuple[AisleSegment, ...]:
-        """Return where episodes begin: known places, else aisle segments, else around goals."""
+        """Return the areas where episodes begin: known starts, else aisle segments, else goals."""
         if self.starts_m:
             here = (Rect(x - 0.46, y - 0.46, x + 0.46, y + 0.46) for x, y in self.starts_m)
             return tuple(AisleSegment("start", 0, area) for area in here)
@@ -222,7 +222,7 @@ class Warehouse:
 
     @cached_property
     def zones(self) -> dict[str, Rect]:
-        """Return named parts of the floor, for coverage; the first one counts if they overlap."""
+        """Return the named parts of the floor, for coverage; if parts overlap, the first counts."""
         named = {dock.name: dock.area for dock in self.docks}
         named |= dict(self.cross_zones)
         return named | {segment.name: segment.area for segment in self.segments}
@@ -236,7 +236,7 @@ class Warehouse:
         return [str(name) for name in names[inside.argmax(axis=1)]]
 
     def segment_of(self, x_m: F64, y_m: F64) -> Ints:
-        """Return the index of the aisle segment each point lies in, (N,); -1 for none."""
+        """Return the index (N,) of the aisle segment that holds each point; -1 if none does."""
         if not self.segments:
             return np.full(np.shape(x_m), -1, np.int64)
         inside = within(self.segment_edges, x_m, y_m)
@@ -244,7 +244,7 @@ class Warehouse:
 
     @cached_property
     def rack_boxes(self) -> F64:
-        """Return the middle and the half size of each rack, (R, 4)."""
+        """Return the centre and half size of each rack, (R, 4)."""
         return np.array([(*rack.center, *rack.half_size) for rack in self.racks]).reshape(-1, 4)
 
     @cached_property
@@ -259,10 +259,10 @@ class Warehouse:
 
     @cached_property
     def hash(self) -> str:
-        """Return 12 hex digits that identify the floor, its name excepted."""
+        """Return 12 hex digits that identify the floor, independently of its name."""
         content = asdict(self) | {"name": ""}
         for later, usual in (("room_m", ROOM_M), ("way_m", WAY_M), ("starts_m", ())):
-            if content[later] == usual:  # floors from before these were known keep their hash
+            if content[later] == usual:  # so that floors from before these fields keep their hash
                 del content[later]
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
 
@@ -296,7 +296,8 @@ def strip_warehouse(
 ) -> Warehouse:
     """Build a grid of racks between free strips: aisles (south, north), cross-aisles (west, east).
 
-    `open_racks` are left out: floor to walk on. There is no aisle segment beside such a place.
+    Racks whose index is in `open_racks` are left out, so their place is free. No aisle segment lies
+    beside such a place.
     """
     blocks = [
         Rect(west[1], south[1], east[0], north[0])

@@ -1,13 +1,13 @@
 """Occupancy grids from any source, and the twin's floors made from them.
 
-Occupancy is in percent, -1 unknown, as `nav_msgs/OccupancyGrid` has it. The floor is one connected
-part of the free cells: the one that a robot drove in where its poses are known, else the largest.
-What is not free, or unknown, is obstacle, merged into boxes; where that takes too many, cells are
-made coarser and never freer, which is said in the floor's notes. The floor keeps the grid's axes,
-and `Warehouse.map_origin` the way back to the map's frame.
+Occupancy is in percent, -1 for unknown, as in `nav_msgs/OccupancyGrid`. The floor is one connected
+part of the free cells: the part that a robot drove in if its poses are known, else the largest.
+All other cells, unknown ones included, are obstacles, which are merged into boxes. If that takes
+too many boxes, cells are made coarser (never freer), and a note of the floor says so. The floor
+keeps the grid's axes; `Warehouse.map_origin` leads back to the map's frame.
 
 If the robot's poses are known, missions start and end at places where it really was, with room to
-turn, and connected with the others. Of each square of the floor the roomiest such place is kept.
+turn, and connected with each other. Each square of the floor keeps its place with the most room.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from restock.train.twin.floors.layout import (
 )
 from restock.train.twin.floors.planner import Planner
 
-SPACING_M = 0.5
-PLACES = 100
-SAMPLE = 12  # starts and goals at most, whose ways are measured
-OFTEN = 0.1  # of the pairs of places: so many are a usual mission apart on a large floor
-SHORTEST = 0.4  # of the longest way on a small one
-NEAR_M = 3.0  # places that are no further apart give short missions alone
-NEAREST_M = 0.5  # a way shorter than this is no mission
+SPACING_M = 0.5  # side of the squares that keep one place each
+PLACES = 100  # maximum
+SAMPLE = 12  # starts, and goals, between which routes are measured (roughly)
+OFTEN = 0.1  # on a large floor, at least this share of routes has a usual mission's length
+SHORTEST = 0.4  # on a smaller floor, the shortest mission as a share of the longest route
+NEAR_M = 3.0  # if visited places are no farther apart, missions go to other places, too
+NEAREST_M = 0.5  # shorter routes are not used as missions
 
 
 def find_places(
@@ -57,10 +57,10 @@ def find_places(
     turn_m: float,
     notes: list[str],
 ) -> tuple[tuple[float, float], ...]:
-    """Choose start and goal places among those visited (N, 2), in the floor's frame.
+    """Choose start and goal places among the visited ones (N, 2), in the floor's frame.
 
-    `free` and `reachable` (X, Y) are the floor's cells, `room_m` is what driving needs around a
-    robot's middle, `turn_m` what turning does. Without two places there are none.
+    `free` and `reachable` (X, Y) are masks of the floor's cells. A robot needs `room_m` around its
+    middle to drive, and `turn_m` to turn. If fewer than two places fit, none is returned.
     """
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
     cells = np.floor(visited_m / cell_m).astype(np.int64)
@@ -96,7 +96,7 @@ def find_places(
 def with_missions(
     floor: Warehouse, elsewhere: tuple[tuple[float, float], ...], notes: list[str]
 ) -> Warehouse:
-    """Return the floor with lengths of missions that fit its places.
+    """Return the floor with mission lengths that fit its places.
 
     If the visited places are all close together, missions also go to places in `elsewhere`.
     """
@@ -124,7 +124,7 @@ def missions_way(floor: Warehouse) -> Warehouse:
 
 
 def _ways(floor: Warehouse) -> tuple[F64, F64]:
-    """Return lengths and costs (N,) in metres of the ways between places that make missions."""
+    """Return the lengths and costs (N,), in metres, of routes that are long enough for missions."""
     planner = Planner(floor, trees_kept=1)
     starts = [segment.area.center for segment in floor.starts]
     starts = starts[:: max(len(starts) // SAMPLE, 1)]
@@ -140,11 +140,11 @@ def _ways(floor: Warehouse) -> tuple[F64, F64]:
 
 
 def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
-    """Return the floor with missions of these lengths, unless the usual ones are common enough."""
+    """Return the floor with these lengths for missions, unless usual lengths are common enough."""
     if not len(length):
         return floor
     low, high = WAY_M
-    usual = (length >= low) & (length <= high) & (cost <= 1.3 * high)  # as episodes are drawn
+    usual = (length >= low) & (length <= high) & (cost <= 1.3 * high)  # as in `draw_episode`
     if usual.mean() >= OFTEN:
         return floor
     longest = float(max(length.max(), cost.max() / 1.3))
@@ -153,7 +153,7 @@ def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
 
 
 def connected(floor: Warehouse) -> Warehouse:
-    """Return the floor with only the goals and starts of the part that holds most goals."""
+    """Return the floor with only the goals and starts of the connected part with most goals."""
     planner = Planner(floor, trees_kept=1)
     part = planner.parts()
     goals = part[[planner.cell(x, y) for x, y in floor.goals_m]]
@@ -165,14 +165,14 @@ def connected(floor: Warehouse) -> Warehouse:
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 COARSEST_M = 0.2
-MAX_CELLS = 40_000_000  # read from a header before anything else: a map's pixels take memory
-_MANY_CELLS = 6_000_000  # more are made coarser first: a floor has at most MAX_SIDE_M
-_AROUND_M = 12.0  # of the places that a robot drove, what is kept of a map that is too large
+MAX_CELLS = 40_000_000  # checked in the header of a map's image, before its pixels take memory
+_MANY_CELLS = 6_000_000  # larger grids are made coarser first: a floor has at most MAX_SIDE_M
+_AROUND_M = 12.0  # a map that is too large is cut to this distance around the robot's places
 
 
 @dataclass(frozen=True)
 class OccupancyGrid:
-    """Cells (X, Y) of a map: column i, row j is i along the grid's x and j along its y."""
+    """The cells (X, Y) of a map: cell (i, j) is i-th along the grid's x and j-th along its y."""
 
     occupancy: NDArray[np.int8]  # (X, Y) percent, -1 unknown
     cell_m: float
@@ -185,24 +185,24 @@ class OccupancyGrid:
         return np.asarray(self.occupancy == FREE, np.bool_)
 
     def within(self, places_m: F64) -> F64:
-        """Convert places (N, 2) of the map's frame to the grid's own axes, from its corner."""
+        """Convert places (N, 2) from the map's frame to the grid's, which begins at its corner."""
         return into_frame(places_m, self.origin)
 
     def at(self, places_m: F64) -> NDArray[np.int8]:
-        """Return the occupancy (N,) at places (N, 2) of the map's frame; unknown off the map."""
+        """Return the occupancy (N,) at places (N, 2) in the map's frame; UNKNOWN off the grid."""
         cells, inside = self.cells_at(places_m)
         found = np.full(len(places_m), UNKNOWN, np.int8)
         found[inside] = self.occupancy[cells[inside, 0], cells[inside, 1]]
         return found
 
     def cells_at(self, places_m: F64) -> tuple[NDArray[np.int64], Bools]:
-        """Return the cells (N, 2) of places (N, 2) of the map, and which are on it (N,)."""
+        """Return the cells (N, 2) at places (N, 2) in the map's frame, and which are on the grid."""
         cells = np.floor(self.within(places_m) / self.cell_m).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupancy.shape)).all(axis=1)
         return cells, np.asarray(inside, np.bool_)
 
     def cut(self, i0: int, i1: int, j0: int, j1: int) -> OccupancyGrid:
-        """Return its columns i0 to i1 and rows j0 to j1 (exclusive)."""
+        """Return the grid of columns i0 to i1 and rows j0 to j1 (exclusive)."""
         corner = out_of_frame(np.array([[i0, j0]]) * self.cell_m, self.origin)[0]
         origin = (float(corner[0]), float(corner[1]), self.origin[2])
         return OccupancyGrid(self.occupancy[i0:i1, j0:j1], self.cell_m, origin, self.frame)
@@ -220,7 +220,7 @@ class OccupancyGrid:
 
 @dataclass(frozen=True)
 class GridFloor:
-    """A floor made from a grid, with the grid as it was used and notes on what was changed."""
+    """A floor made from a grid, the part of the grid that was used, and notes on changes to it."""
 
     floor: Warehouse
     grid: OccupancyGrid
@@ -228,7 +228,7 @@ class GridFloor:
 
 
 def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
-    """Convert places (N, 2) of the map to a frame whose corner and yaw are `origin`."""
+    """Convert places (N, 2) from the map's frame to the frame at `origin` (x, y, yaw) in it."""
     x, y, yaw = origin
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved: F64 = (np.asarray(places_m, np.float64) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
@@ -236,7 +236,7 @@ def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
 
 
 def out_of_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
-    """Convert places (N, 2) of such a frame to the map's frame."""
+    """Convert places (N, 2) from the frame at `origin` (x, y, yaw) back to the map's frame."""
     x, y, yaw = origin
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved: F64 = np.asarray(places_m, np.float64) @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
@@ -252,24 +252,25 @@ def floor_of_grid(
     turn_m: float = GOAL_ROOM_M,
     visited_m: F64 | None = None,
 ) -> GridFloor:
-    """Build the floor of a grid: the part the robot was in, or the largest that it fits in.
+    """Build a floor from a grid: the part the robot was in, or the largest part that it fits in.
 
     Args:
-        name: of the floor.
-        where: names the grid in errors.
-        room_m: how far a robot's middle keeps off obstacles.
-        turn_m: how far off it needs them to turn on the spot.
-        visited_m: where it drove (N, 2), in the map's frame: missions start and end there.
+        name: name of the floor.
+        where: name of the grid in errors.
+        room_m: minimum distance from a robot's middle to obstacles.
+        turn_m: the same distance for turning on the spot.
+        visited_m: places (N, 2), in the map's frame, where the robot drove: missions start and end
+            there.
 
     Raises:
-        ConfigError: no such part, one too large, or obstacles too ragged for boxes.
+        ConfigError: no such part exists, it is too large, or obstacles are too ragged for boxes.
     """
     notes: list[str] = []
     grid = _bounded(grid, where, visited_m, notes)
     drivable = drivable_part(grid.free, grid.cell_m, room_m, _cells_in(grid, visited_m))
     if not drivable.any():
         raise ConfigError(_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
-    # Free cells that belong to it: within the room around its cells.
+    # The part also has the free cells around those that the robot's middle can be in.
     near = ndimage.distance_transform_edt(~drivable) * grid.cell_m <= 1.5 * room_m + grid.cell_m
     free = grid.free & near
     columns, rows = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
@@ -342,7 +343,7 @@ def _no_room(grid: OccupancyGrid, room_m: float) -> str:
 def _bounded(
     grid: OccupancyGrid, where: str, visited_m: F64 | None, notes: list[str]
 ) -> OccupancyGrid:
-    """Cut a grid too large for a floor to where the robot drove, or make it coarser."""
+    """Cut a grid that is too large for a floor to where the robot drove, and make it coarser."""
     size = grid.occupancy.shape
     if visited_m is not None and len(visited_m) and max(size) * grid.cell_m > MAX_SIDE_M:
         cells, inside = grid.cells_at(visited_m)
@@ -379,7 +380,7 @@ def _metres(grid: OccupancyGrid) -> str:
 def _cells_in(
     grid: OccupancyGrid, visited_m: F64 | None, cell_m: float | None = None
 ) -> NDArray[np.int64] | None:
-    """Return the cells (N, 2) of this size that the robot was in; they may be off the grid."""
+    """Return the cells (N, 2), of size `cell_m`, that the robot was in, even cells off the grid."""
     if visited_m is None:
         return None
     return np.floor(grid.within(visited_m) / (cell_m or grid.cell_m)).astype(np.int64)
@@ -388,7 +389,7 @@ def _cells_in(
 def _racks(
     free: Cells, cell_m: float, where: str, notes: list[str]
 ) -> tuple[Cells, float, tuple[Rect, ...]]:
-    """Cover the obstacles with boxes, with coarser (never freer) cells until few boxes suffice."""
+    """Cover obstacles with at most MAX_RACKS boxes, on coarser (never freer) cells if needed."""
     fine, fine_m = free, cell_m
     while cell_m <= COARSEST_M:
         boxes = cover(~free, MAX_RACKS)
@@ -417,9 +418,9 @@ def _racks(
 def drivable_part(
     free: Cells, cell_m: float, room_m: float, visited: NDArray[np.int64] | None = None
 ) -> Cells:
-    """Return the connected cells that a robot's centre can be in.
+    """Return one connected part of the cells that a robot's centre can be in.
 
-    It is the part with most of the cells `visited` (N, 2), else the largest.
+    It is the part with most of the cells `visited` (N, 2), or the largest part if none has any.
     """
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
     parts, count = ndimage.label(room >= room_m)

@@ -1,8 +1,8 @@
-"""Checks that a drive is in a floor's frame: poses on free ground, lidar returns on walls.
+"""Check that a drive is in a floor's frame: poses on free ground, lidar returns near walls.
 
-Odometry begins anew with each start of a robot, and so may a map that is made on the way:
-recordings may each have a frame of their own. On open ground poses of another frame lie as well as
-the floor's own, but walls are then elsewhere.
+Odometry starts again from zero with each start of a robot, and so may a map that is made while
+driving, so each recording may have its own frame. On open ground, poses of another frame fit as
+well as poses of the floor's own frame; only the walls are then in the wrong place.
 
 `logged_drives` reads the drives of a store's recordings.
 """
@@ -21,24 +21,24 @@ from restock.ingest.task.task import Task, clearances_of
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
 
-PLACED = 0.8  # of the poses, on free ground
+PLACED = 0.8  # minimum share of poses on free ground
 
-# Of the returns, that near to a wall. Measured on real drives and the sample logs: on the floors
-# that were made of them .78 to .98, on those of other frames up to .61.
+# Minimum share of lidar returns within NEAR_M of a wall. Measured on real drives and the sample
+# logs: .78 to .98 on floors made from the same drives, up to .61 on floors of other frames.
 SEEN, NEAR_M = 0.7, 0.25
-MIN_RETURNS = 50  # fewer say nothing
+MIN_RETURNS = 50  # fewer returns are ignored
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The places of a robot and of its lidar's nearest returns, in the frame of its log."""
+    """The positions of a robot and of its lidar's nearest returns, in the frame of its log."""
 
     places_m: F64  # (N, 2)
-    returns_m: F64  # (M, 2); none without a lidar
+    returns_m: F64  # (M, 2); empty without a lidar
 
 
 def on_free_ground(floor: Warehouse, places_m: F64) -> Bools:
-    """Return which places (N, 2), in the floor's own frame, are on it and in no rack, (N,)."""
+    """Return which places (N, 2), in the floor's frame, are on it and outside all racks, (N,)."""
     x, y = places_m.T
     free: Bools = (x >= 0) & (x <= floor.width_m) & (y >= 0) & (y <= floor.depth_m)
     for rack in floor.racks:
@@ -47,7 +47,7 @@ def on_free_ground(floor: Warehouse, places_m: F64) -> Bools:
 
 
 def from_walls_m(floor: Warehouse, places_m: F64) -> F64:
-    """Return the distance (N,) of places (N, 2), in the floor's frame, to a rack or edge."""
+    """Return the distance (N,) of places (N, 2), in the floor's frame, to the next rack or wall."""
     x, y = places_m.T
     away = np.abs(np.stack([x, floor.width_m - x, y, floor.depth_m - y])).min(axis=0)
     for rack in floor.racks:
@@ -58,7 +58,7 @@ def from_walls_m(floor: Warehouse, places_m: F64) -> F64:
 
 
 def placed_on(floor: Warehouse, drive: Drive) -> bool:
-    """Return whether a drive, in the frame of its log, was on this floor."""
+    """Return whether the frame of a drive's log is that of this floor's map; False if empty."""
     if not len(drive.places_m):
         return False
     places, returns = (
@@ -71,10 +71,10 @@ def placed_on(floor: Warehouse, drive: Drive) -> bool:
     return float((from_walls_m(floor, returns) < NEAR_M).mean()) >= SEEN
 
 
-COMPARED = 64  # recordings whose frames are looked at where there may be thousands
-ROWS = 2000  # of a recording, at most about so many
-WITHIN_M = 3.0  # of the lidar: farther off, a sector is wide
-RETURNS = 4000  # at most so many
+COMPARED = 64  # maximum number of recordings whose frames are checked
+ROWS = 2000  # maximum rows read of a recording, roughly
+WITHIN_M = 3.0  # maximum distance of returns from the lidar: farther away, a sector is wide
+RETURNS = 4000  # maximum returns of a drive
 _COUNTS = (
     "SELECT recording_id, count(*) FROM transitions WHERE list_contains(?, recording_id)"
     " GROUP BY recording_id"
@@ -89,10 +89,10 @@ _ROWS = (
 def logged_drives(
     connection: duckdb.DuckDBPyConnection, task: Task | None, recordings: Sequence[str]
 ) -> dict[str, Drive]:
-    """Read the drives of these recordings, by id; only their poses if `task` is None."""
+    """Read drives by recording id; without returns if `task` is None or has no lidar."""
     counts = connection.execute(_COUNTS, [list(recordings)]).fetchall()
     lidar = task is not None and task.lidar
-    query = _ROWS.format(", observation" if lidar else "")  # large: only where it is looked at
+    query = _ROWS.format(", observation" if lidar else "")  # large, so read only if it is used
     drives = {}
     for recording, count in counts:
         x, y, yaw, *seen = (
@@ -108,7 +108,7 @@ def logged_drives(
 
 
 def drive_of(task: Task, poses: F64, clearance_m: F64) -> Drive:
-    """Build a drive from its known poses (N, 3) and the clearances (N, K) seen there."""
+    """Build a drive from poses (N, 3) and the clearances (N, K) seen there, without NaN poses."""
     clearance_m, poses = clearance_m[np.isfinite(poses).all(axis=1)], _known(poses)
     x, y = sector_returns(task, clearance_m)
     cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])

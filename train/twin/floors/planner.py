@@ -1,10 +1,10 @@
-"""The robot's navigation stack: plans on the known aisle map.
+"""The robot's navigation stack: plans on the known map of racks and walls.
 
-It knows the racks and the walls. Pallets, people and wet floors it does not: a wholly blocked
-aisle is found from the lidar (`block_finder`) and then closed on the grid, and the plan made again.
-Plans are shortest paths on a .1 m grid whose cells cost more near racks, one Dijkstra tree per
-goal and set of closures, cached; a plan is read off the tree, smoothed and resampled. One-way rules
-are directed edges; a robot that they shut in behind a block leaves against them.
+Pallets, people and wet floors are not on the map. If the lidar shows that an aisle is wholly
+blocked (`BlockFinder`), the aisle is closed on the grid and the robot replans. Plans are shortest
+paths on a .1 m grid whose cells cost more near racks. Each goal and set of closures has a cached
+Dijkstra tree; a plan is read off the tree, smoothed and resampled. One-way rules are directed
+edges. A robot that has no way to its goal under these rules, behind a block, may break them.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from restock.train.twin.floors.layout import HEADINGS, ROOM_M, Warehouse
 
 CELL_M = 0.1
 PLAN_POINTS = 48
-WIDE_M = 0.85  # from this clearance on, cells cost the stand-in no more than their length
-NEAR_COST = 3.0  # how much more a cell at the floor's `room_m` costs
+WIDE_M = 0.85  # cells with this clearance cost just their length, for the stand-in
+NEAR_COST = 3.0  # a cell whose clearance is the floor's `room_m` costs 1 + this times its length
 _TREES_KEPT = 2048
-_TREES_KEPT_BYTES = 1 << 29  # of all planners that `planners` makes together
+_TREES_KEPT_BYTES = 1 << 29  # of all planners together that one call of `planners` makes
 
-Closure = tuple[int, int]  # aisle segment, and the place along it in steps of CLOSURE_STEP_M
+Closure = tuple[int, int]  # aisle segment, and the position along it in steps of CLOSURE_STEP_M
 CLOSURE_STEP_M = 0.3
 
 
 @dataclass
 class Planner:
-    """A planner for one warehouse. Shared by all environments; its only state is a cache."""
+    """The planner of one warehouse, shared by all environments; its only state is a cache."""
 
     warehouse: Warehouse
     trees_kept: int = _TREES_KEPT
@@ -65,9 +65,9 @@ class Planner:
     ) -> F64:
         """Return the plan from a place to a goal, (PLAN_POINTS, 2), first point near the place.
 
-        Where closures leave no way, those that shut the robot off are opened again: a robot
-        that believed everything shut would stand for ever. A free place without a way by the
-        one-way rules gets one without them.
+        If closures leave no way, the last ones are ignored until there is a way: a robot for which
+        everything is closed would stand still for ever. If one-way rules leave no way from a free
+        place, the plan ignores them.
         """
         cell = self.cell(x_m, y_m)
         if self._unruled is not None and self._clearance_m.flat[cell] >= self.warehouse.room_m:
@@ -89,9 +89,9 @@ class Planner:
         boxes: F64,
         half_m: tuple[float, float],
     ) -> F64 | None:
-        """Plan past boxes as `graph_around` takes them; None if there is no way. Not cached.
+        """Plan past boxes (see `graph_around`), without a cache; None if there is no way.
 
-        Without boxes the result is that of `plan`.
+        Without boxes the plan is that of `plan`.
         """
         if not len(boxes):
             return self.plan(x_m, y_m, goal)
@@ -111,13 +111,13 @@ class Planner:
         boxes: F64,
         half_m: tuple[float, float],
     ) -> sparse.csr_matrix:
-        """Return the graph of cells for driving past boxes that the map does not know.
+        """Return the graph of cells for driving past boxes that are not on the map.
 
-        The boxes (K, 3) are x, y, yaw. Edges run against the robot's direction, in cost-weighted
-        metres.
+        The boxes (K, 3) are x, y, yaw, with half sizes `half_m`. Edges run against the robot's
+        direction; their weights are cost-weighted metres.
 
-        It is for drivers that see more than the robot does. One-way rules are dropped if boxes
-        leave no other way from a place to the goal, as in `plan`. Not cached.
+        The graph is for drivers that see more than the robot does, and is not cached. As in `plan`,
+        it has no one-way rules if they and the boxes leave no way to the goal.
         """
         clearance = self._clearance_m
         for x, y, yaw in boxes:
@@ -131,8 +131,8 @@ class Planner:
         return graph if np.isfinite(distance[cell]) else self._unruled._build_graph(clearance)
 
     def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
-        """Follow the tree from a cell to the goal; return the way smoothed and resampled."""
-        cells, following = [start], before.data  # whose items are Python's own numbers
+        """Follow the tree from a cell to the goal; return the path smoothed and resampled."""
+        cells, following = [start], before.data  # a memoryview: its items are Python ints
         while (cell := following[cells[-1]]) >= 0:
             cells.append(cell)
         way = stacked(*np.divmod(np.array(cells), self.shape[1])) * CELL_M + CELL_M / 2
@@ -144,7 +144,7 @@ class Planner:
         return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
 
     def parts(self) -> Ints:
-        """Return the connected part (size,) of each cell: by the rules, there and back."""
+        """Return the connected part (size,) of each cell; robots can drive both ways within a part."""
         return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
 
     def cell(self, x_m: float, y_m: float) -> int:
@@ -154,7 +154,10 @@ class Planner:
         return i * self.shape[1] + j
 
     def _nearest(self, cell: int, distance: F64) -> int:
-        """Return the reachable cell nearest to an unreachable one, such as one close to a rack."""
+        """Return the reachable cell nearest to an unreachable one, such as one beside a rack.
+
+        It is at most 8 cells away along each axis; -1 if there is none.
+        """
         i, j = divmod(cell, self.shape[1])
         low_i, low_j = max(i - 8, 0), max(j - 8, 0)
         window = distance.reshape(self.shape)[low_i : i + 9, low_j : j + 9]
@@ -194,9 +197,9 @@ class Planner:
         return (across, along) if turned else (along, across)
 
     def _build_graph(self, clearance_m: F64) -> sparse.csr_matrix:
-        """Connect cells to their eight neighbours, at length times the cost of both ends.
+        """Connect cells to their eight neighbours, at length times the mean cost of both ends.
 
-        Edges run against the robot's way: trees grow from the goal.
+        Edges run against the robot's direction, because trees grow from the goal.
         """
         room = self.warehouse.room_m
         wide = WIDE_M * (room / ROOM_M)
@@ -214,7 +217,7 @@ class Planner:
             one, other = index[cells][both], index[neighbours][both]
             length = CELL_M * np.hypot(di, dj)
             weight = length * (cost[cells][both] + cost[neighbours][both]) / 2
-            # one -> other in the graph is the robot's way from `other` to `one`, by (-di, -dj).
+            # Edge one -> other is for a robot that drives from `other` to `one`, by (-di, -dj).
             kept = _allowed(against, (-di, -dj), one, other)
             forth.append((one[kept], other[kept], weight[kept]))
             kept = _allowed(against, (di, dj), one, other)
@@ -223,7 +226,7 @@ class Planner:
         return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
 
     def _against_rules(self) -> list[tuple[tuple[int, int], Bools]]:
-        """Return each one-way rule's heading, and the cells (size,) that it holds in."""
+        """Return each one-way rule's heading, and a mask (size,) of the cells where it holds."""
         x, y = _cell_middles(self.shape)
         rules = []
         for rule in self.warehouse.one_way:
@@ -239,7 +242,7 @@ def _allowed(
     one: Ints,
     other: Ints,
 ) -> Bools:
-    """Return which edges between cells a robot may take by `step`: not against a one-way rule."""
+    """Return which edges a robot may drive in the direction `step`: not against one-way rules."""
     allowed = np.ones(len(one), np.bool_)
     for heading, inside in rules:
         if heading[0] * step[0] + heading[1] * step[1] < 0:
@@ -248,7 +251,7 @@ def _allowed(
 
 
 def planners(floors: Sequence[Warehouse]) -> list[Planner]:
-    """Return a planner per floor; together their caches stay within some 500 MB."""
+    """Return a planner per floor; their caches together take at most about 500 MB."""
     cells = max(round(f.width_m / CELL_M) * round(f.depth_m / CELL_M) for f in floors)
     kept = _TREES_KEPT_BYTES // (12 * max(cells, 1) * len(floors))
     return [Planner(floor, min(max(kept, 16), _TREES_KEPT)) for floor in floors]
@@ -285,15 +288,15 @@ def box_distance(
 
 
 def smooth_plan(way: NDArray[Any]) -> F64:
-    """Return a plan (PLAN_POINTS, 2) along the centres (C, 2) of the cells of a way."""
+    """Smooth and resample the centres (C, 2) of a path's cells to a plan (PLAN_POINTS, 2)."""
     return _resample(_smooth(way))
 
 
 def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
-    """Average a way's cells over a moving window, which rounds the grid's corners."""
+    """Average a path's cells over a moving window, which rounds off the grid's corners."""
     if len(way) < 3:
         return way
-    padded = np.zeros((len(way) + 2 * half_window + 1, 2))  # after a row of zeros
+    padded = np.zeros((len(way) + 2 * half_window + 1, 2))  # row 0 stays 0: sums start from it
     padded[1 : half_window + 1], padded[-half_window:] = way[0], way[-1]
     padded[half_window + 1 : -half_window] = way
     total, width = np.cumsum(padded, axis=0), 2 * half_window + 1

@@ -1,9 +1,9 @@
 """A state lattice: the time to a goal from every pose near obstacles, and the fastest plan.
 
-A plan on the map is a way for a point. Whether the robot's outline comes through a gap, and how it
-must stand before it, a search over places and headings says (state lattices: Pivtoraiko and Kelly,
-2005): within a window around the obstacles over cells of .1 m and 16 headings, outside it over the
-planner's cells, both in one Dijkstra tree from the goal.
+A plan on the map is a path for a point. A search over places and headings (a state lattice:
+Pivtoraiko and Kelly, 2005) also finds whether the robot's outline fits through a gap, and with
+which heading. Within a window around the obstacles, the states are cells of .1 m with 16 headings;
+outside the window, they are the planner's cells. One Dijkstra tree from the goal holds both.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from restock.arrays import F64, Bools, Ints
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import CELL_M, smooth_plan
 
-# A step to a neighbouring cell for each of 16 headings, counter-clockwise from east.
+# The step in cells along each of 16 headings, counter-clockwise from east.
 _QUARTER = [(1, 0), (2, 1), (1, 1), (1, 2)]
 STEPS = [*_QUARTER, *((-y, x) for x, y in _QUARTER)]
 STEPS += [(-x, -y) for x, y in STEPS]
 HEADINGS_RAD = np.array([np.arctan2(y, x) % (2 * np.pi) for x, y in STEPS])
 _ROUND_RAD = np.append(HEADINGS_RAD, 2 * np.pi)
 TOUCH_M = 0.06  # a pose whose outline comes nearer to anything is not free
-NEAR_M, NEAR_COST = 0.25, 2.0  # within this clearance a step costs up to so many times more
-ARC = 0.35  # of the time to turn on the spot, that the same turn takes while driving
-OFF_COST_S = 0.5  # a cell that a pose lies off the free ones
-_FIELD_M = 0.05  # cells of the clearance that outlines are looked up in
-_NO_WAY_S = 60.0  # of a heading without any free state
-BORDER_CELLS = 2  # along a window's sides, where the floor's cells go on
-ENTER_RAD = 0.6  # the turn that coming in costs: outside, where a cell has no heading, none does
+NEAR_M, NEAR_COST = 0.25, 2.0  # within NEAR_M, a step costs up to 1 + NEAR_COST times its time
+ARC = 0.35  # extra time of a turn while driving, as a share of the same turn on the spot
+OFF_COST_S = 0.5  # added for each cell between a state without a way and the nearest with one
+_FIELD_M = 0.05  # cell size of the clearance field in which outlines are looked up
+_NO_WAY_S = 60.0  # time from a heading that has no state with a way
+BORDER_CELLS = 2  # width of the border along a window's sides where the floor continues
+ENTER_RAD = 0.6  # turn charged for entering the window: outside it, turning costs nothing
 
 
 @dataclass(frozen=True)
 class Motion:
-    """The outline and speeds of a robot that turns on the spot, as a lattice needs them."""
+    """The outline and speeds of a robot that turns on the spot."""
 
     outline_m: F64  # (K, 2) points on its outline, x ahead of the pose
     ahead_mps: float
@@ -48,7 +48,10 @@ class Motion:
 
 @cache
 def rectangle(length_m: float, width_m: float, axle_x_m: float = 0.0, points: int = 5) -> F64:
-    """Return points on a rectangle's outline, (4 * points - 4, 2), about an axle off its centre."""
+    """Return points on a rectangle's outline, (4 * points - 4, 2), relative to its axle.
+
+    The axle is `axle_x_m` ahead of the centre. Each side has `points` points, corners included.
+    """
     side = np.linspace(-1.0, 1.0, points)[:-1]
     one = np.ones_like(side)
     corners = np.concatenate(
@@ -66,9 +69,9 @@ def rectangle(length_m: float, width_m: float, axle_x_m: float = 0.0, points: in
 class Window:
     """The cells of a floor that a lattice spans."""
 
-    low: Ints  # (2,) the first
-    high: Ints  # (2,) behind the last
-    floor: tuple[int, int]  # the floor's own number of cells
+    low: Ints  # (2,) first cell
+    high: Ints  # (2,) last cell + 1
+    floor: tuple[int, int]  # number of cells of the whole floor
 
     @classmethod
     def around(cls, places_m: F64, reach_m: float, floor: tuple[int, int]) -> Window:
@@ -90,7 +93,7 @@ class Window:
 
     @property
     def border(self) -> Bools:
-        """Return the cells (nx, ny) along those sides that are not the floor's."""
+        """Return the cells (nx, ny) along the window's sides, except sides of the floor itself."""
         border = np.ones(self.shape, np.bool_)
         first = np.where(self.low > 0, BORDER_CELLS, 0)
         last = self.shape - np.where(self.high < self.floor, BORDER_CELLS, 0)
@@ -98,13 +101,16 @@ class Window:
         return border
 
     def covers(self, x_m: float, y_m: float) -> bool:
-        """Return whether a place is in the window and off its border."""
+        """Return whether a place is in the window but not on its border."""
         (west, south), (east, north) = self._inner
         return west < x_m < east and south < y_m < north
 
     @cached_property
     def _inner(self) -> tuple[list[float], list[float]]:
-        """Return the least and largest x and y of what lies off the border."""
+        """Return the minimum and maximum x and y of the window without its border, in metres.
+
+        They are infinite on sides of the floor itself.
+        """
         margin = (BORDER_CELLS + 1) * CELL_M
         low = np.where(self.low == 0, -np.inf, self.low * CELL_M + margin)
         high = np.where(self.high == self.floor, np.inf, self.high * CELL_M - margin)
@@ -113,12 +119,12 @@ class Window:
 
 @dataclass(frozen=True)
 class StateLattice:
-    """The time to the goal from every pose of a window, and plans there from anywhere."""
+    """The time to the goal from every pose in a window, and plans to the goal from anywhere."""
 
     window: Window
-    times_s: F64  # (nx, ny, 17) at the middles of cells; the last heading is the first again
+    times_s: F64  # (nx, ny, 17) at the centres of cells; the last heading repeats the first
     goal: tuple[float, float]
-    _before: Ints  # (cells + states + 1,) the next node on the way; below 0: none
+    _before: Ints  # (cells + states + 1,) the next node on the way to the goal; negative: no way
 
     def time_s(self, poses: F64) -> F64:
         """Return times (...) from poses (..., 3): x, y, heading, interpolated between states."""
@@ -148,7 +154,7 @@ class StateLattice:
         return smooth_plan(places[np.append(moved, True)])
 
     def _nearest(self, x_m: float, y_m: float, yaw_rad: float) -> int:
-        """Return the nearest node within .6 m of a pose from which there is a way, or -1."""
+        """Return the nearest node, within .6 m of a pose, that has a way to the goal; else -1."""
         inside = self.window.covers(x_m, y_m)
         pose = np.array([x_m, y_m, yaw_rad])
         x, y, turned = (float(value) for value in self._place(pose))
@@ -169,7 +175,7 @@ class StateLattice:
         return int(nodes[gap.argmin()]) if np.isfinite(gap).any() else -1
 
     def _place(self, poses: F64) -> list[F64]:
-        """Convert poses (..., 3) to cells and headings of the window."""
+        """Convert poses (..., 3) to fractional indices of the window's cells and headings."""
         turned = np.interp(poses[..., 2] % (2 * np.pi), _ROUND_RAD, np.arange(len(_ROUND_RAD)))
         return [*(poses[..., a] / CELL_M - 0.5 - self.window.low[a] for a in range(2)), turned]
 
@@ -194,10 +200,10 @@ def lattice_around(
     motion: Motion,
     window: Window,
 ) -> StateLattice:
-    """Build a lattice over a window of a floor with boxes (K, 2), half sizes (K, 2), on it.
+    """Build a lattice over a window of a floor on which boxes (K, 2) of half sizes (K, 2) stand.
 
-    `graph` connects the floor's cells past the boxes, in metres, against the robot's direction
-    (`Planner.graph_around`). It is used outside the window.
+    `graph` (from `Planner.graph_around`) connects the floor's cells past the boxes, in metres,
+    against the robot's direction. It is used outside the window.
     """
     room = _room(floor, boxes, half_m, window, motion.outline_m)
     free = room > TOUCH_M
@@ -215,11 +221,11 @@ def lattice_around(
     filled = np.stack([_filled(times[..., k]) for k in range(len(STEPS))], axis=-1)
     filled = np.concatenate([filled, filled[..., :1]], axis=-1)
     before = before.astype(np.int64)
-    before[-1] = nodes  # the root: behind all
+    before[-1] = nodes  # the root is at the goal: not negative, which would mean no way
     return StateLattice(window, filled, goal, before)
 
 
-Edges = tuple[Ints, Ints, F64]  # from and to in the robot's way, and the seconds
+Edges = tuple[Ints, Ints, F64]  # start and end nodes in the robot's direction, and the seconds
 
 
 def _outside(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
@@ -254,7 +260,7 @@ def _arrivals(
 
 
 def _inside(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
-    """Return the edges between the window's states, whose nodes follow those of the cells."""
+    """Return the edges between the window's states; their nodes are numbered after the cells."""
     nx, ny, headings = free.shape
     index = np.arange(free.size).reshape(free.shape)
     edges: list[Edges] = []
@@ -308,7 +314,7 @@ def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: 
 
 
 def _filled(times: F64) -> F64:
-    """Fill unknown times (nx, ny) of one heading with the nearest known one plus a penalty."""
+    """Fill unknown times (nx, ny) of one heading with the nearest known time plus a penalty."""
     known = np.isfinite(times)
     if not known.any():
         return np.full(times.shape, _NO_WAY_S)
@@ -320,9 +326,9 @@ def _filled(times: F64) -> F64:
 def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64:
     """Return the distance from points (n, …) of n robots to the nearest rack, wall or `own` box.
 
-    It is negative inside, and exact if it is below `within_m`: boxes farther from all points of a
-    robot are left out, as a floor made of scans has hundreds. `own` (n, K, 4) are middles and half
-    sizes.
+    It is negative inside. It is exact only below `within_m`: boxes farther from all points of a
+    robot are skipped, because a floor made from scans has hundreds. `own` (n, K, 4) are the centres
+    and half sizes of boxes on each robot's floor.
     """
     room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
     room = np.ascontiguousarray(room)

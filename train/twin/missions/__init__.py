@@ -1,6 +1,6 @@
-"""The kinds of missions that the twin stages and scores, a file each.
+"""The kinds of missions that the twin stages and scores, one module each.
 
-A module in this folder with a `MISSION` is a kind; nothing else lists them.
+Every module in this folder that defines `MISSION` is a kind; no other list of kinds exists.
 """
 
 from __future__ import annotations
@@ -23,6 +23,6 @@ def _find() -> dict[str, Mission]:
 
 MISSIONS: Mapping[str, Mission] = _find()
 KINDS = tuple(MISSIONS)
-# Shares of episodes in training, and of a site that runs well, if nothing else is requested.
+# Default shares by kind: of episodes in training, and of missions at a site that runs well.
 DEFAULT_CONDITIONS: Mapping[str, float] = {name: one.share for name, one in MISSIONS.items()}
 NATURAL: Mapping[str, float] = {name: one.natural for name, one in MISSIONS.items()}

@@ -1,4 +1,4 @@
-"""Pallets across an aisle on the route, partly (a gap of .8 to 1 m) or wholly."""
+"""Pallets across an aisle on the route, which leave a gap of .8 to 1 m or block it wholly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ GAP_M = (0.80, 1.00)
 
 
 def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged | None:
-    """Stage pallets across an aisle of the plan; None if none has room."""
+    """Stage pallets across an aisle on the plan; None if there is no room."""
     block = "partial" if rng.random() < 0.5 else "full"
     pallets = _draw_block(rng, warehouse, plan, full=block == "full")
     return None if pallets is None else Staged(block, pallets=pallets)
@@ -43,7 +43,7 @@ def _draw_block(
     x = along[place]
     width = area.y_max - area.y_min
     if full:
-        # Between the racks in a narrow aisle, and without a gap to pass in a wide one.
+        # Pallets stay between the racks of a narrow aisle, and leave no gap to pass in a wide one.
         near = min(half_y, max(width / 2 - half_y, 0.0))
         apart = float(np.clip(width / 2 - 2 * half_y, 0.0, 0.2))
         for row in range(2):

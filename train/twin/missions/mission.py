@@ -1,6 +1,6 @@
-"""The interface of a kind of mission, and the plainest kind: nominal.
+"""The interface of a kind of mission, and the nominal kind, which stages nothing.
 
-Every other kind is a module beside this one, with a `MISSION`.
+Every other kind is a module in this folder that defines `MISSION`.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ class Staged:
 
 @dataclass(frozen=True)
 class Situation:
-    """The physical truth over a step of N environments, each (N,)."""
+    """The physical truth about one step of N environments; arrays are (N,) if not stated."""
 
     plan_blocked: Bools  # at t: pallets lay on the plan just ahead
-    near: Bools  # at t + 1: nearer than the task's `tight_clearance_m`, or the bumper was pressed
+    near: Bools  # at t + 1: less clearance than `tight_clearance_m`, or the bumper was pressed
     slipped: Bools  # a wheel moved over a slippery patch by more than the task's limit
     clearance_m: F64  # at t + 1, from the body's edge
-    traffic_gap_m: F64  # (N, AGENTS) at t, to each person and forklift; inf: not there
+    traffic_gap_m: F64  # (N, AGENTS) at t, to each person and forklift; inf if absent
 
 
 @dataclass(frozen=True)
 class Mission:
-    """A kind of mission: `stage` draws an episode of it, `is_true` scores its steps.
+    """A kind of mission: `stage` draws its obstacles, `is_true` finds the steps that met them.
 
-    `stage` takes a generator, the floor and the plan (P, 2), and returns None if that plan has no
-    room for it. Its draws decide what a seed means: keep their order.
+    `stage` takes a generator, the floor and the plan (P, 2), and returns None if the plan has no
+    room. The order of its draws determines the episode of every seed: keep it.
     """
 
     name: str
     stage: Callable[[np.random.Generator, Warehouse, F64], Staged | None]
-    share: float  # of training's missions, unless a config says otherwise
-    natural: float  # of the missions of a site that runs well
-    colour: str  # in charts, from Okabe and Ito
-    place: int  # among the kinds; the same place: by name
+    share: float  # default share of missions in training
+    natural: float  # share of missions at a site that runs well
+    colour: str  # in charts, from the palette of Okabe and Ito
+    place: int  # kinds are sorted by place, then by name
     is_true: Callable[[Situation], Bools] | None = None  # None: there is nothing to meet
-    blocks: Mapping[str, str] = field(default_factory=dict)  # ways it can be staged: colours
-    block_measures: Mapping[str, str] = field(default_factory=dict)  # of a study: name -> block
-    needs_lidar: bool = False  # without one a robot meets it only by driving into it
+    blocks: Mapping[str, str] = field(default_factory=dict)  # way to stage it -> colour in charts
+    block_measures: Mapping[str, str] = field(default_factory=dict)  # measure of a study -> block
+    needs_lidar: bool = False  # a robot without a lidar meets it only by driving into it
 
 
 def length_m(plan: F64) -> float:

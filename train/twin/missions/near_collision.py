@@ -16,11 +16,11 @@ from restock.train.twin.floors.layout import (
 )
 from restock.train.twin.missions.mission import Mission, Staged
 
-PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin
+PASSING_M = 0.6  # from the plan to the side of a waiting person: half the robot and a margin
 
 
 def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged | None:
-    """Stage traffic on the plan; None if none fits."""
+    """Stage people and forklifts on the plan; None if none fits."""
     walks = draw_walks(rng, warehouse, plan)
     return None if walks is None else Staged(walks=walks)
 
@@ -38,7 +38,7 @@ def draw_walks(
             if oncoming
             else _crossing(rng, warehouse, plan, crossings[rng.integers(len(crossings))], 0.3)
         )
-    if crossings and rng.random() < 0.65:  # there is room for half of them
+    if crossings and rng.random() < 0.65:  # only about half of these find room
         place = crossings[rng.integers(len(crossings))]
         walks[PEOPLE] = _crossing(rng, warehouse, plan, place, 0.6)
     return tuple(walks) if any(walk is not None for walk in walks) else None
@@ -56,7 +56,7 @@ def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
 def _crossing(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64, index: int, half_width_m: float
 ) -> Walk | None:
-    """Draw a walk straight across the plan at one of its points, as far as the racks allow."""
+    """Draw a walk straight across the plan at point `index`, up to the racks; None without room."""
     place = plan[index]
     along = plan[min(index + 2, len(plan) - 1)] - plan[max(index - 2, 0)]
     across = np.array([0.0, 1.0]) if abs(along[0]) > abs(along[1]) else np.array([1.0, 0.0])
@@ -68,7 +68,7 @@ def _crossing(
     ends = np.stack([start, end])
     off_plan = np.hypot(*(ends[:, None] - plan[None]).transpose(2, 0, 1)).min(axis=1)
     if off_plan.min() < half_width_m + PASSING_M:
-        return None  # who waits or has arrived there would leave no room to pass
+        return None  # a person who waits or has arrived there would leave no room to pass
     speed = rng.uniform(0.5, 1.1)
     arrival_s = float(np.hypot(*(place - start))) / speed + rng.uniform(-0.6, 0.6)
     return Walk(
@@ -80,7 +80,7 @@ def _crossing(
 
 
 def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
-    """Draw a walk along the robot's plan, the other way, some distance to one side of it."""
+    """Draw a walk along the plan toward the robot, .25 to .5 m to one side of the plan."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     length = spacing * (len(plan) - 1)
     meet_m = rng.uniform(0.4, 0.7) * length
@@ -102,7 +102,7 @@ def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
 
 
 def _free_m(warehouse: Warehouse, place: F64, direction: F64, half_width_m: float) -> float:
-    """Return how far one can go from a place in a direction before a rack or wall is too near."""
+    """Return how far a walk can go from a place before a rack or wall is too near; 6 m at most."""
     x, y = (place + direction * (0.1 * np.arange(1, 60))[:, None]).T
     floor = np.array([[0.0, 0.0, warehouse.width_m, warehouse.depth_m]])
     free = within(floor, x, y, half_width_m)[:, 0]

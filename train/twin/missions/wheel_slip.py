@@ -17,9 +17,10 @@ def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged:
 
 
 def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
-    """Draw oily floor before and in the sharpest turn, and mostly also at the start or stop.
+    """Draw oily patches before and in the sharpest turn, and mostly also at the start and goal.
 
-    Some patches lie under the wheels of one side only, which turns a robot that pulls or brakes.
+    Some patches lie under the wheels of one side only, which turns a robot that accelerates or
+    brakes.
     """
     patches = np.tile(NO_PATCH, (PATCHES, 1))
     turn, total = _sharpest_turn(plan), length_m(plan)
@@ -32,7 +33,7 @@ def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
         at = point_along(plan, place)
         ahead = point_along(plan, place + 0.3) - point_along(plan, place - 0.3)
         long, wide = rng.uniform(1.2, 1.7), 1.5
-        if row > 0 and rng.random() < 0.35:  # under one side only: an edge along the plan
+        if row > 0 and rng.random() < 0.35:  # under one side only: its edge is along the plan
             normal = np.array([-ahead[1], ahead[0]]) / max(float(np.hypot(*ahead)), 1e-9)
             wide = 0.6
             at = at + normal * rng.choice([-1.0, 1.0]) * wide
@@ -42,7 +43,7 @@ def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
 
 
 def _sharpest_turn(plan: F64) -> float:
-    """Return how far along the plan it bends most over .6 m."""
+    """Return where, in metres along the plan, the heading changes most within .6 m either way."""
     step = np.diff(plan, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     spacing = length_m(plan) / (len(plan) - 1)
