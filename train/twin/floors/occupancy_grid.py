@@ -196,7 +196,7 @@ class OccupancyGrid:
         return found
 
     def cells_at(self, places_m: F64) -> tuple[NDArray[np.int64], Bools]:
-        """Return the cells (N, 2) at places (N, 2) in the map's frame, and which are on the grid."""
+        """Return the cells (N, 2) at places (N, 2) in the map's frame, and which are on the map."""
         cells = np.floor(self.within(places_m) / self.cell_m).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupancy.shape)).all(axis=1)
         return cells, np.asarray(inside, np.bool_)

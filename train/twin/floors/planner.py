@@ -144,7 +144,7 @@ class Planner:
         return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
 
     def parts(self) -> Ints:
-        """Return the connected part (size,) of each cell; robots can drive both ways within a part."""
+        """Return the part (size,) of each cell; within a part, robots can drive back and forth."""
         return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
 
     def cell(self, x_m: float, y_m: float) -> int:
