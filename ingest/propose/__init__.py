@@ -1,1 +1,1 @@
-"""Propose a first profile for an unknown robot, from what its recordings show."""
+"""Proposes a first profile for an unknown robot from its recordings."""

@@ -22,8 +22,8 @@ from restock.ingest.propose.roles import usable_topics
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
 MAX_A_TOPIC = 8
-# A field's path -> its unit, by the end of the path, and how a name ends that is in it. Messages of
-# ROS use SI units (REP 103).
+# (pattern of the end of a field's path, its unit, ending of a signal's name in that unit). ROS
+# messages use SI units (REP 103).
 UNITS = (
     (r"angular_velocity\.\w|angular\.[xyz]|velocity\[.*\]", "rad/s", "radps"),
     (r"linear_acceleration\.\w|accel\.linear\.\w", "m/s²", "mps2"),
@@ -49,19 +49,19 @@ _IGNORED_TYPES = re.compile(
 
 @dataclass(frozen=True)
 class Candidate:
-    """A number that a profile might have as a custom signal."""
+    """A numeric field that may become a custom signal."""
 
     name: str
     topic: TopicInfo
     path: str
-    unit: str  # "" if nothing shows it
+    unit: str  # "" if unknown
 
     def signal(self) -> CustomSignal:
         """Return the signal that its table declares."""
         return CustomSignal(self.topic.name, self.topic.type, self.path, self.unit or "1")
 
     def toml(self, max_age_s: float | None) -> list[str]:
-        """Write its table, as lines."""
+        """Write its table, line by line."""
         lines = [
             f"[signals.{self.name}]",
             f"topic = {json.dumps(self.topic.name)}",
@@ -75,9 +75,9 @@ class Candidate:
 def candidates(
     recording: Recording, *, without: Collection[str] = (), used: Collection[tuple[str, str]] = ()
 ) -> list[Candidate]:
-    """List what might become custom signals, by topic: numbers that change.
+    """List the numeric fields that change, topic by topic: they may become custom signals.
 
-    `without` are topics to leave out, `used` fields (topic, path).
+    Topics in `without` and fields (topic, path) in `used` are left out.
     """
     named: dict[str, Candidate] = {}
     for topic in usable_topics(recording).values():
@@ -114,9 +114,9 @@ def _changing(recording: Recording, topic: TopicInfo, possible: list[Candidate])
 
 
 def _paths(recording: Recording, topic: TopicInfo) -> Iterator[tuple[str, str]]:
-    """Yield the paths of a topic's numbers, and what names them.
+    """Yield the paths of a topic's numbers, and the words to name each by.
 
-    Of lists, these are the numbers that a name or a key beside them tells apart.
+    In lists, only numbers with a name or key beside them are included.
     """
     fields = {field.path: field for field in recording.fields(topic.name)}
     if "name" in fields and fields["name"].kind == "string" and fields["name"].dims:
@@ -158,7 +158,7 @@ def _candidate(topic: TopicInfo, path: str, words: str) -> Candidate:
 
 
 def _plain(name: str) -> bool:
-    """Return whether a path may select by this name."""
+    """Return whether a path can select an element by this name."""
     return name == name.strip() and not any(mark in name for mark in "]=")
 
 

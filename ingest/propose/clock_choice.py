@@ -1,9 +1,10 @@
 """The clock of a proposed profile: which time, which ticks, and how long a command holds.
 
-All of it is taken from the recording: the gaps between commands say how often there is a tick, how
-long a command may hold and which gap ends an episode. If header stamps run at another pace than log
-time, gaps are measured in the robot's own (stamped) time, provided that messages without a stamp
-can be placed in it within half a control period. Otherwise log time is proposed, with the reason.
+All of it comes from the recording: the gaps between commands determine how often there is a tick,
+how long a command may hold and which gap ends an episode. If header stamps run at another pace than
+log time, gaps are measured in the robot's own (stamped) time, provided that messages without a
+stamp can be placed in it within half a control period. Otherwise log time is proposed, with the
+reason.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, align
 from restock.ingest.steps.clocks import STAMP
 
-FASTEST_S, SLOWEST_S = 0.08, 0.5  # control periods that are proposed
+FASTEST_S, SLOWEST_S = 0.08, 0.5  # limits of the proposed control period
 EVENTS_S = 0.2  # the control period if commands are not steady
-STEADY_S = (0.08, 0.5)  # commands this far apart make the ticks themselves
-PAUSE = 5.0  # a gap of more median gaps is a pause in driving
+STEADY_S = (0.08, 0.5)  # if commands are this far apart, each one is a tick
+PAUSE = 5.0  # a gap longer than this many median gaps is a pause in driving
 MAX_HOLD_S = 5.0
-MAX_OFF_CLOCK = 0.05  # of a topic's messages
+MAX_OFF_CLOCK = 0.05  # share of a topic's messages
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,10 @@ class Gaps:
 
     count: int = 0  # of commands
     period_s: float | None = None  # the median gap
-    driving_s: float = 0.0  # the longest gap that is no pause
+    driving_s: float = 0.0  # the longest gap that is not a pause
     mean_s: float = 0.0
-    hold_s: float | None = None  # how long the robot was seen to go on with a command
-    sensor_s: float = 0.0  # between two messages of what is seldomer, pose or wheels
+    hold_s: float | None = None  # how long the robot went on with a command
+    sensor_s: float = 0.0  # between two messages of pose or wheels, whichever are rarer
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Gaps:
@@ -52,15 +53,15 @@ class Gaps:
 
 @dataclass(frozen=True)
 class ClockChoice:
-    """The `[clock]`, control period and hold of a command that are proposed, and why."""
+    """The proposed `[clock]`, control period and hold of a command, with the reasons."""
 
     alignment: str
     steps: str
     period_s: float  # on the alignment clock
     max_gap_s: float
     command_age_s: float
-    pace: float = 1.0  # seconds of the alignment clock in one of log time
-    every_s: float | None = None  # between two commands, mostly; on the alignment clock
+    pace: float = 1.0  # seconds of the alignment clock per second of log time
+    every_s: float | None = None  # median gap between commands, on the alignment clock
     comments: tuple[str, ...] = ()
 
     @classmethod
@@ -68,7 +69,7 @@ class ClockChoice:
         """Choose a clock by gaps in log time, on an alignment clock that runs at this pace."""
         middle = None if gaps.period_s is None else gaps.period_s * pace
         steady = middle is not None and STEADY_S[0] <= middle <= STEADY_S[1]
-        # Commands on every key press, or in bursts, say nothing of how often to decide.
+        # Commands at key presses or in bursts do not show how often to decide.
         streamed = middle is not None and gaps.mean_s * pace <= 2 * middle < 2 * STEADY_S[0]
         usual = (middle if steady or streamed else EVENTS_S) or EVENTS_S
         least = FASTEST_S if steady else max(FASTEST_S, gaps.sensor_s * pace)
@@ -88,17 +89,17 @@ class ClockChoice:
         )
 
     def at_a_rate(self) -> ClockChoice:
-        """Return the choice with a tick every period instead of one a command."""
+        """Return the choice with one tick per period instead of one per command."""
         return replace(self, steps="rate", max_gap_s=max(0.5, _up(2.5 * self.period_s)))
 
 
 def drivable(period_s: float) -> float:
-    """Return the nearest control period that the twin can drive: it cannot drive every hundredth.
+    """Return the nearest control period that the twin can simulate.
 
-    It drives a period in equal parts of a tenth at most, each some hundredths.
+    The twin divides a period into equal parts of at most 0.1 s, each a whole number of hundredths.
     """
     parts = int(np.ceil(round(period_s * 10, 6)))
-    # With one part less, too: .2015 s is nearer to 2 of .1 s than to 3 of .07 s.
+    # Also try one part less: .2015 s is nearer to 2 of .1 s than to 3 of .07 s.
     near = {
         count: round(period_s * 100 / count)
         for count in (parts - 1, parts)
@@ -145,9 +146,9 @@ def by_log_time(gaps: Gaps, why: str) -> ClockChoice:
 def _by_stamp(
     columns: dict[str, TopicColumns], latched: frozenset[str], gaps: Gaps
 ) -> tuple[ClockChoice, str]:
-    """Choose a clock on header stamps; and say why that does not work, else ""."""
+    """Choose a clock by header stamps; also return why that does not work, or ""."""
     choice = ClockChoice.of(gaps, STAMP)
-    for _ in range(3):  # the period is known when the pace is, and the tolerance when the period is
+    for _ in range(3):  # the period depends on the pace, and the pace on a tolerance by the period
         try:
             _, report = align(columns, Clock(), latched, tolerance_s=choice.period_s / 2)
         except RecordingError as error:

@@ -1,14 +1,16 @@
-"""What the commands of a recording say: who drives, how fast, how long each holds.
+"""Finds who commands a recording's robot, how fast, and how long each command holds.
 
-A multiplexer's output repeats its inputs: if a topic changes to what another one has just
-commanded, and not the other way round, it comes after it. Some drivers stop a robot that receives
-nothing for half a second; others continue until the next command. If commands are rare, this
-decides the number of rows. So it is read from the poses: in each gap after a command to move, the
-robot still moved when the gap ended, or it stood still from some moment on. A command to stop holds
-until the next one whatever the driver does. The speed that the robot reached under its fastest
-commands is measured too: a driver scales down or cuts off what its wheels cannot do. Commands
-beyond that speed are not actions of the robot: a twin that obeyed them would not move as the robot
-did.
+A multiplexer's output repeats its inputs: if topic A changes to what topic B has just commanded,
+and not the other way round, A comes after B.
+
+Some drivers stop a robot that receives no command for half a second; others continue until the next
+command. If commands are rare, this decides the number of rows. It is therefore read from the poses:
+in each gap after a command to move, the robot still moved when the gap ended, or it stood still
+from some moment on. A command to stop holds until the next one whatever the driver does.
+
+The speed that the robot reached under its fastest commands is measured, too, as a driver scales
+down or cuts off what the wheels cannot do. Commands beyond that speed are not actions of the robot:
+a twin that obeyed them would not move as the robot did.
 """
 
 from __future__ import annotations
@@ -32,21 +34,21 @@ from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.task import wrap_angle
 
 PASSED_WITHIN_S = 0.5
-MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5  # changes that one topic took over from another
+MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5  # of changes that one topic repeats from another
 Fit = tuple[TopicInfo, Kind]
 
 
 @dataclass(frozen=True)
 class CommandSource:
-    """A topic whose commands the one that drives repeats, and the policy that it is of."""
+    """A topic whose commands the driving topic repeats, and its behaviour policy."""
 
     policy: str
     fit: Fit
-    passed_on: int  # changes of the driving command
+    passed_on: int  # changes of the driving command that come from this topic
     max_age_s: float
 
     def toml(self, wheelbase_m: float) -> list[str]:
-        """Write its table; a source that steers does so about the command's wheelbase."""
+        """Write its table; a source with steering angles gets the command's wheelbase."""
         topic, kind = self.fit
         fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
         steers = "steering_rad" in kind.fields
@@ -88,7 +90,7 @@ class CommandLog:
 
     @property
     def steered(self) -> bool:
-        """Return whether it has the angle of the front wheels, as of a car."""
+        """Return whether it has the angle of the front wheels, as for a car."""
         return "steering_rad" in self.fit[1].fields
 
     @cached_property
@@ -97,7 +99,7 @@ class CommandLog:
         return np.flatnonzero((np.diff(self.values, axis=0) != 0).any(axis=1)) + 1
 
     def passed_on(self, output: CommandLog) -> int:
-        """Count the changes of `output` to what this topic said last."""
+        """Count the changes of `output` to this topic's last command."""
         times = output.log_time_ns[output.changed]
         at = np.searchsorted(self.log_time_ns, times, "right") - 1
         age_s = (times - self.log_time_ns[np.maximum(at, 0)]) * 1e-9
@@ -111,25 +113,25 @@ class CommandLog:
         return enough and passed > output.passed_on(self)
 
     def max_age_s(self) -> float:
-        """Return four of its periods."""
+        """Return four of its median periods, between 0.2 and 1 s."""
         gaps = np.diff(self.log_time_ns) * 1e-9
         return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
 
 
 @dataclass(frozen=True)
 class CommandChoice:
-    """The command that drives, its sources, and who drives where none of them does."""
+    """The driving command, its sources, and the behaviour policy of all other commands."""
 
-    log: CommandLog | None = None  # None: there is none
+    log: CommandLog | None = None  # None: no command was recorded
     sources: list[CommandSource] = field(default_factory=list)
     policy: str = "unknown"
     why: str = "the driver, if no topic says so"
 
 
 def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[Fit], CommandChoice]:
-    """Sort the topics that may drive, and find the sources of the first's commands.
+    """Sort the topics that may drive, best first, and find the sources of the best one's commands.
 
-    What comes last in a chain of multiplexers is first.
+    The best one is the last in a chain of multiplexers.
     """
     logs = [CommandLog.read(recording, fit) for fit in fitting]
     reported = [one for one in logs if len(one.values)]
@@ -155,7 +157,7 @@ def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[F
 
 
 def _policy(topic: str) -> str:
-    """Guess who drives by a topic of this name."""
+    """Guess the behaviour policy from a topic's name."""
     name = topic.lower()
     if any(word in name for word in BY_HAND):
         return "teleop"
@@ -165,23 +167,23 @@ def _policy(topic: str) -> str:
     return parts[-1][:64] if parts else name
 
 
-MIN_GAP_S = 0.4  # shorter ones say little
-WITHIN_S = 0.5  # that a robot has moved in, at the end of a gap
-MOVES = 0.25  # of what was commanded: less is standing
-STANDS_M, STANDS_RAD = 0.05, 0.2  # within a gap after a command to stop
+MIN_GAP_S = 0.4  # shorter gaps show little
+WITHIN_S = 0.5  # time over which the speed within a gap is measured
+MOVES = 0.25  # share of the commanded speed below which the robot stands
+STANDS_M, STANDS_RAD = 0.05, 0.2  # most that a standing robot moves in a gap
 MAX_S = 60.0
-MAX_GAP_S = 3600.0  # between two commands; longer: their log times are wrong
-SETTLED_S = 1.0  # commanded so fast for so long: latency and ramp are over
-NEARLY = 0.8  # of the fastest command counts as it
+MAX_GAP_S = 3600.0  # between two commands; if it is longer, log times are wrong
+SETTLED_S = 1.0  # after commands have been fast for this long, latency and ramp are over
+NEARLY = 0.8  # share of the fastest command from which a command counts as fast
 MIN_SAMPLES = 10
-HELD_BACK = 0.67  # of what was commanded: a robot that stays below has reached its limit
+HELD_BACK = 0.67  # share of the command; a robot that stays below has reached its limit
 
 
 @dataclass(frozen=True)
 class CommandHold:
     """Evidence of how long a robot goes on with a command, in log time."""
 
-    age_s: float | None = None  # None: nothing is known
+    age_s: float | None = None  # None: unknown
     stops_hold: bool = False  # a command to stop holds until the next
     comments: tuple[str, ...] = ()
 
@@ -189,15 +191,15 @@ class CommandHold:
 def command_hold(
     time_s: F64, speed_mps: F64, yaw_rate_radps: F64, poses: PoseSeries
 ) -> CommandHold:
-    """Read the hold from the gaps between commands (N,).
+    """Find how long commands (N,) hold, from the gaps between them.
 
-    `poses` are on the same clock, from the same 0.
+    `poses` are on the same clock, with the same zero.
     """
     at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
     if not len(time_s) or len(at) < 2:
         return CommandHold()
     turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
-    # The way, summed up: a robot that comes back to where it was has moved.
+    # Path length, as a robot that comes back to where it was has moved.
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(poses.x_m), np.diff(poses.y_m)))])
     within = max(WITHIN_S, 3 * float(np.median(np.diff(at))))
     ends = np.append(time_s[1:], at[-1])
@@ -213,7 +215,7 @@ def command_hold(
             continue
         moving = _last_moving(at, way, turned, begin, end, speed, turn, within)
         if moving is None:
-            continue  # it never began to: held up, or not this robot's command
+            continue  # it never started: it was blocked, or it is not this robot's command
         if moving >= end - within / 2:
             on.append(end - begin)
         else:
@@ -231,7 +233,7 @@ def _last_moving(
     turn: float,
     within: float,
 ) -> float | None:
-    """Return until when in a gap the robot did a good part of its command; None if it never did."""
+    """Return the time in a gap until which the robot followed its command; None if never."""
     checked = np.arange(min(begin + within, end), end + 1e-9, within / 4)
     checked = np.append(checked, end)
     since = np.maximum(checked - within, begin)
@@ -239,12 +241,12 @@ def _last_moving(
     gone = (np.interp(checked, at, way) - np.interp(since, at, way)) / span
     spun = (np.interp(checked, at, turned) - np.interp(since, at, turned)) / span
     drives = gone >= MOVES * abs(speed) if speed else spun * np.sign(turn) >= MOVES * abs(turn)
-    # Poses that stay away for longer say nothing.
+    # Only times with new poses show whether it drives.
     seen = np.searchsorted(at, checked, "right") > np.searchsorted(at, since, "left")
     moving = np.flatnonzero(drives & seen)
     if not len(moving):
         return None
-    # Up to the first break: what it does after that is not this command's (a hand, another driver).
+    # Up to the first break: later motion has another cause (a hand, another driver).
     broken = np.flatnonzero(~drives & seen & (checked > checked[moving[0]]))
     return float(checked[broken[0] - 1] if len(broken) else checked[moving[-1]])
 
@@ -264,7 +266,7 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
 
 @dataclass(frozen=True)
 class CommandedDrive:
-    """The commands of a drive and what odometry measured of it, each in m/s and rad/s."""
+    """The commands of a drive and its odometry, both as columns of m/s and rad/s."""
 
     command_ns: Ints  # (N,) ascending
     command: F64  # (N, 2)
@@ -289,15 +291,15 @@ class CommandedDrive:
         return cls(log.log_time_ns, command, columns.log_time_ns, np.stack(measured, axis=1))
 
     def settled(self, axis: int, fastest: float) -> F64:
-        """Return what was measured along an axis (K,) once the fastest commands had settled.
+        """Return the speeds measured on an axis (K,) once commands near `fastest` had settled.
 
-        It is positive along the command. `fastest` was commanded now and then; above 0.
+        They are positive in the direction of the command. `fastest` is above 0.
         """
         reported, measured = self.command[:, axis], self.odometry[:, axis]
         if not len(reported):
             return np.zeros(0)
         fast = np.abs(reported) >= NEARLY * fastest
-        # Since when the commands have been fast, one way, without a break.
+        # The time since which commands have been fast in one direction, without a break.
         breaks = (np.diff(fast) != 0) | (np.diff(np.sign(reported)) != 0)
         begins = np.where(np.append(True, breaks), np.arange(len(reported)), 0)
         since_ns = self.command_ns[np.maximum.accumulate(begins)]
@@ -305,7 +307,7 @@ class CommandedDrive:
         row = np.maximum(index, 0)
         settled = (index >= 0) & fast[row]
         settled &= (self.odometry_ns - since_ns[row]) * 1e-9 >= SETTLED_S
-        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # it is no old one
+        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # a recent command
         along = (measured * np.sign(reported[row]))[settled]
         return np.asarray(along[np.isfinite(along)], np.float64)
 
@@ -322,8 +324,8 @@ def _limit(settled: F64, fastest: float) -> float | None:
     return float(f"{reached:.3g}") if 0.01 < reached < HELD_BACK * fastest else None
 
 
-MOSTLY, RARELY = 98, 2  # percentiles of speeds: what is beyond is an outlier
-APART = 0.25  # of the fastest command; a command that is further from every action is far off it
+MOSTLY, RARELY = 98, 2  # percentiles of speeds; values beyond are outliers
+APART = 0.25  # share of the fastest command: a command this far from every action is far off
 
 
 @dataclass(frozen=True)
@@ -333,19 +335,19 @@ class Commands:
     speed_mps: float = 0.5
     yaw_rate_radps: float = 1.0
     reverse_mps: tuple[float, ...] = ()  # slowest first; empty if it never backed up
-    still: bool = False  # it was told nothing but to stand
+    still: bool = False  # all commands are to stand
     count: int = 0
     topic: str = ""
     measured: bool = False  # they are odometry, in place of commands
-    steered: bool = False  # by the angle of the front wheels, as a car
+    steered: bool = False  # they have the angle of the front wheels, as for a car
     wheelbase_m: float = 0.3
-    reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
+    reached: tuple[float | None, float | None] = (None, None)  # limits (m/s, rad/s), if shown
 
     @classmethod
     def of(cls, drives: Sequence[CommandedDrive], **known: Any) -> Commands:
-        """Find the fastest commands of these drives, and what the robot reached of them.
+        """Find the fastest commands of these drives, and the speeds that the robot reached.
 
-        `known` are other fields.
+        `known` sets other fields.
         """
         command = np.concatenate([one.command for one in drives])
         found = replace(cls().fastest(*command.T), count=len(command), **known)
@@ -364,7 +366,7 @@ class Commands:
         )
 
     def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
-        """Set the fastest of these (N,) that is commanded now and then; an outlier is no action."""
+        """Set the fastest of these commands (N,), without outliers, which are not actions."""
         if not len(speed_mps):
             return self
         fast, sharp = (float(np.percentile(np.abs(c), MOSTLY)) for c in (speed_mps, yaw_rate_radps))
@@ -379,9 +381,9 @@ class Commands:
 
 
 def _reverse_speeds(back_mps: F64, most_mps: float) -> tuple[float, ...]:
-    """Return the fastest reverse speed that is commanded now and then, at most `most_mps`.
+    """Return the fastest reverse speed without outliers, at most `most_mps`.
 
-    Half of it is another one, if other commands are so slow that they would be far off.
+    Half of it is added if slow commands would otherwise be far from every action.
     """
     if not len(back_mps):
         return ()
@@ -396,7 +398,7 @@ def read_commands(
     poses: PoseSeries | None,
     wheelbase_m: float | None,
 ) -> tuple[CommandedDrive | None, Commands, CommandHold]:
-    """Read a drive: how fast and which way it was commanded, and how long each command holds."""
+    """Return a drive's commands with odometry, their fastest speeds, and how long they hold."""
     if log is None:
         return None, Commands(), CommandHold()
     drive = CommandedDrive.of(recording, log, wheels, wheelbase_m)
@@ -416,9 +418,9 @@ def read_commands(
 def how_it_turned(
     log: CommandLog | None, poses: PoseSeries | None
 ) -> tuple[DriveEvidence, float | None]:
-    """Return how the robot turned under its Twists.
+    """Return how the robot turned under Twist commands.
 
-    Also return the sharpest of commands that are steering angles.
+    Also return the sharpest steering angle, if the commands are steering angles.
     """
     if log is not None and log.steered:
         angles = np.abs(log.values[:, 1])

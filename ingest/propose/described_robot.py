@@ -1,8 +1,8 @@
-"""The robot that a description (URDF) has: its drive, wheels, mass and lidar.
+"""Reads a robot from its description (URDF): drive, wheels, mass and lidar.
 
-A wheel is a link on a joint that turns without end about an axis across the robot. Missing values
-stay unknown. Parts that cannot be used are named: meshes (no other file is read), arms, steering,
-wheels of a drive that the twin does not have, invalid values.
+A wheel is a link on a joint that turns endlessly about an axis across the robot. Missing values
+stay unknown. Links that have only meshes are counted in a note: their size is in other files, which
+are not read.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from restock.ingest.profile.description import (
 )
 
 MIN_M = 0.005  # of a wheel's radius
-MAX_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
-ENDLESS_RAD = 6 * np.pi  # a joint that may turn so far is a wheel's
+MAX_ABOVE = 2  # moving joints between base and wheel, as of a suspension: more are an arm's
+ENDLESS_RAD = 6 * np.pi  # a joint that may turn this far counts as endless
 DRIVES = {  # words in the names of links and of simulators' plugins
     "omnidirectional": ("mecanum", "omni_wheel", "omniwheel", "planar_move", "holonomic"),
     "ackermann": ("ackermann",),
@@ -37,7 +37,7 @@ DRIVES = {  # words in the names of links and of simulators' plugins
 
 @dataclass(frozen=True)
 class DescribedRobot:
-    """Values of `[robot]` by their keys, what could not be used, or why there is no robot."""
+    """Values of `[robot]` by key, notes, and why the description cannot be used."""
 
     values: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -50,7 +50,7 @@ class _Wheel:
     place: Place
     radius_m: float  # NaN: its shape is a mesh, or it has none
     swivels: bool  # a joint above it turns about the vertical without a limit: a caster
-    steers: bool  # … with one
+    steers: bool  # … within limits
 
     @property
     def x_m(self) -> float:
@@ -64,7 +64,7 @@ class _Wheel:
 def described_robot(
     description: Description, middle_x_m: float, scan_frame: str = ""
 ) -> DescribedRobot:
-    """Describe the robot of a URDF whose outline's middle is `middle_x_m` ahead of its base."""
+    """Return the robot of a URDF; the middle of its outline is `middle_x_m` ahead of its base."""
     places = description.places()
     wheels = _wheels(description, places)
     driven = _driven(wheels)
@@ -139,7 +139,7 @@ def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
 
 
 def _ground(description: Description, places: dict[str, Place]) -> float | None:
-    """Return the height of the floor: by name, else what the lowest shape stands on."""
+    """Return the height of `base_footprint`, or else of the lowest point of all shapes."""
     for name, place in places.items():
         if name.split("/")[-1] == "base_footprint":
             return float(place.at_m[2])
@@ -149,7 +149,7 @@ def _ground(description: Description, places: dict[str, Place]) -> float | None:
 
 
 def _endless(joint: Joint) -> bool:
-    """Return whether it turns without end, or as good as that."""
+    """Return whether a joint turns endlessly, or nearly so."""
     if joint.kind == "continuous":
         return True
     limit = joint.element.find("limit")
@@ -179,7 +179,7 @@ def _radius(link: ET.Element | None) -> float:
 
 
 def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
-    """Return the wheels that drive: large ones that do not swivel, on both sides."""
+    """Return the wheels that drive: large ones that do not swivel; [] unless on both sides."""
     able = [
         wheel
         for wheel in wheels
@@ -196,7 +196,7 @@ def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
 
 
 def _axles(driven: list[_Wheel], radius: float) -> list[float]:
-    """Return how far ahead each axle is."""
+    """Return how far ahead of the base each axle is, in m."""
     axles: list[list[float]] = []
     for x in sorted(wheel.x_m for wheel in driven):
         if axles and x - axles[-1][-1] < radius / 2:
@@ -234,7 +234,7 @@ def _lidar_z(places: dict[str, Place], frame: str, floor: float) -> float | None
 
 
 def _no_wheels(description: Description, wheels: list[_Wheel]) -> str:
-    """Say in one sentence why it does not roll."""
+    """Return the problem of a robot without usable wheels."""
     if wheels:
         return (
             f"{description.name!r} has {counted(len(wheels), 'wheel')}, but no driven "

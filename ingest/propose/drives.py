@@ -1,8 +1,8 @@
-"""Propose a first profile for an unknown robot, from one of its recordings or from several drives.
+"""Proposes a first profile for an unknown robot, from one of its recordings or from several drives.
 
 What each topic is for is guessed from its type and name; the clock, the speeds of the actions,
 maximum ages, the lidar's range, the outline and the frames come from the messages. The proposal is
-then tried on the recording, so that it can say what its choices cost.
+then tried on the recording, to report what its choices cost.
 
 Drives show different things: one its description, another the fastest command, a third the longest
 gap through which the robot drove on. The robot's properties are combined from all drives. Of the
@@ -48,7 +48,7 @@ from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.needs import as_recorded, read_topics
 
-# What a recording lacks -> what to do about it.
+# missing input -> what to do about it
 REMEDIES = {
     "command": "record the topic of the command that drives the robot (geometry_msgs/msg/Twist)",
     "pose": "no topic contains the robot's pose; record localisation, odometry, or the transforms "
@@ -61,35 +61,36 @@ INSTEAD_OF_COMMANDS = (
 
 @dataclass(frozen=True)
 class Proposal:
-    """The TOML of a profile, what in it needs a person, and what it makes of the recording."""
+    """The TOML of a proposed profile, what needs a person, and its outcome on the recording."""
 
     toml: str
     base: Path  # the recording that it was proposed from, and tried on
     missing: list[str] = field(default_factory=list)  # required inputs that nothing fills
-    signals: int = 0  # custom signals that stand in it, commented out
+    signals: int = 0  # number of custom signals in it, all commented out
     ticks: int = 0
     transitions: int = 0
     problems: list[str] = field(default_factory=list)  # why it cannot be used as it is
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, if several may drive the robot
-    # Of each kind, if there are several: its `robot` in words and `recordings`; its own first.
+    # One dict per kind of robot, if there are several: `robot` in words and `recordings`. The
+    # profile's own kind is first.
     kinds: list[dict[str, Any]] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
 
 
 def propose_profile(recording: Recording, name: str, given: Given | None = None) -> Proposal:
-    """Propose a profile of this name for recordings like this one, tried on it.
+    """Propose a profile of this name for recordings like this one, and try it on this one.
 
     Raises:
-        ConfigError: the URDF cannot be used; says why.
+        ConfigError: the URDF cannot be used.
     """
     return propose_from(gather(recording, given or Given()), name)
 
 
 def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:
-    """Propose a profile from gathered evidence, tried on the recording that it is from.
+    """Propose a profile from gathered evidence, and try it on the evidence's recording.
 
-    With `goal_decided` its goal is not left out where this recording alone has few in hindsight.
+    With `goal_decided`, its goal is kept even if this recording alone has few goals in hindsight.
     """
     recording = seen.recording
     located = bool(seen.roles["pose"]) or seen.poses_from_frames
@@ -130,7 +131,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
 
 
 def _without_contradicted(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
-    """Leave out odometry and gyros whose speeds are not those of the poses."""
+    """Drop odometry and gyros whose speeds contradict the poses."""
     roles = {"wheels": "wheels", "gyro": "imu"}
     while off := [one for one in trial.findings if one.kind in roles]:
         why = f"{off[0].topic} is not used, as {off[0].what}"
@@ -142,15 +143,15 @@ def _without_contradicted(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial
 
 
 def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
-    """Use a tick every period instead of one per command, if that pays.
+    """Use one tick per period instead of one per command, if that pays.
 
-    It does if it makes rows of much more time, or if commands come too unevenly for the twin to
-    follow.
+    It does if it turns much more time into rows, or if commands come too unevenly for the twin
+    to follow.
     """
     clock = seen.clock
     if clock.steps != "command":
         return seen, trial
-    goalless = replace(seen, goal=GoalChoice(None))  # pauses may cost the goals of a drive, too
+    goalless = replace(seen, goal=GoalChoice(None))  # as pauses may also cost the drive its goals
     now, other = trial_of(goalless), trial_of(replace(goalless, clock=clock.at_a_rate()))
     longer = other.seconds > GAIN * now.seconds
     evener = other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds
@@ -166,7 +167,7 @@ def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
 
 
 def trial_of(seen: Evidence, recording: Recording | None = None) -> Trial:
-    """Try what `seen` proposes on a recording, else on its own."""
+    """Try the profile that `seen` leads to on a recording, by default on its own."""
     return tried(recording or seen.recording, "\n".join(profile_lines(seen, "robot")))
 
 
@@ -179,23 +180,23 @@ def tried(recording: Recording, toml: str) -> Trial:
         return Trial(problem=error.what)
 
 
-MAX_DRIVES = 12  # of one kind, that a proposal reads
-MAX_NAMED = 5  # of those that it does not read, in a profile's first lines
-MAX_BASES = 4  # that are tried on all drives
-# Time with poses on a map is worth so many times as much as with odometry. It is not worth more, as
-# drives without a map would be lost.
+MAX_DRIVES = 12  # of one kind that a proposal reads
+MAX_NAMED = 5  # recordings that a list names
+MAX_BASES = 4  # drives whose evidence is tried on all drives
+# Worth of time with poses on a map, relative to time with odometry. If it were more, drives without
+# a map would be lost.
 LOCALISED_WORTH = 1.25
-SAME_PACE = 1.5  # times the period: commands that are no further apart than this are of one pace
+SAME_PACE = 1.5  # ratio up to which the control periods of drives count as the same
 
 
 @dataclass(frozen=True)
 class Drives:
-    """Recordings by the kind of robot that they are of, and which of them a proposal reads."""
+    """Recordings grouped by kind of robot, and which of them a proposal reads."""
 
     paths: Sequence[Path]
-    traits: Sequence[RobotTraits]  # of each of them
-    kinds: Sequence[Sequence[int]]  # places in `paths`; the first kind is the one proposed for
-    read: Sequence[int]  # places of those of the first kind that the proposal reads
+    traits: Sequence[RobotTraits]  # one per path
+    kinds: Sequence[Sequence[int]]  # indices of `paths`; the proposal is for the first kind
+    read: Sequence[int]  # indices of the recordings, of the first kind, that the proposal reads
 
     @property
     def unread(self) -> list[Path]:
@@ -222,9 +223,9 @@ class Drives:
 def drives_by_kind(
     paths: Sequence[Path], traits: Sequence[RobotTraits], *, most: int = MAX_DRIVES
 ) -> Drives:
-    """Sort recordings into kinds, and choose what to read of the kind with most drives.
+    """Group recordings by kind, and choose what to read of the kind with most drives.
 
-    It reads at most `most` drives, those with a command and the largest first.
+    At most `most` drives are read: those with a command first, then the largest.
     """
     kinds = robot_kinds(traits)
     own = max(kinds, key=lambda members: sum(bool(traits[one].command) for one in members))
@@ -239,13 +240,13 @@ def propose_for_drives(
     """Propose one profile for all drives of a kind, as `propose_profile` does for one.
 
     Args:
-        recordings: those that `drives` says to read, in that order.
-        drives: what is known of these and more recordings.
+        recordings: those in `drives.read`, in that order.
+        drives: all recordings, grouped by kind.
         name: of the profile.
-        given: what a person says of the robot.
+        given: what a person states about the robot.
 
     Raises:
-        ConfigError: the URDF cannot be used; says why.
+        ConfigError: the URDF cannot be used.
     """
     given = given or Given()
     if len(drives.paths) == 1:
@@ -285,7 +286,7 @@ def propose_for_drives(
 
 
 def _best(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
-    """Return what makes rows of most of the time of all drives, from one of the `bases`."""
+    """Return evidence with one of `bases`: the one that turns most time of all drives into rows."""
     return max(
         (pooled(base, drives) for base in _bases(bases)),
         key=lambda one: (
@@ -305,13 +306,13 @@ def _bytes(path: Path) -> int:
 
 
 def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
-    """Return the evidence of one drive, with what belongs to the robot from all of them."""
+    """Return the evidence of one drive, with the robot's properties combined from all drives."""
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max((base, *drives), key=lambda one: len(one.robot.values))
-    if base.commands.steered and not described.robot.described:  # of one wheelbase
+    if base.commands.steered and not described.robot.described:  # keep to one wheelbase
         described = base
-    # A measured outline before a guess, then one whose lidar is placed; of guesses the smallest: it
-    # had the nearest return.
+    # Prefer a measured outline to a guess, then one whose lidar is placed, then the smallest: a
+    # guess is from the nearest return.
     outlined = min(
         (base, *drives),
         key=lambda one: (
@@ -327,7 +328,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         clock=replace(
             base.clock,
             command_age_s=max(one.clock.command_age_s for one in (base, *driven)),
-            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # its own is at a rate
+            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base may be at a rate
         ),
         paces_s={
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
@@ -341,14 +342,14 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
 
 
 def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
-    """Return the fastest of the commands of all drives."""
+    """Return the fastest commands of all drives."""
     driven = [one.driven for one in drives if one.driven is not None]
     known = {name: getattr(base, name) for name in ("topic", "measured", "steered", "wheelbase_m")}
     return Commands.of(driven, **known) if driven else base
 
 
 def _hold(drives: Sequence[CommandHold]) -> CommandHold:
-    """Return the longest hold that any drive shows; a command to stop holds if all say so."""
+    """Return the longest hold that any drive shows; a command to stop holds if all show it."""
     reported = [one for one in drives if one.comments]
     if not reported:
         return CommandHold()
@@ -357,10 +358,10 @@ def _hold(drives: Sequence[CommandHold]) -> CommandHold:
 
 
 def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
-    """Return a drive of each proposed clock and source of poses, the fullest first.
+    """Return one drive per proposed clock and source of poses, the fullest first.
 
-    If one drive has far more frequent commands than another, a tick a command would be
-    another time in each: then there is a tick every period, the middle one of the drives.
+    If some drives have far more frequent commands than others, one tick per command would be a
+    different time in each. Then there is one tick per period, the median of the drives' periods.
     """
     fullest = sorted(drives, key=_fullness, reverse=True)
     usable = [one for one in fullest if _fullness(one)[0] == _fullness(fullest[0])[0]]
@@ -380,14 +381,14 @@ def _at_rate(clock: ClockChoice, period_s: float, why: str) -> ClockChoice:
 
 
 def _fullness(one: Evidence) -> tuple[int, int, float]:
-    """Count the deciding inputs that it has and all its inputs, with how long it drove."""
+    """Return how many deciding inputs and inputs a drive has, and its duration (s)."""
     located = bool(one.roles["pose"]) or one.poses_from_frames
     deciding = sum((bool(one.roles["command"]), located, bool(one.roles["wheels"])))
     return deciding, sum(map(bool, one.roles.values())), one.recorded_s
 
 
 def names_of(paths: Sequence[Path]) -> str:
-    """Name the first of these recordings, and say how many more there are."""
+    """Name the first of these recordings, and count the others."""
     more = f" and {len(paths) - MAX_NAMED:,} more" if len(paths) > MAX_NAMED else ""
     return ", ".join(map(_name, paths[:MAX_NAMED])) + more
 
@@ -398,7 +399,7 @@ def _name(path: Path) -> str:
 
 
 def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
-    """Say which other drive has what the profile's own drive lacks."""
+    """Report which other drives have an input that the profile's own drive lacks."""
     return [
         f"{_name(one.recording.path)} has a {role} ({one.roles[role][0][0].name}) and no {lacks}:"
         " one recording must hold both"
@@ -411,13 +412,13 @@ def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]
 def _left_out(
     drives: Drives, evidence: Sequence[Evidence], trials: Sequence[Trial]
 ) -> Iterator[Advice]:
-    """Yield which recordings were not read, give no rows, or are of another kind of robot."""
+    """Yield advice on recordings that were not read, give no rows, or are of another kind."""
     if drives.unread:
         yield Advice("name", f"not read, of that kind: {names_of(drives.unread)}")
     idle = [
         one.recording.path for one, t in zip(evidence, trials, strict=True) if not t.transitions
     ]
-    if idle and len(idle) < len(trials):  # of none at all the problems tell
+    if idle and len(idle) < len(trials):  # if none gives any, `problems` has it
         yield Advice(
             "name",
             f"{len(idle):,} of {len(trials):,} recordings give no transition: {names_of(idle)}",
@@ -428,11 +429,11 @@ def _left_out(
         yield Advice("name", f"not of that kind: {others}: {kinds}; propose another profile for it")
 
 
-SCANS = 40  # of a recording that are looked at
-BEAMS = 0.1  # of the beams, by which scans of one lidar may differ: some turn at their own pace
+SCANS = 40  # first scans of a recording, which are used
+BEAMS = 0.1  # share by which scans of one lidar may differ in beams, as its speed may vary
 RANGE = 0.01
 SIMULATED_NS = 10**8 * 10**9  # stamps before 1973 are of a simulation, which begins at 0
-SHARED = 0.5  # of all topics
+SHARED = 0.5  # share of all topics that recordings of one kind have in common
 
 
 @dataclass(frozen=True)
@@ -441,7 +442,7 @@ class Lidar:
 
     frame: str
     beams: int
-    range_max_m: float  # 0: they do not say
+    range_max_m: float  # 0: unknown
     simulated: bool  # by their stamps
 
     def agrees(self, other: Lidar) -> bool:
@@ -464,13 +465,13 @@ class RobotTraits:
     command: str  # type of the topic that drives it
     frames: str  # of its odometry: "odom -> base_link"
     lidar: Lidar | None
-    description: str  # a digest of it
-    named: str  # the robot's name in it
+    description: str  # a digest of the description
+    named: str  # the robot's name in the description
     inputs: frozenset[tuple[str, str]]  # topics, with their types, that command and locate it
     topics: frozenset[tuple[str, str]]  # all of them
 
     def fits(self, other: RobotTraits) -> bool:
-        """Return whether both may be one kind of robot, and something shows that they are."""
+        """Return whether both are of one kind: nothing differs, and something specific agrees."""
         for name in ("command", "frames", "description"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine and its and mine != its:

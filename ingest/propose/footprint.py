@@ -1,12 +1,14 @@
-"""How large a robot is, and where its lidar is: by its description, its transforms and its scans.
+"""Finds a robot's outline and its lidar's place, from its description, transforms and scans.
 
-A description (URDF, on `/robot_description`) has the boxes, cylinders and spheres of its links:
-those that move with the base as one body, and its wheels, are put where their joints say. The size
-of a mesh is not in the recording. No return comes from inside the robot's outline, so the nearest
-return is a bound. A robot also keeps its distance: with an outline up to that bound every such pass
-would be a near collision, so the guess is smaller by the room that a near collision allows. Parts
-of the robot that its lidar sees stay at one range whichever way it faces, unlike anything around
-it: they belong to the outline, and are not obstacles.
+A description (URDF, on `/robot_description`) has the boxes, cylinders and spheres of the links. The
+outline is around the links that are fixed to the base, and the wheels, placed by their joints. The
+size of a mesh is not in the recording.
+
+No return comes from inside the robot, so the nearest return bounds the outline. A robot also keeps
+its distance: with an outline up to that bound, every such pass would be a near collision, so the
+guess is smaller by the clearance of one. Parts of the robot that its lidar sees stay at the same
+range whichever way the robot faces, unlike its surroundings. They belong to the outline and are not
+obstacles.
 """
 
 from __future__ import annotations
@@ -39,12 +41,12 @@ from restock.ingest.propose.roles import Kind, own_first, shared
 from restock.ingest.steps.frames import Edges, PoseSeries, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
 
-OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms
-SIZES_M = (0.02, 30.0)  # of a robot that this can be
+OUTLINE = ("fixed", "continuous")  # joints of parts of the outline: not those of arms
+SIZES_M = (0.02, 30.0)  # smallest and largest plausible robot
 
 
-MIN_ASIDE_M = 0.05  # of the middle
-DESCRIBED = "as described"  # the source of a lidar's place
+MIN_ASIDE_M = 0.05  # to the left or right of the middle
+DESCRIBED = "as described"  # source of a lidar's place
 
 
 @dataclass(frozen=True)
@@ -54,17 +56,17 @@ class Footprint:
     length_m: float
     width_m: float
     source: str  # of the outline, in words
-    lidar_x_m: float | None = None  # ahead of the middle; None: nothing says
+    lidar_x_m: float | None = None  # ahead of the middle; None: unknown
     lidar_y_m: float = 0.0  # to the left
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
     upside_down: bool = False  # the lidar
     lidar_unplaced: str = ""  # the frame of its scans, if nothing gives its direction
-    measured: bool = True  # False: a guess, though with a reason
+    measured: bool = True  # False: a guess
 
     @property
     def lidar_aside(self) -> bool:
-        """Return whether the lidar is so far beside the middle that its input gives its place."""
+        """Return whether the lidar is so far aside that [inputs.scan] must give its place."""
         return abs(self.lidar_y_m) > MIN_ASIDE_M
 
     @property
@@ -82,7 +84,7 @@ def parse_footprint(text: str) -> Footprint:
     """Parse `LxW` in metres, as in `0.6x0.5`.
 
     Raises:
-        ConfigError: it is not that.
+        ConfigError: it is not of this form, or not the size of a robot.
     """
     match = re.fullmatch(r"\s*(\d*\.?\d+)\s*[x,]\s*(\d*\.?\d+)\s*", text)
     length, width = (float(part) for part in match.groups()) if match else (0.0, 0.0)
@@ -107,15 +109,15 @@ class RobotText:
 
     @cached_property
     def description(self) -> Description | str:
-        """Return what the text describes, or why it cannot be used."""
+        """Return the parsed description, or why it cannot be used."""
         return read_description(self.text)
 
 
 def descriptions(recording: Recording) -> Iterator[RobotText]:
-    """Yield the last description of the robot of each topic that has any.
+    """Yield the last robot description of each topic that has one.
 
-    Of several robots in the recording, those of the one to propose for, then those of none in
-    particular.
+    If the recording has several robots, those of the robot to propose for come first, then those
+    of no robot in particular.
     """
     for name in own_first(recording, recording.topics):
         topic = recording.topics[name]
@@ -131,7 +133,7 @@ def descriptions(recording: Recording) -> Iterator[RobotText]:
 def footprint_of(
     texts: Iterable[RobotText], scan_frame: str = ""
 ) -> tuple[Footprint | None, list[str]]:
-    """Return the footprint in the first description that has one, and notes on those before."""
+    """Return the first footprint that a description has, and notes on the descriptions before."""
     notes: list[str] = []
     for one in texts:
         found = of_urdf(one, scan_frame)
@@ -146,7 +148,7 @@ def footprint_of(
 
 
 def of_urdf(text: RobotText, scan_frame: str = "") -> Footprint | str:
-    """Return the outline that a robot's description has, or why there is none."""
+    """Return the footprint from a robot's description, or why there is none."""
     description = text.description
     if isinstance(description, str):
         return description
@@ -171,9 +173,9 @@ def of_urdf(text: RobotText, scan_frame: str = "") -> Footprint | str:
 
 
 def outline(description: Description) -> tuple[F64, F64, int] | None:
-    """Return the lowest and highest corner of what moves with the base, and its number of links.
+    """Return the lowest and highest corner of the links in the outline, and their number.
 
-    None if there is none.
+    None if no link that is rigid with the base has a shape.
     """
     links, places = description.links, description.places(OUTLINE)
     boxes = {name: extent(links[name], place) for name, place in places.items() if name in links}
@@ -188,7 +190,7 @@ def outline(description: Description) -> tuple[F64, F64, int] | None:
 def _lidar(places: dict[str, Place], frame: str) -> tuple[tuple[float, float], float, bool] | None:
     """Return the lidar's place (m ahead and to the left), its yaw, and whether it is upside down.
 
-    None if a description does not place it.
+    None if the description does not place it.
     """
     frame = frame.strip("/")
     near = [n for n in places if n == frame or n.split("/")[-1] == frame.split("/")[-1]]
@@ -201,13 +203,14 @@ def _lidar(places: dict[str, Place], frame: str) -> tuple[tuple[float, float], f
 
 
 BINS = 60  # of the full circle
-NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field's name holds a space
+NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field has a space in its name
 MIN_SCANS = 20
-OFTEN = 0.005  # of the scans, and at least three: one odd return says nothing
-TIGHT_PER_WIDTH = 0.3  # room, by the robot's width: less is a near collision
-MIN_M = 0.05  # half of a robot's length
+OFTEN = 0.005  # share of scans, at least three, that must have a return as near
+TIGHT_PER_WIDTH = 0.3  # clearance as a share of the robot's width: less is a near collision
+MIN_M = 0.05  # least half length of a robot
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
-# It must have turned so far, with so many scans each way it faced; and so many say the same.
+# To find own parts: the robot faced MIN_FACINGS directions, sectors of FACING_RAD, with
+# MIN_A_FACING scans in each; MOSTLY is the share of scans, and of directions, that must agree.
 FACING_RAD, MIN_FACINGS, MIN_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
 _LIMITS = ("range_min", "range_max")
 
@@ -216,19 +219,16 @@ _LIMITS = ("range_min", "range_max")
 class ScannedOutline:
     """The bounds that scans put on the outline."""
 
-    nearest_m: float  # that anything but the robot's own parts came to the lidar; inf: nothing did
+    nearest_m: float  # range of the nearest return not of the robot's own parts; inf: no return
     own_m: F64  # (P, 2) the robot's own parts, in the lidar's frame
 
     @property
     def own_range_m(self) -> float:
-        """Return how far the farthest of its own parts is; 0 if it sees none."""
+        """Return the range of the farthest own part; 0 if the lidar sees none."""
         return float(np.hypot(*self.own_m.T).max(initial=0.0))
 
     def footprint(self, guess: Footprint) -> Footprint | None:
-        """Return the outline by these scans.
-
-        None if they say no more than the guess without them.
-        """
+        """Return the outline from these scans; None if it is the same as `guess`."""
         half_m = max(self.nearest_m / (1 + 2 * TIGHT_PER_WIDTH), min(MIN_M, self.nearest_m))
         own = 2 * np.abs(self.own_m).max(axis=0, initial=0.0)
         length, width = (
@@ -246,9 +246,9 @@ class ScannedOutline:
 def scanned_outline(
     recording: Recording, fit: tuple[TopicInfo, Kind], poses: PoseSeries | None
 ) -> ScannedOutline | None:
-    """Bound the outline by a topic's scans.
+    """Bound the outline by a topic's scans; None if there are too few.
 
-    None if it has too few. Without poses no own parts are found.
+    Without poses, no own parts are found.
     """
     topic, source = fit[0].name, Input(fit[0].name, fit[0].type, fit[1].fields)
     leaves = recording.leaves(topic)
@@ -271,7 +271,7 @@ def scanned_outline(
 
 
 def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
-    """Return the bearings (BINS,) at which the range stays, whichever way the robot faces."""
+    """Return at which bearings (BINS,) the range stays the same whichever way the robot faces."""
     facing = np.floor(yaw_rad / FACING_RAD).astype(np.int64)
     ways, counts = np.unique(facing, return_counts=True)
     ways = ways[counts >= MIN_A_FACING]
@@ -313,7 +313,7 @@ def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
     return {NEAREST: found}
 
 
-MAX_ASIDE_M = 3.0  # of the middle: a lidar
+MAX_ASIDE_M = 3.0  # of a lidar from the middle
 MIN_RANGE_M = 0.01
 _TURN = 2 * math.pi
 
@@ -322,16 +322,16 @@ _TURN = 2 * math.pi
 class SeenScans:
     """The frame and angles of a topic's scans."""
 
-    frame: str = ""  # that the first one is in; "": it does not say
-    angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last one
+    frame: str = ""  # of the first scan; "": unknown
+    angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last scan
 
     def view(
         self, yaw_rad: float = 0.0, *, upside_down: bool = False
     ) -> tuple[float, float, int] | None:
         """Return the lowest and highest angle and the beams of the last scan, seen from above.
 
-        They are in a frame in which the lidar is turned by `yaw_rad`. None if the scan does not say
-        them, or not sanely.
+        The angles are in a frame in which the lidar is turned by `yaw_rad`. None if the scan has no
+        angles, or implausible ones.
         """
         if self.angles is None:
             return None
@@ -344,7 +344,7 @@ class SeenScans:
         if beams < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
             return None
         high = min(high, low + _TURN)
-        if yaw_rad:  # the middle of it within half a turn
+        if yaw_rad:  # keep the middle of the view within half a turn
             yaw_rad -= _TURN * round(((low + high) / 2 + yaw_rad) / _TURN)
         return low + yaw_rad, high + yaw_rad, beams
 
@@ -357,7 +357,7 @@ def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> di
         frame, angles = frame_id_path(leaves), _angles(kind)
         kept = angles if leaves.issuperset(angles) else []
         wanted[topic.name] = [*([frame] if frame else []), *kept]
-        if len(kept) == 2:  # by the last of so many
+        if len(kept) == 2:  # the step follows from the number of beams
             counted[topic.name] = Reduction((kind.fields["ranges_m"],), _beam_counts)
     columns = recording.read(wanted, counted) if wanted else {}
     return {
@@ -396,10 +396,10 @@ def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
 
 
 def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint:
-    """Add the lidar's place by the last of the recording's transforms, if they say it sanely.
+    """Add the lidar's place by the recording's last transforms, if it is plausible.
 
-    The base frame is taken for the middle of the outline. If the lidar is outside a measured one,
-    it is not: then only the lidar's yaw is known.
+    The base frame is taken for the middle of the outline. That is wrong if the lidar would be
+    outside a measured outline: then only the lidar's yaw is used.
     """
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     bases = [
@@ -416,7 +416,7 @@ def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint
     if footprint.measured and abs(x_m) > footprint.length_m / 2:
         return replace(turned, lidar_source=f"{bases[0]} has it {x_m:.2f} m ahead, outside")
     length_m, width_m = footprint.length_m, footprint.width_m
-    if not footprint.measured:  # a guess holds the lidar
+    if not footprint.measured:  # enlarge a guess to include the lidar
         length_m, width_m = max(length_m, 2 * abs(x_m)), max(width_m, 2 * abs(y_m))
     return replace(
         turned,
@@ -429,10 +429,9 @@ def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
-    """Write the nearest and the farthest range of use, at most 4 m, as keys of [task].
+    """Write the nearest and the farthest usable range, at most 4 m, as keys of [task].
 
-    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of the robot's own
-    parts.
+    The nearest excludes the 0 that some lidars give without a return, and the robot's own parts.
     """
     low, high, why = 0.05, 4.0, ""
     if set(_LIMITS) <= set(recording.leaves(topic)):

@@ -1,4 +1,4 @@
-"""All that a recording says of its robot, gathered for a proposal."""
+"""Gathers what a recording shows about its robot, for a proposal."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
-RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
-MIN_ROWS = 100  # with a goal in hindsight, if these are wanted and the rest is left out
+RADIUS_M = (0.1, 0.4)  # smallest and largest radius of a goal
+MIN_ROWS = 100  # with a goal in hindsight, if such goals are wanted
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,14 @@ class GoalChoice:
     """The goal of a proposal; `source` None: the task has none."""
 
     source: GoalSource | None
-    why: str = ""  # there is none
-    hindsight_wanted: bool = False  # also if most of the drive has none
+    why: str = ""  # why there is none
+    hindsight_wanted: bool = False  # even if most of the drive has no goal in hindsight
 
     def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
         """Return the choice after a trial.
 
-        There is no goal if hindsight finds none for most of the drive or, if hindsight is wanted,
-        for all but a few rows.
+        The goal is dropped if hindsight finds none for most of the drive or, if hindsight is
+        wanted, for all but a few rows.
         """
         without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
         enough = self.hindsight_wanted and transitions >= MIN_ROWS
@@ -96,36 +96,36 @@ class GoalChoice:
         return lines
 
     def fallback(self, role: str) -> str:
-        """Say what is used instead of `goal` or `plan`."""
+        """Return what is used instead of the input `goal` or `plan`."""
         return HINDSIGHT[role] if self.source == "hindsight" else "progress without a goal"
 
     def table_lines(self) -> list[str]:
-        """Write the [goal] of the profile, if it needs one."""
+        """Write the [goal] table, if the profile needs one."""
         if self.source != "hindsight":
             return []
         why = "where a drive stopped, turned back or went far enough"
         return ["[goal]  # no goal and plan seen", f'source = "hindsight"  # {why}', ""]
 
 
-# Input -> the field without which a topic is of no use for it.
+# input -> the field that a topic must measure to be of use for it
 MEASURED = {"imu": "yaw_rate_radps", "wheels": "speed_mps", "pose": "x_m"}
-MILLIMETRES_UP_TO_M = 1e4  # in float32
+MILLIMETRES_UP_TO_M = 1e4  # up to here, float32 has a resolution of about a millimetre
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a recording shows of its robot, and what is chosen by that."""
+    """What a recording shows about its robot, and the choices that follow."""
 
     recording: Recording
     roles: Roles
-    frames: Frames | None  # that transforms join
+    frames: Frames | None  # the fixed and base frames that transforms join
     poses_from_frames: bool
     motion: MotionChoice | None  # if no topic has the wheels' speeds
     commands: Commands
     chosen: CommandChoice
     driven: CommandedDrive | None
     hold: CommandHold
-    paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
+    paces_s: dict[str, float]  # topic -> usual time between its messages, in log time
     clock: ClockChoice
     gaps: Gaps
     footprint: Footprint
@@ -134,7 +134,7 @@ class Evidence:
     goal: GoalChoice
     signals: list[Candidate]
     robot: RobotProposal
-    unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
+    unmeasured: dict[str, str]  # input -> topics that have no estimate of it, or ""
     origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
 
     @property
@@ -146,20 +146,20 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Given:
-    """What a person says of a robot beside its recordings."""
+    """What a person states about a robot, besides its recordings."""
 
-    footprint: Footprint | None = None  # its outline; None: what the recording says of it
-    urdf: Path | None = None  # a file that describes it, in place of the recording's description
-    odometry_as_command: bool = False  # the measured motion stands for commands that are missing
-    # Goals in hindsight even if most of the drive has none: its rows are then left out.
+    footprint: Footprint | None = None  # its outline; None: from the recording
+    urdf: Path | None = None  # a file that replaces the recording's description
+    odometry_as_command: bool = False  # use the measured motion if commands are missing
+    # Use goals in hindsight even if most of the drive has none, whose rows are then left out.
     hindsight_goals: bool = False
 
 
 def gather(recording: Recording, given: Given) -> Evidence:
-    """Gather what a recording says of its robot.
+    """Gather what a recording shows about its robot.
 
     Raises:
-        ConfigError: the URDF cannot be used; says why.
+        ConfigError: the URDF cannot be used.
     """
     roles = {role: topics_for(recording, kinds) for role, kinds in KINDS.items()}
     if not roles["bumper"]:
@@ -179,7 +179,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
     edges = transform_edges(recording)
     frames = transform_frames(recording, edges)
     if frames is not None and all(kind.by_fix for _, kind in roles["pose"]):
-        roles["pose"] = []  # transforms say where it faces, too
+        roles["pose"] = []  # transforms also give its heading
     # Odometry drifts: transforms that lead to a map are the better pose.
     drifts = all(is_motion(topic.type) for topic, _ in roles["pose"])
     framed = frames is not None and (on_map(frames) or not roles["pose"]) and drifts
@@ -187,7 +187,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
     if framed or roles["pose"]:
         poses, poses_from = pose_series(recording, roles, frames if framed else None, edges)
     scanned = scans_of(recording, roles["scan"])
-    # Of several lidars' scans, the one in the frame of the base is the others put together.
+    # Of several lidars, the scan in the base frame is usually the merged one.
     roles["scan"].sort(key=lambda fit: plain(scanned[fit[0].name].frame) not in BASE_FRAMES)
     scan = roles["scan"][0][0].name if roles["scan"] else None
     frame = scanned[scan].frame if scan is not None else ""
@@ -279,7 +279,7 @@ def _measured(
 ) -> tuple[list[tuple[TopicInfo, Kind]], str]:
     """Drop the topics of an input before the first that measures `key`.
 
-    Also return what the dropped ones say instead.
+    Also return why they were dropped.
     """
     reasons: list[str] = []
     for place, (topic, kind) in enumerate(fits):
@@ -301,9 +301,10 @@ def _measured(
 
 
 def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
-    """Leave out the first topic of an input, and say `why` in the profile.
+    """Drop the first topic of an input; `why` goes into the profile.
 
-    The next one takes its place, or for wheels the poses. Returns None if there are too few poses.
+    The next topic takes its place or, for wheels, the poses do. Returns None if there are too few
+    poses.
     """
     roles = {**seen.roles, role: seen.roles[role][1:]}
     reasons = "; ".join(filter(None, [seen.unmeasured.get(role, ""), why]))

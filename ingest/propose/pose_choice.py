@@ -1,10 +1,10 @@
-"""Where poses come from, and how speeds follow from them where there is no odometry.
+"""Chooses where poses come from, and how speeds follow from them without odometry.
 
 Transforms give poses if they join a fixed frame with the robot's, by the frames' names. Speeds are
-the slope of the last poses. How far a pose scatters is found from third differences, which no
-smooth motion has: of white noise of size s they are s times the root of 20. A slope over a window
-of n poses then scatters by s / period x sqrt(12 / (n (n² - 1))); the shortest window in which it is
-small enough is proposed.
+the slope of the last poses in a window. The noise of poses is found from third differences, which
+smooth motion does not have: for white noise with standard deviation s, theirs is s x sqrt(20). A
+slope over a window of n poses then has s / period x sqrt(12 / (n (n² - 1))). The shortest window in
+which that is small enough is proposed.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def frame_lines(frames: Frames, *, used: bool) -> list[str]:
 def transform_topics(recording: Recording) -> tuple[str, str]:
     """Return the topics of the robot's moving and static transforms.
 
-    They are of its own namespace, else `/tf` and `/tf_static`, else of the only namespace that has
-    any, else the only topic of Foxglove's.
+    They are those in its own namespace, or else `/tf` and `/tf_static`, or else those in the only
+    namespace that has any, or else the only topic with Foxglove's transforms.
     """
     names = Frames().topic, Frames().static_topic
     held = {
@@ -80,7 +80,7 @@ def transform_topics(recording: Recording) -> tuple[str, str]:
 
 
 def transform_edges(recording: Recording, frames: Frames | None = None) -> Edges:
-    """Read the transforms of these topics, else of `transform_topics`; empty if there are none."""
+    """Read the transforms of the topics in `frames`, by default of `transform_topics`."""
     if frames is None:
         topic, static_topic = transform_topics(recording)
         frames = Frames(topic=topic, static_topic=static_topic)
@@ -95,7 +95,7 @@ def transform_edges(recording: Recording, frames: Frames | None = None) -> Edges
 def mount_of(edges: Edges, sensor: str, base: str) -> tuple[F64, F64] | None:
     """Return rotation (3, 3) and place (3,) of a sensor's frame in the base's; None if unknown.
 
-    Of moving transforms the last counts.
+    The last message of each transform is used.
     """
     turn, place = np.eye(3), np.zeros(3)
     chain = chain_between(edges, sensor, base) if sensor else []
@@ -115,7 +115,7 @@ def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
         names = [name for name in edges.topics if name.split(" ", 1)[1] == here]
         if not names or len(chain) > len(edges.topics):
             return []
-        # A frame may be sent both as static and as moving: the moving one says where it is.
+        # A frame may be sent both as static and as moving: the moving transform is right.
         name = min(names, key=lambda name: (name in edges.static, -len(edges.topics[name])))
         chain.append(name)
         here = str(np.asarray(edges.topics[name].fields[PARENT], object)[-1])
@@ -125,7 +125,7 @@ def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
 def transform_frames(recording: Recording, edges: Edges) -> Frames | None:
     """Guess the map's and the robot's frame from transforms (`transform_edges`).
 
-    None if they join no such two.
+    None if they do not join two such frames.
     """
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     others = {robot.rpartition("/")[2] for robot in robots_in(recording)[1:]}
@@ -139,19 +139,19 @@ def transform_frames(recording: Recording, edges: Edges) -> Frames | None:
 
 
 def named_frames(words: tuple[str, ...], frames: set[str]) -> list[str]:
-    """Return the frames of these names, with a robot's prefix or without; best first."""
+    """Return the frames with these names, with or without a robot's prefix; best first."""
     return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
 
 
-SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # how far a speed may scatter
-MIN_S, MAX_S = 0.2, 2.0
+SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # largest standard deviations of speeds
+MIN_S, MAX_S = 0.2, 2.0  # of the window
 MIN_POSES = 3
 MIN_CHANGES = 20
 
 
 @dataclass(frozen=True)
 class MotionChoice:
-    """The `[motion]` that is proposed, or why there can be none."""
+    """The proposed `[motion]`, or why there can be none."""
 
     window_s: float
     why: str = ""
@@ -163,7 +163,7 @@ class MotionChoice:
 
 
 def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> MotionChoice:
-    """Choose how speeds follow from the recording's poses, which are from this `source`."""
+    """Choose the window in which speeds follow from poses; `source` names where they are from."""
     gaps = np.diff(poses.stamp_ns) * 1e-9
     period, usual = (float(np.percentile(gaps, p)) if len(gaps) else 0.0 for p in (50, 90))
     least = (MIN_POSES - 1) * usual * 1.1
@@ -176,7 +176,7 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
             f" {MAX_S / MIN_POSES:.1f} s"
         )
         return MotionChoice(0.0, problem=problem)
-    poses = _changes(poses)  # a transform that is held says nothing of noise
+    poses = _changes(poses)  # repeated poses do not show the noise
     period = max(period, float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
     noise_m = float(np.hypot(_scatter(poses.x_m), _scatter(poses.y_m)) / np.sqrt(2))
     noise_rad = _scatter(np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))]))
@@ -192,7 +192,7 @@ def pose_series(
 ) -> tuple[PoseSeries, str]:
     """Return every pose at its log time, and its source in words.
 
-    `frames` of the transforms `edges`, else the topic for poses.
+    Poses are those of `frames` by the transforms `edges`, or without `frames` those of the topic.
     """
     if frames is not None:
         edges = edges.only({frames.base, frames.fixed})
@@ -222,10 +222,7 @@ def fixes_in(recording: Recording, topic: str, fields: Mapping[str, str]) -> Fix
 
 
 def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> list[str]:
-    """Write the keys of a satellite receiver's fixes.
-
-    Origin, accuracy, distance that gives the yaw.
-    """
+    """Write the keys for satellite fixes: origin, accuracy, and distance that gives the yaw."""
     fixes = fixes_in(recording, topic, fields)
     origin, usual = fixes.origin_deg(), _usual_std_m(fixes)
     how = "without a stated accuracy" if usual is None else f"of {usual:.2g} m, mostly"
@@ -241,7 +238,7 @@ def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> li
 def fix_noise_lines(
     recording: Recording, topic: str, fields: Mapping[str, str], driven_m: float
 ) -> list[str]:
-    """Write the limits of jump and slip for fixes between which `driven_m` are driven."""
+    """Write the limits of jumps and slip, if the robot drives `driven_m` between two fixes."""
     usual = _usual_std_m(fixes_in(recording, topic, fields)) or 1.0
     return [
         "[episodes]",
@@ -261,7 +258,7 @@ def _usual_std_m(fixes: Fixes) -> float | None:
 
 
 def _changes(poses: PoseSeries) -> PoseSeries:
-    """Keep the poses that differ from the one before, if enough of them show the noise."""
+    """Keep the poses that differ from the one before, if these are enough to show the noise."""
     columns = (poses.x_m, poses.y_m, poses.yaw_rad)
     new = np.concatenate([[True], np.any([np.diff(column) != 0 for column in columns], axis=0)])
     if new.sum() < MIN_CHANGES:
@@ -270,7 +267,7 @@ def _changes(poses: PoseSeries) -> PoseSeries:
 
 
 def _scatter(values: F64) -> float:
-    """Return the standard deviation of white noise on a smooth curve, outliers aside."""
+    """Return the standard deviation of white noise on a smooth curve, ignoring outliers."""
     third = np.diff(values, n=3)
     return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20)) if len(third) else 0.0
 

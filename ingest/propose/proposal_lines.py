@@ -1,4 +1,4 @@
-"""The text of a proposed profile: TOML with a comment at each guess."""
+"""Writes the text of a proposed profile: TOML with a comment at each guess."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Noise, Rewards, Task
 
-# The fields of a required input that nothing fills, for a person to name.
+# required input -> the fields that a person must name if no topic fills it
 BY_HAND = {"command": ("speed_mps", "yaw_rate_radps"), "pose": ("x_m", "y_m", "yaw_rad")}
 
 
@@ -50,7 +50,7 @@ def profile_lines(
 ) -> list[str]:
     """Write the TOML of a profile, with each piece of `advice` as a comment at its table.
 
-    `problems` say why it cannot be used; `trial` is what it made of the recording.
+    `problems` are the reasons why it cannot be used; `trial` is its outcome on the recording.
     """
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
@@ -105,7 +105,7 @@ def profile_lines(
 
 
 def advice_of(seen: Evidence) -> Iterator[Advice]:
-    """Yield what a person should check in a proposal, each by the key that it concerns."""
+    """Yield what a person should check in a proposal, each with the key that it concerns."""
     roles, commands, footprint = seen.roles, seen.commands, seen.footprint
     if robots := robots_in(seen.recording):
         others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
@@ -212,7 +212,7 @@ def _notes(advice: Sequence[Advice], *tables: str) -> list[str]:
 
 
 def _takeover_lines(seen: Evidence) -> list[str]:
-    """Write the button of whoever takes over, if it was recorded and nothing has its name yet."""
+    """Write the table of a takeover button, if it was recorded and `operator` is not taken."""
     topic = seen.recording.topics.get(TAKEOVER)
     named = any(source.policy == "operator" for source in seen.chosen.sources)
     if named or topic is None or topic.type != "std_msgs/msg/Bool" or not topic.expected:
@@ -235,7 +235,7 @@ def _conditions(seen: Evidence) -> tuple[list[str], list[str]]:
 
 
 def _odometry_alone(seen: Evidence) -> bool:
-    """Return whether poses and wheel speeds are of one topic, and nothing else shows motion."""
+    """Return whether poses and wheel speeds come from one topic, and nothing else shows motion."""
     pose, wheels = (
         [topic.name for topic, _ in seen.roles[role][:1]] for role in ("pose", "wheels")
     )
@@ -244,7 +244,7 @@ def _odometry_alone(seen: Evidence) -> bool:
 
 
 def _trial_lines(trial: Trial) -> list[str]:
-    """Say what the profile makes of the recording it is proposed from."""
+    """Write the profile's outcome on the recording that it is proposed from, as comments."""
     if not trial.ticks:
         return []
     most = [f"{reason} {count:,}" for reason, count in list(trial.dropped.items())[:3]]
@@ -274,7 +274,7 @@ def _topic_lines(seen: Evidence) -> list[str]:
 
 
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
-    """Write how noisy its poses are, if that is more than a profile's default."""
+    """Write the noise of the robot's poses, if that is more than a profile's default."""
     fixes = next(iter(seen.roles["pose"]), None)  # its pose's topic
     if fixes is None or not fixes[1].by_fix:
         noise_m = trial.pose_noise_m
@@ -294,7 +294,7 @@ def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
 
 
 def _clock_lines(clock: ClockChoice) -> list[str]:
-    """Write which time, and when there is a tick."""
+    """Write the [clock] table."""
     every_s = clock.every_s
     why = "no commands" if every_s is None else f"a command every {every_s:.2f} s, mostly"
     return [
@@ -393,14 +393,14 @@ def _input_lines(role: str, fits: Sequence[tuple[TopicInfo, Kind]], seen: Eviden
 
 
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
-ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
+ROUTE_M = 20.0  # that the robot must be able to drive within the time limit
 MAX_TIME_LIMIT_STEPS = 1000
-MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
-MIN_TIGHT_M = 0.05  # a lidar's noise hides what is less
+MOSTLY_FREE = 0.1  # largest share of messages in which a bumper is pressed
+MIN_TIGHT_M = 0.05  # less is within a lidar's noise
 
 
 def task_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
-    """Write the [task] table and those in it."""
+    """Write the [task] table and its subtables."""
     roles, commands = seen.roles, seen.commands
     kind = "speeds" if commands.measured else "commands"
     held_back = [
@@ -456,7 +456,7 @@ def actions_of(commands: Commands, robot: RobotProposal) -> list[tuple[float, fl
         return _steered_actions(commands, robot)
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
-    if 0.8 * speed > GENTLE_MPS:  # over slippery floor it needs a curve, too, that is none of these
+    if 0.8 * speed > GENTLE_MPS:  # on a slippery floor it also needs a slower curve
         slow, bend = min(0.35 * speed, GENTLE_MPS), min(0.5 * turn, GENTLE_RADPS)
         actions += [(slow, bend), (slow, -bend)]
     return actions + [(-back, 0.0) for back in commands.reverse_mps]
@@ -481,7 +481,7 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
 
 
 def _bump_line(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> str:
-    """Let a bumper stop the robot, unless it is pressed too often to be one."""
+    """Write that a bump ends an episode, unless the bumper is pressed too often to be one."""
     if not fits:
         return "bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"
     topic, kind = fits[0]
@@ -495,7 +495,7 @@ def _bump_line(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> 
 
 
 def _body_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
-    """Write the outline, and how near is near for a robot narrower than suits the default."""
+    """Write the outline, and the tight clearance of a robot that is too narrow for the default."""
     footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
     aside = bool(seen.roles["scan"]) and footprint.lidar_aside

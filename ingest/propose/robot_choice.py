@@ -1,7 +1,7 @@
-"""The `[robot]` of a proposed profile, by its description, its scans and how it turned.
+"""Proposes the `[robot]` of a profile, from its description, its scans and how it turned.
 
-A robot with two driven sides turns on the spot; one that steers never does. So if nothing describes
-the robot, its drive shows in whether it follows commands to turn on the spot.
+A robot with two driven sides turns on the spot; one that steers never does. If nothing describes
+the robot, its drive is found by whether it followed commands to turn on the spot.
 """
 
 from __future__ import annotations
@@ -24,33 +24,34 @@ from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.task import wrap_angle
 from restock.toml import toml_value
 
-SETTLED_S = 1.0  # a command is no older
-ANSWERED_S = 0.5  # after its end in which a turn still answers it
-STANDS_MPS, MUCH = 0.02, 0.3  # of a command to turn on the spot; of the sharpest turn that is told
-TURNS_RADPS = 0.15  # less is no turn
-MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
+SETTLED_S = 1.0  # longest time that a command holds
+ANSWERED_S = 0.5  # a turn up to this long after a command still answers it
+# Commands to turn on the spot: most speed, least share of the sharpest turn, least yaw rate.
+STANDS_MPS, MUCH = 0.02, 0.3
+TURNS_RADPS = 0.15
+MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # such commands needed; share to follow
 MIN_MOVED_M = 0.05  # else it may not have been able to move
 
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """How a robot answered commands to turn on the spot, as no car can."""
+    """How a robot followed commands to turn on the spot, which no car can."""
 
-    moved_m: float = 0.0  # the size of the place it drove in
+    moved_m: float = 0.0  # diagonal of the area it drove in
     requested_rad: float = 0.0  # by commands to turn on the spot
     spells: int = 0  # of such commands
-    followed_rad: float = 0.0  # of what they asked for
+    followed_rad: float = 0.0  # turned in the direction of such commands
 
     @property
     def steers(self) -> bool:
-        """Return whether it did not turn on the spot when told to, though it can move."""
+        """Return whether it did not turn on the spot when commanded to, although it can move."""
         reported = self.requested_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
         followed = self.followed_rad >= FOLLOWS * self.requested_rad
         return reported and self.moved_m >= MIN_MOVED_M and not followed
 
     @property
     def why(self) -> str:
-        """Say what it showed, as the rest of a sentence about the robot."""
+        """Return the evidence in words, as the rest of a sentence about the robot."""
         if not self.requested_rad:
             return "it was never commanded to turn on the spot"
         return (
@@ -62,11 +63,11 @@ class DriveEvidence:
 def drive_evidence(
     command_s: F64, command_mps: F64, command_radps: F64, poses: PoseSeries
 ) -> DriveEvidence:
-    """Read from one drive whether its robot steers as a car.
+    """Return the evidence of one drive on whether its robot steers like a car.
 
     Args:
         command_s, command_mps, command_radps: the commands (N,), in order, on the clock of `poses`.
-        poses: of the robot, from the same 0.
+        poses: of the robot, with the same zero of time.
     """
     if len(command_s) < 2 or len(poses) < 3:
         return DriveEvidence()
@@ -81,7 +82,7 @@ def drive_evidence(
 def _on_the_spot(
     command_s: F64, command_mps: F64, command_radps: F64, at_s: F64, heading: F64
 ) -> tuple[float, int, float]:
-    """Return how far (rad) and how often it was told to turn on the spot, and how far it did."""
+    """Return how far (rad) and how often it was to turn on the spot, and how far it turned."""
     sharp = float(np.percentile(np.abs(command_radps), 98))
     side = np.sign(command_radps) * (
         (np.abs(command_mps) <= STANDS_MPS)
@@ -103,27 +104,27 @@ def _on_the_spot(
 
 WHEELBASE_PART = 0.6  # of the outline's length, if nothing shows it
 _OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
-MAX_BEAMS = 361  # in the twin, as each costs time: every k-th beam of a finer lidar
+MAX_BEAMS = 361  # in the twin, as each costs time; of a finer lidar every k-th beam is used
 
 
 @dataclass(frozen=True)
 class RobotProposal:
-    """Values of `[robot]` by their keys, where each is from, and what is to be said."""
+    """Values of `[robot]` by key, the origin of each, and notes."""
 
     values: dict[str, Any] = field(default_factory=dict)
     origin: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    rolls: bool = True  # False: a description says that it has no wheels
+    rolls: bool = True  # False: by its description it has no wheels
     drive_why: str = "A GUESS: the recording does not show it"
 
     @property
     def described(self) -> bool:
-        """Return whether a description says how it drives."""
+        """Return whether a description gives its drive."""
         return "drive" in self.values and self.origin.get("drive") != "logs"
 
     @property
     def guessed_steering(self) -> bool:
-        """Return whether it is taken for a car by how it drove alone."""
+        """Return whether it is taken for a car only because of how it drove."""
         return self.values.get("drive") == "ackermann" and not self.described
 
     def driven(
@@ -133,8 +134,8 @@ class RobotProposal:
 
         Args:
             shown: how it turned.
-            length_m: of its outline, by which the wheelbase is guessed.
-            command_rad: the sharpest of its commands, where they are steering angles.
+            length_m: of its outline, from which the wheelbase is guessed.
+            command_rad: the sharpest of its commands, if they are steering angles.
         """
         if self.described:
             return self
@@ -190,7 +191,7 @@ def read_urdf(path: Path) -> RobotText:
     """Read the description of a robot on wheels from a URDF file.
 
     Raises:
-        ConfigError: it cannot be read, is no URDF, or has no wheels.
+        ConfigError: it cannot be read, is not a URDF, or has no wheels.
     """
     remedy = "give the URDF of a wheeled robot, as XML in UTF-8"
     try:
@@ -213,13 +214,13 @@ def propose_robot(
     upside_down: bool = False,
     lidar_yaw_rad: float = 0.0,
 ) -> RobotProposal:
-    """Return the robot that the first description of one on wheels, and its scans, describe.
+    """Return the robot by the first description of a wheeled robot, and by its scans.
 
     Args:
         texts: the descriptions.
-        scan: what the scans say of the lidar.
-        upside_down: the lidar hangs so.
-        lidar_yaw_rad: by which the twin's lidar, which is in the middle, covers what this one does.
+        scan: the frame and angles of its scans.
+        upside_down: whether the lidar hangs upside down.
+        lidar_yaw_rad: yaw at which the twin's lidar, in the middle, covers the same directions.
     """
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}
@@ -234,7 +235,7 @@ def propose_robot(
         middle = 0.0 if shapes is None else float(shapes[0][0] + shapes[1][0]) / 2
         found = described_robot(description, middle, scan.frame if scan is not None else "")
         if found.problem is not None:
-            unfit.append(f"{one.source}: {found.problem}")  # an arm's, say, beside that of its base
+            unfit.append(f"{one.source}: {found.problem}")  # perhaps an arm's
             continue
         if one.check:
             notes.append(f"{one.source}: {one.check}")
@@ -253,7 +254,7 @@ def propose_robot(
 
 
 def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Keep the values that a robot can have, and note the others."""
+    """Keep the values that a robot can have; add notes on the others."""
     kept = {}
     for key, value in values.items():
         try:

@@ -1,4 +1,4 @@
-"""What a topic may be for, and of which robot: guesses by message types and names."""
+"""Guesses what a topic is for, and of which robot, from message types and names."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ def _under(path: str, fields: dict[str, str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Kind:
-    """A message type that may fill an input, and how."""
+    """A message type that may fill an input, and its fields.
+
+    `words`, `never` and `rather` are words in a topic's name.
+    """
 
     type: str
     fields: dict[str, str]
-    words: tuple[str, ...] = ()  # in the topic's name, they speak for it
-    must: bool = False  # … and without one of them it is not taken
-    never: tuple[str, ...] = ()  # in the topic's name, they speak against it
-    rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
+    words: tuple[str, ...] = ()  # prefer a topic, by the first that it has
+    must: bool = False  # require one of `words`
+    never: tuple[str, ...] = ()  # exclude a topic
+    rather: tuple[str, ...] = ()  # put a topic after all others
     at_changes: bool = False  # messages come when something changes, and hold until then
 
     @property
@@ -42,7 +45,7 @@ class Kind:
         return "latitude_deg" in self.fields
 
 
-# If nothing else gives the robot's position.
+# Satellite fixes, used if nothing else gives the robot's position.
 _STATED_FIX = {
     "latitude_deg": "latitude",
     "longitude_deg": "longitude",
@@ -53,9 +56,9 @@ _STATED_FIX = {
 _FIX = {key: path for key, path in _STATED_FIX.items() if key != "status"}
 _RECEIVERS = ("fix", "gps", "gnss")
 
-# A name of what may drive but is only proposed: to a multiplexer, a smoother, a person's remote.
+# Names of commands that are only proposed: to a multiplexer, a smoother or a person's remote.
 NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
-# Of several, what is nearest to the motor is driven: a multiplexer's output before its inputs.
+# Names of commands, the nearest to the motors first: a multiplexer's output before its inputs.
 _DRIVEN = ("cmd_vel_out", "mux/out", "mux/cmd_vel", "cmd_vel")
 _ACKERMANN = ("low_level", "output", "ackermann_cmd", "drive")
 BY_HAND = ("teleop", "joy", "key", "web", "remote")
@@ -69,7 +72,7 @@ _ELSEWHERE = (
 
 _ROBOTS_POSE = ("robot_pose", "tracked_pose", "slam", "pose")
 _PATHS = ("plan", "path")
-# A name of a path that does not lead to the goal: what a controller looks at, next to the robot.
+# Names of paths that do not lead to the goal, but only as far as a controller looks.
 _NEAR_PATHS = ("local_plan", "local_path", "local_traj", "transformed_", "pruned_")
 
 _MEASURED = (
@@ -81,7 +84,7 @@ _MEASURED = (
     ),
 )
 
-MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
+MUCH = 0.1  # share of the chosen topic's messages from which another topic may be right
 
 _TWISTS = (
     ("geometry_msgs/msg/Twist", _TWIST),
@@ -121,7 +124,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             for name in _POSES
         ),
         *(Kind(name, _under(at, _POSE), ("filtered", "map", "odom")) for name, at in _ODOMETRY),
-        # Of motion capture and the like, whatever their names.
+        # From motion capture and the like, whatever the topic's name.
         *(Kind(name, _under("pose", _POSE), never=_ELSEWHERE) for name in _POSES),
         Kind(
             "geometry_msgs/msg/TransformStamped",
@@ -163,7 +166,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         Kind("foxglove.LaserScan", _SCAN, ("scan",), rather=("back", "rear")),
     ),
     "goal": (
-        Kind(  # all that move_base was sent
+        Kind(  # every goal that move_base got
             "move_base_msgs/msg/MoveBaseActionGoal", _under("goal.target_pose.pose", _PLACE)
         ),
         *(Kind(name, _under("pose", _PLACE), ("goal",), must=True) for name in _POSES),
@@ -199,9 +202,9 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     "true_exposure": _texts(("exposure",)),
     "perturbation": _texts(("perturbation",)),
 }
-# Where that is asked for: the measured motion in place of commands that were not recorded.
+# Used on request: the measured motion in place of commands that were not recorded.
 ODOMETRY_AS_COMMAND = _MEASURED
-# Message type -> what of a robot it is. Poses may also be of odometry's type.
+# Message type -> the input that shows it to be of a robot. Odometry may also fill the pose.
 _KIND_OF = {
     name: role
     for role in ("pose", "imu", "scan", "plan", "wheels", "command")
@@ -211,11 +214,11 @@ _KIND_OF = {
 _OTHER_ENCODINGS = ("json", "protobuf")
 REQUIRED = ("command", "pose")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
-# Of Restock's own node: what a policy would have driven is no command of the robot.
+# Topics of Restock's own node: what a policy would have driven is not a command of the robot.
 NODE_TOPICS = frozenset((PROPOSAL, SHADOW, ACTION, LIMITER, TAKEOVER))
-SPENT = (*LATCHED, "true_condition", "true_exposure")  # nothing else is in their topics
+SPENT = (*LATCHED, "true_condition", "true_exposure")  # topics without any other use
 
-Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
+Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> topics that may fill it, best first
 
 
 def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
@@ -230,14 +233,14 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
 def robots_in(recording: Recording) -> list[str]:
     """Return the namespaces of a recording's robots, if it has several.
 
-    The one to propose for is first: the chosen one, or one with a command and topics of most kinds.
+    The robot to propose for is first: the chosen one, or one with a command and topics of most
+    kinds.
 
-    Robots' namespaces lie side by side, and topics of two kinds at least have the same name in
-    more than one of them: `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one
-    robot.
+    Namespaces are robots' if they are siblings in which topics of at least two kinds have the same
+    names. `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one robot.
     """
     kinds, messages = defaultdict[str, set[str]](set), Counter[str]()
-    beside = defaultdict[tuple[str, str, str], set[str]](set)  # by place, name in it, and kind
+    beside = defaultdict[tuple[str, str, str], set[str]](set)  # by parent, rest and kind
     for name, topic in _readable(recording):
         other = topic.encoding in _OTHER_ENCODINGS
         if (kind := _KIND_OF.get(last_part(topic.type) if other else topic.type)) is None:
@@ -257,7 +260,7 @@ def robots_in(recording: Recording) -> list[str]:
         key=lambda one: (
             one != recording.robot,
             "command" not in kinds[one],
-            -len(kinds[one] - {"imu"}),  # which everything can do without
+            -len(kinds[one] - {"imu"}),  # an IMU is not needed
             -messages[one],
             one,
         ),
@@ -265,10 +268,10 @@ def robots_in(recording: Recording) -> list[str]:
 
 
 def choose_robot(recording: Recording, name: str) -> None:
-    """Propose for the robot of this namespace, of several in the recording.
+    """Choose the robot with this namespace, of several in the recording, to propose for.
 
     Raises:
-        ConfigError: it is not one of them; names those that are. Or there are no such topics.
+        ConfigError: there is no such robot, or no topic in this namespace.
     """
     chosen, robots = f"/{name.strip('/')}", sorted(robots_in(recording))
     known = any(topic.startswith(f"{chosen}/") for topic in recording.topics)
@@ -284,14 +287,14 @@ def choose_robot(recording: Recording, name: str) -> None:
 
 
 def own_first(recording: Recording, names: Iterable[str]) -> list[str]:
-    """Drop names in other robots' namespaces, and put those in none last."""
+    """Drop topics of other robots, and put topics without a robot's namespace last."""
     robots = tuple(f"{robot}/" for robot in robots_in(recording))
     kept = [name for name in names if not name.startswith(robots[1:])]
     return sorted(kept, key=lambda name: not name.startswith(robots[:1]))
 
 
 def shared(recording: Recording, place: str) -> str:
-    """Warn that a topic may not be of this robot; "" if it is."""
+    """Return a warning if a topic may be another robot's, or ""."""
     robots = robots_in(recording)[:1]
     if not robots or place.startswith(f"{robots[0]}/"):
         return ""
@@ -307,9 +310,9 @@ def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
 def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
     """Return whether a topic's messages are of this type.
 
-    JSON and protobuf have ROS's types in namespaces of any name (`ros.geometry_msgs.Twist`,
-    `Twist`), so their fields are checked as well. So are those of bumpers, whose packages no
-    distribution has.
+    In JSON and protobuf, ROS's types may be in any namespace (`ros.geometry_msgs.Twist`, `Twist`),
+    so the fields are checked as well. So are bumpers' fields, as no distribution defines their
+    packages.
     """
     other = topic.encoding in _OTHER_ENCODINGS
     of_ros = "/" in kind.type and last_part(topic.type) == last_part(kind.type)
@@ -326,7 +329,7 @@ MAX_FLAGS = 8
 
 
 def own_bumpers(recording: Recording) -> list[tuple[TopicInfo, Kind]]:
-    """Return bumpers of a robot's own type: named so, and nothing but flags in their messages."""
+    """Return bumpers with a type of the robot's own: a bumper by name, with flags only."""
     found = []
     for topic in usable_topics(recording).values():
         leaves = [one for one in recording.fields(topic.name) if not one.path.startswith("header.")]
@@ -340,7 +343,8 @@ def own_bumpers(recording: Recording) -> list[tuple[TopicInfo, Kind]]:
 def topics_for(recording: Recording, kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
     """Sort the topics that may fill an input, best first.
 
-    The robot's own come before those of no robot, then it is by kind, by name, by messages.
+    The robot's own topics come before those of no robot. Within these, topics with a word of
+    `rather` are last, and the rest is by kind, by word and by number of messages.
     """
     own = tuple(f"{robot}/" for robot in robots_in(recording)[:1])
     topics, fitting = usable_topics(recording).values(), []

@@ -1,4 +1,4 @@
-"""A profile tried on a recording: what it gives, and what to try instead."""
+"""Tries a profile on a recording: what it gives, and what to try instead."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from restock.ingest.steps.episodes import Split, Steps, split, steps_of, why_non
 from restock.ingest.task.conditions import in_steps
 from restock.ingest.task.task import Task
 
-MUCH = 0.1  # of the ticks: what costs so many is worth a word
-GAIN = 1.1  # times the transitions: what gives so many is worth a try
-OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
+MUCH = 0.1  # share of ticks: a choice that costs as many is reported
+GAIN = 1.1  # factor of transitions: a choice that gives as many more is worth a try
+OFTEN_NEAR = 0.4  # share of ticks: if it is exceeded, the outline is probably wrong
 OFTEN_INSIDE = 0.02
-MOVING, MIN_MOVING = 0.2, 30  # of the fastest action; ticks
+MOVING, MIN_MOVING = 0.2, 30  # share of the fastest action's speed; ticks
 SLIP_OVER = "{0.2 m}"  # of driving, as in wheel_slip and slippery_floor
-NOISE_IN_LIMIT = 1.25  # slip is more than twice the noise
-EVEN_S = 3.0  # as long as a stretch that the twin is compared with a log by
-EVEN = 0.25  # of a control period
-UNEVEN = 4.0  # times the time that can be followed: worth a tick a period
+NOISE_IN_LIMIT = 1.25  # margin: slip is more than twice the noise
+EVEN_S = 3.0  # same length as the segments used to compare twin and log
+EVEN = 0.25  # share of a control period by which an even tick may be off
+UNEVEN = 4.0  # factor of time that the twin can follow from which one tick per period is better
 
 
 @dataclass(frozen=True)
 class Advice:
     """The cost of a choice, and what to try."""
 
-    key: str  # of the profile, as `inputs.command.max_age_s`
+    key: str  # of the profile, such as `inputs.command.max_age_s`
     text: str
 
     def __str__(self) -> str:
@@ -50,16 +50,16 @@ class Trial:
     transitions: int = 0
     seconds: float = 0.0  # that the transitions span
     even_s: float = 0.0  # of them, in stretches that a simulator can follow tick by tick
-    dropped: dict[str, int] = field(default_factory=dict)  # ticks in no episode, by reason
+    dropped: dict[str, int] = field(default_factory=dict)  # reason -> ticks in no episode
     advice: list[Advice] = field(default_factory=list)
-    problem: str = ""  # why there is nothing
-    findings: list[Finding] = field(default_factory=list)  # what contradicts itself
-    pose_noise_m: float | None = None  # by how much poses differ from wheels in a control period
+    problem: str = ""  # why there are no transitions
+    findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
+    pose_noise_m: float | None = None  # of poses against wheels, over a control period
     inside_outline: float | None = None  # share of usable ticks with a return inside the robot
 
 
 def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
-    """Try a profile on the columns of a recording (those `read_topics` reads for it)."""
+    """Try a profile on the columns that `read_topics` reads for it from a recording."""
     try:
         steps = steps_of(profile, topics)
     except RecordingError as error:
@@ -93,8 +93,8 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
 def _pose_noise_m(steps: Steps, task: Task) -> float | None:
     """Return the noise of poses over a control period; None if the robot hardly moved.
 
-    Limits of slip follow from it. They are well above how far poses and wheels differ over the
-    steps of a window, at nine in ten of the ticks at which either moved.
+    The limits of slip follow from it: they should be well above the difference of poses and wheels
+    over a window, at nine in ten of the ticks at which either moved.
     """
     limits = task.condition_limits
     window = int(in_steps(SLIP_OVER, limits)) + 1
@@ -103,7 +103,7 @@ def _pose_noise_m(steps: Steps, task: Task) -> float | None:
     moved = np.maximum(np.abs(driven_mps), np.abs(poses_mps)) > MOVING * limits["fastest_mps"]
     off_m = np.where(steps.follows, driven_mps - poses_mps, 0.0) * task.control_period_s
     summed_m, breaks = np.cumsum(off_m), np.cumsum(~steps.follows)
-    ends = np.arange(window, len(steps))  # of windows of so many ticks, each after one more
+    ends = np.arange(window, len(steps))  # last ticks of windows
     ends = ends[(breaks[ends] == breaks[ends - window]) & moved[ends]]
     if len(ends) < MIN_MOVING:
         return None
@@ -112,10 +112,10 @@ def _pose_noise_m(steps: Steps, task: Task) -> float | None:
 
 
 def _even_s(stamp_ns: Ints, period_s: float) -> float:
-    """Return the time of an episode's ticks (N,) in even stretches of some 3 s.
+    """Return the time of an episode's ticks (N,) that is in even segments of about 3 s.
 
-    In these each tick is within a quarter of a period of when it is due, as the twin's fit and gap
-    take them.
+    In an even segment, each tick is within a quarter of a period of when it is due, as for the
+    segments by which the twin is calibrated and compared.
     """
     ticks, even_s, at = max(round(EVEN_S / period_s), 1), 0.0, 0
     off_s = (stamp_ns - stamp_ns[0]) / NS - np.arange(len(stamp_ns)) * period_s
@@ -129,7 +129,7 @@ def _even_s(stamp_ns: Ints, period_s: float) -> float:
 def _ages(
     profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps, episodes: Split
 ) -> Iterator[Advice]:
-    """Yield how old each input is that is often stale, and what it would give if it were held."""
+    """Yield advice on inputs that are often stale: their age, and the outcome if latched."""
     for name, source in profile.inputs.items():
         count = episodes.dropped.get(f"{name}: stale", 0)
         if source.max_age_s is None or count < MUCH * len(steps):
@@ -157,14 +157,14 @@ def _outline(
 ) -> tuple[float | None, list[Advice]]:
     """Return the share of usable ticks at which the lidar sees something inside the robot.
 
-    Also advise on that, and on things that almost touch it.
+    Also return advice on that, and on things that almost touch the robot.
     """
     scan, body = profile.inputs.scan, profile.task.body
     usable = np.array([problem == "" for problem in steps.problem], np.bool_)
     if scan is None or scan.topic not in topics or not usable.any():
         return None, []
     clearance = steps.signals["clearance_m"][usable]
-    near_m = profile.task.rewards.tight_clearance_m  # as of near_collision and recovery
+    near_m = profile.task.rewards.tight_clearance_m  # as for near_collision and recovery
     inside, near = float((clearance <= 0).mean()), float((clearance < near_m).mean())
     if inside <= OFTEN_INSIDE and near <= OFTEN_NEAR:
         return inside, []
