@@ -45,10 +45,10 @@ from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs,
 from restock.ingest.store.lineage import Ingest, own_path
 from restock.ingest.store.manifest import (
     LabelScore,
+    correct_labels,
     corrections_in,
     definitions,
     label_scores,
-    lay_over,
     manifest_row,
     recorded_facts,
     rules_of,
@@ -272,7 +272,7 @@ class _Ingest:
             *(profile, steps, episodes, provenance),
             done=lambda tick: watch("rows and labels, ticks", tick, ticks),
         )
-        table, self.corrections = lay_over(
+        table, self.corrections = correct_labels(
             table, self.corrections, profile.conditions, steps.clock.offset_ns
         )
         named = Counter(table["condition"].to_pylist())
@@ -473,10 +473,10 @@ def _refusal(
         found = store.repeated(one.staged, one.period_s, ahead=ahead)
     except StoreError as error:
         return error
-    if found is None or (one.repeated == "replace" and found.the_less):
+    if found is None or (one.repeated == "replace" and found.has_less):
         return None
     remedy = "leave it out, or use --repeated keep to ingest it anyway"
-    if found.the_less:  # it was ingested while still being written, or salvaged
+    if found.has_less:  # it was ingested while still being written, or salvaged
         remedy = (
             f"this one holds more of the drive: {_removal(store, found.recording_id)} removes "
             "that one; then ingest this one again (--repeated replace does both), or keep both "
@@ -542,7 +542,7 @@ def _finished(
         notes.append(note)
     elif repeats is not None:
         until = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
-        if repeats.the_less:
+        if repeats.has_less:
             how = f"{_removal(store, repeats.recording_id)} removes that one, which holds less"
         else:
             how = f"{_removal(store, staged.recording_id)} removes this one"

@@ -28,10 +28,10 @@ from restock.ingest.store.manifest import (
     LabelScore,
     Moments,
     conditions_json,
+    correct_labels,
     corrections_in,
     driven_plan,
     label_scores,
-    lay_over,
     merged,
     rules_of,
     score_columns,
@@ -154,7 +154,7 @@ def relabel_rows(
     }
     rows = replaced(rows, new)
     corrections = corrections_in(row)
-    rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
+    rows, corrections = correct_labels(rows, corrections, every_condition, row["clock_offset_ns"])
     named = rows["condition"].to_pylist()
     scores = label_scores(rows, labels, task.control_period_s)
     profile = parse_profile(row["profile_toml"], where="the manifest's profile")
@@ -310,7 +310,7 @@ def _one(
     before = store.rows(row["recording_id"], row["ingest_id"])
     conditions, offset_ns = stored_conditions(row), row["clock_offset_ns"]
     every = merged(corrections_in(row), given, Moments.of(before, offset_ns))
-    rows, every = lay_over(before, every, conditions, offset_ns)
+    rows, every = correct_labels(before, every, conditions, offset_ns)
     ingest_id = uuid.uuid4().hex[:16]
     rows = replaced(rows, {"ingest_id": ingest_id})
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)

@@ -153,15 +153,15 @@ def written_whole(place: Location, path: str) -> Iterator[None]:
 
 def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
     """Return the error for a store that cannot be written, with what to do."""
-    said = str(error)
-    if re.search(r"No space left|Disk quota exceeded|os error (28|122)\b", said):
+    text = str(error)
+    if re.search(r"No space left|Disk quota exceeded|os error (28|122)\b", text):
         return StoreError(
             "cannot be written: there is no space left on its disk",
             where=str(place),
             remedy="free some space, then run the same command again: no stored data is lost",
         )
     # Delta's library puts the cause on the last line, after an arrow.
-    causes = [line.rsplit("↳\x1b[0m ")[-1].strip() for line in said.splitlines() if "↳" in line]
+    causes = [line.rsplit("↳\x1b[0m ")[-1].strip() for line in text.splitlines() if "↳" in line]
     return StoreError(
         "cannot be written: " + ": ".join([first_line(error), *causes[-1:]]), where=str(place)
     )
@@ -244,7 +244,7 @@ class TableCommits(StoreReader):
             if extra:
                 table.alter.add_columns(Schema.from_arrow(pa.schema(extra)).fields)
 
-        self.again_on_conflict(create)
+        self.retry_on_conflict(create)
 
     def expect_folder(self) -> None:
         """Raise StoreError if there is a file, a panel or a run in place of the store."""
@@ -279,25 +279,25 @@ class TableCommits(StoreReader):
             table, active = listing.table, listing.files
             if {file.path for file in added} <= {file.path for file in active}:
                 return table.version()  # an earlier attempt was committed, but its answer was lost
-            self._still(instead_of)
+            self._expect_unchanged(instead_of)
             now_ms = time.time_ns() // 1_000_000
             actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
-            turns = []
+            locks = []
             if name == TRANSITIONS:
                 self.discard_uncommitted(name, rewritten)  # of an earlier attempt
-                replaced[:] = _held(active, recordings)
+                replaced[:] = _own_paths(active, recordings)
                 rewritten.clear()
-                actions += self._without(active, recordings, rewritten, now_ms)
+                actions += self._removing_actions(active, recordings, rewritten, now_ms)
                 # Two concurrent first ingests of one recording remove nothing, so Delta would not
                 # see a conflict: the transaction id makes it one.
-                turns = _turns(table, recordings)
-            self.transact(table, actions, turns)
-            return self._read_on(name, table)
+                locks = _make_locks(table, recordings)
+            self.transact(table, actions, locks)
+            return self._read_own_commit(name, table)
 
         with self.discarded_on_failure(name, rewritten):
-            return self.again_on_conflict(attempt), replaced
+            return self.retry_on_conflict(attempt), replaced
 
-    def take_out(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
+    def remove_rows(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
         """Remove recordings from `transitions`, all or none; `ingests` maps recording to ingest.
 
         The caller removes their manifests.
@@ -316,20 +316,20 @@ class TableCommits(StoreReader):
             table, active = listing.table, listing.files
             self.discard_uncommitted(TRANSITIONS, rewritten)  # of an earlier attempt
             rewritten.clear()
-            if before and not _held(active, ingests):
+            if before and not _own_paths(active, ingests):
                 return table.version()  # an earlier attempt was committed, but its answer was lost
-            self._still(ingests)
+            self._expect_unchanged(ingests)
             before[:] = [table.version()]
             now_ms = time.time_ns() // 1_000_000
-            actions = self._without(active, ingests, rewritten, now_ms)
-            self.transact(table, actions, _turns(table, sorted(ingests)), operation)
-            return self._read_on(TRANSITIONS, table)
+            actions = self._removing_actions(active, ingests, rewritten, now_ms)
+            self.transact(table, actions, _make_locks(table, sorted(ingests)), operation)
+            return self._read_own_commit(TRANSITIONS, table)
 
         with self.discarded_on_failure(TRANSITIONS, rewritten):
-            version = self.again_on_conflict(attempt)
+            version = self.retry_on_conflict(attempt)
         return before[0], version
 
-    def _without(
+    def _removing_actions(
         self,
         active: Sequence[StoredFile],
         recordings: Collection[str],
@@ -377,7 +377,7 @@ class TableCommits(StoreReader):
             return table.version()
 
         with self.discarded_on_failure(name, made):
-            version = self.again_on_conflict(attempt)
+            version = self.retry_on_conflict(attempt)
         if version is None:
             self.discard_uncommitted(name, made)
         return version
@@ -415,16 +415,16 @@ class TableCommits(StoreReader):
             ]
             if actions:
                 self.transact(listing.table, actions, [])
-                self._read_on(name, listing.table)
+                self._read_own_commit(name, listing.table)
 
         if paths:
-            self.again_on_conflict(attempt)
+            self.retry_on_conflict(attempt)
 
     def transact(
         self,
         table: DeltaTable,
         actions: Sequence[AddAction | RemoveAction],
-        turns: Sequence[Transaction],
+        locks: Sequence[Transaction],
         operation: str = "restock ingest",
     ) -> None:
         """Commit to a table.
@@ -442,7 +442,7 @@ class TableCommits(StoreReader):
                 mode="append",
                 schema=table.schema(),
                 commit_properties=CommitProperties(
-                    custom_metadata={"operation_name": operation}, app_transactions=list(turns)
+                    custom_metadata={"operation_name": operation}, app_transactions=list(locks)
                 ),
             )
         except CommitFailedError:
@@ -452,7 +452,7 @@ class TableCommits(StoreReader):
                 raise  # `translate_errors` explains errors of S3
             raise unwritten(self.path, error) from error
 
-    def _still(self, instead_of: Mapping[str, str]) -> None:
+    def _expect_unchanged(self, instead_of: Mapping[str, str]) -> None:
         """Check that the store still has these ingests (recording -> ingest)."""
         if not instead_of:
             return
@@ -465,7 +465,7 @@ class TableCommits(StoreReader):
                     remedy="try again; the store keeps the result of the other command",
                 )
 
-    def again_on_conflict(self, work: Callable[[], T]) -> T:
+    def retry_on_conflict(self, work: Callable[[], T]) -> T:
         """Run `work`, which reads the table anew, up to ATTEMPTS times while others are faster."""
         for attempt in range(ATTEMPTS):
             try:
@@ -484,7 +484,7 @@ class TableCommits(StoreReader):
         )
 
 
-def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str]:
+def _own_paths(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str]:
     """Return the own paths of these recordings' ingests in the files."""
     return [
         own_path(one.recording_id, one.ingest_id)
@@ -494,7 +494,7 @@ def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str
     ]
 
 
-def _turns(table: DeltaTable, recordings: Sequence[str]) -> list[Transaction]:
+def _make_locks(table: DeltaTable, recordings: Sequence[str]) -> list[Transaction]:
     """Return transaction ids that make concurrent changes of one of these recordings conflict."""
     return [
         Transaction(app, (table.transaction_version(app) or 0) + 1)

@@ -29,11 +29,11 @@ from restock.ingest.store.lineage import (
     StoredFile,
     StoreReader,
     active_files,
-    by_system,
     damage_named,
     damage_remedy,
     frame_files,
-    held_by,
+    is_system_error,
+    read_stored_file,
     stored_files,
 )
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
@@ -43,7 +43,7 @@ OPERATION = "restock store compact --drop-damaged"
 READ_AT_ONCE = 4  # files that are read in parallel; each has one row group in memory
 VERIFIED = "verified.json"  # in a store: path of an undamaged file -> [bytes, write time in ns]
 Files = Mapping[str, list[StoredFile]]  # table name -> its readable files
-_TOLD = (
+_LOST_COLUMNS = (
     *("recording_id", "ingest_id", "ingested_at"),
     *("source_file", "transitions", "corrections"),
 )
@@ -99,7 +99,7 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
     for name in (TRANSITIONS, RECORDINGS):  # rows first: only manifests of remaining rows are kept
         table = store.path.open_table(name)
         rows = {path: count or 0 for path, count, *_ in active_files(table)}
-        broken = _damaged(store.path, _below(name, rows))
+        broken = _find_damaged(store.path, _in_table(name, rows))
         damaged = [path.removeprefix(f"{name}/") for path in broken]
         readable[name] = stored_files(store.path, name, table, without=damaged)
         for path in damaged:
@@ -112,7 +112,7 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
             else:
                 done.dropped.append(f"{name}/{path}")
                 lost_rows += rows[path] if name == TRANSITIONS else 0
-    done.lost = _lost(store.path, readable, done.dropped)
+    done.lost = _find_lost(store.path, readable, done.dropped)
     if any(path.startswith(f"{RECORDINGS}/") for path in done.dropped):
         named = sum(one.transitions for one in done.lost if one.corrections is not None)
         done.unnamed_transitions = max(0, lost_rows - named)
@@ -153,9 +153,9 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
         StoreError: a file cannot be read for a reason other than damage.
     """
     stamps = _stamps(place)
-    known = _remembered(place, stamps)
+    known = _read_verified(place, stamps)
     unread = [path for path in paths if again or path not in known]
-    damaged = _damaged(place, unread)
+    damaged = _find_damaged(place, unread)
     if unread:
         for path in unread:
             known.pop(path, None)
@@ -167,7 +167,7 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
 
 def unverified_files(place: Location, paths: Iterable[str]) -> int:
     """Count the files among these that `verify_files` would read."""
-    known = _remembered(place, _stamps(place))
+    known = _read_verified(place, _stamps(place))
     return sum(path not in known for path in paths)
 
 
@@ -196,7 +196,7 @@ def _stamps(place: Location) -> dict[str, list[int]]:
     }
 
 
-def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, list[int]]:
+def _read_verified(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, list[int]]:
     """Return the stamps of files that passed an earlier check and have not changed since."""
     try:
         with place.reading(VERIFIED) as source:
@@ -207,7 +207,7 @@ def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, l
     return {path: stamp for path, stamp in stamps.items() if reported.get(path) == stamp}
 
 
-def _damaged(place: Location, paths: Sequence[str]) -> list[str]:
+def _find_damaged(place: Location, paths: Sequence[str]) -> list[str]:
     """Return the damaged files among these."""
     with ThreadPoolExecutor(READ_AT_ONCE) as pool:
         broken = pool.map(lambda path: is_damaged(place, path), paths)
@@ -230,7 +230,7 @@ def is_damaged(place: Location, path: str) -> bool:
         except (FileNotFoundError, pa.ArrowInvalid):
             return True
         except OSError as error:
-            if by_system(error):
+            if is_system_error(error):
                 raise
             return True
 
@@ -240,19 +240,19 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
 
     The list is empty if one of them is gone or damaged, or if they lack some of the file's rows.
     """
-    paths = _joined_from(place, name, path)
-    if any(is_damaged(place, one) for one in _below(name, paths)):
+    paths = _find_joined_files(place, name, path)
+    if any(is_damaged(place, one) for one in _in_table(name, paths)):
         return []
     there = [one for file in readable[TRANSITIONS] for one in file.ingests]
     known = {one.recording_id for one in there}  # also those that were ingested again since
     reported = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
-    untold = {one.ingest_id for one in there} - reported
+    unlisted = {one.ingest_id for one in there} - reported
     found = []
-    for file in (held_by(place, name, one) for one in paths):
+    for file in (read_stored_file(place, name, one) for one in paths):
         kept = [
             one
             for one in file.ingests
-            if (one.recording_id not in known if name == TRANSITIONS else one.ingest_id in untold)
+            if (one.recording_id not in known if name == TRANSITIONS else one.ingest_id in unlisted)
         ]
         if kept:
             found.append(file._replace(rows=sum(one.rows for one in kept), ingests=tuple(kept)))
@@ -260,7 +260,7 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
     return found if complete else []
 
 
-def _joined_from(place: Location, name: str, path: str) -> list[str]:
+def _find_joined_files(place: Location, name: str, path: str) -> list[str]:
     """Return the files that were removed by the commit that added this file, from Delta's log.
 
     The list is empty if the log no longer has that commit.
@@ -288,7 +288,7 @@ def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredF
     return replaced
 
 
-def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
+def _find_lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
     """Return the recordings that have rows but no manifest, or a manifest but no rows.
 
     A manifest without rows may also be from a writer between its two commits: ingesting its
@@ -296,15 +296,15 @@ def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[Lost
     """
     manifests: dict[str, dict[str, Any]] = {}
     for file in readable[RECORDINGS] if dropped else ():
-        rows = place.read(f"{RECORDINGS}/{file.path}", columns=_TOLD).to_pylist()
+        rows = place.read(f"{RECORDINGS}/{file.path}", columns=_LOST_COLUMNS).to_pylist()
         held = {one.ingest_id for one in file.ingests}
         manifests |= {row["ingest_id"]: row for row in rows if row["ingest_id"] in held}
     lost: dict[str, LostRecording] = {}
     if any(path.startswith(f"{RECORDINGS}/") for path in dropped):
         for file in readable[TRANSITIONS]:
-            if untold := [one for one in file.ingests if one.ingest_id not in manifests]:
+            if unlisted := [one for one in file.ingests if one.ingest_id not in manifests]:
                 sources = _source_files(place, file)
-                for one in untold:
+                for one in unlisted:
                     lost[one.recording_id] = LostRecording(
                         one.recording_id, sources[one.ingest_id], one.rows, None
                     )
@@ -326,5 +326,5 @@ def _source_files(place: Location, file: StoredFile) -> dict[str, str]:
     return dict(zip(*(rows[name].to_pylist() for name in names), strict=True))
 
 
-def _below(name: str, paths: Sequence[str] | Mapping[str, object]) -> list[str]:
+def _in_table(name: str, paths: Sequence[str] | Mapping[str, object]) -> list[str]:
     return [f"{name}/{path}" for path in paths]

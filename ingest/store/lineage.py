@@ -86,7 +86,7 @@ def stored_files(
     for path, rows, size, added_ms in adds:
         if (key := (path, size or 0, added_ms or 0)) in found:
             continue
-        if own := _named(path, rows):
+        if own := _parse_own_path(path, rows):
             found[key] = StoredFile(path, own[0].rows, *key[1:], own)
         else:
             new.append(key)
@@ -136,11 +136,11 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
     return files
 
 
-def held_by(place: Location, name: str, path: str) -> StoredFile:
+def read_stored_file(place: Location, name: str, path: str) -> StoredFile:
     """Read which ingests a file of a table has, active or not. Raises as `stored_files`."""
     with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
         rows = open_parquet(source).metadata.num_rows
-    if own := _named(path, rows):
+    if own := _parse_own_path(path, rows):
         return StoredFile(path, rows, 0, 0, own)
     return StoredFile(path, rows, 0, 0, *_read(place, name, path))
 
@@ -159,12 +159,12 @@ def damage_named(place: Location, path: str) -> Iterator[None]:
             + ("is missing" if missing else f"cannot be read: {first_line(error)}"),
             where=str(place),
             remedy="make the file readable: it may be undamaged"
-            if by_system(error) or isinstance(error, pa.ArrowNotImplementedError)
+            if is_system_error(error) or isinstance(error, pa.ArrowNotImplementedError)
             else damage_remedy(place, path),
         ) from error
 
 
-def by_system(error: BaseException) -> bool:
+def is_system_error(error: BaseException) -> bool:
     """Return whether a file could not be read because of its permissions or the disk.
 
     Errors of Parquet's reader have no errno. Errors of S3 have become a StoreError before.
@@ -202,7 +202,7 @@ def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
     return pa.table(dict(zip(names, arrays, strict=True)))
 
 
-def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
+def _parse_own_path(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
     """Return the ingest that a file's name gives; None if it gives none or `rows` is unknown."""
     ids = OWN_PATH.fullmatch(path)
     return (Ingest(ids[1], ids[2], rows),) if ids and rows is not None else None
@@ -214,8 +214,8 @@ def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bo
     where = f"{name}/{path}"
     with damage_named(place, where), place.reading(where) as source:
         file = open_parquet(source)
-        if said := (file.schema_arrow.metadata or {}).get(INGESTS):
-            listed = tuple(Ingest(*one) for one in json.loads(said))
+        if packed := (file.schema_arrow.metadata or {}).get(INGESTS):
+            listed = tuple(Ingest(*one) for one in json.loads(packed))
             if sum(one.rows for one in listed) == file.metadata.num_rows:
                 return listed, True
         counts: Counter[tuple[str | None, str | None]] = Counter()
@@ -305,7 +305,7 @@ class StoreReader:
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
         """
-        one = self._listing(TRANSITIONS).by_recording.get(recording_id) if self._made() else None
+        one = self._listing(TRANSITIONS).by_recording.get(recording_id) if self._exists() else None
         if one is None:
             return None
         path = self._listing(RECORDINGS).paths.get(one.ingest_id, [own_path(*one[:2])])[-1]
@@ -379,7 +379,7 @@ class StoreReader:
         import pyarrow.compute as pc  # slow to import
 
         own = own_path(recording_id, ingest_id)
-        files = self._listing(TRANSITIONS).paths.get(ingest_id, []) if self._made() else []
+        files = self._listing(TRANSITIONS).paths.get(ingest_id, []) if self._exists() else []
         if files in ([], [own]):  # replaced and uncommitted rows are at the own path, too
             with damage_named(self.path, f"{TRANSITIONS}/{own}"), suppress(FileNotFoundError):
                 return self.path.read(f"{TRANSITIONS}/{own}")
@@ -394,7 +394,7 @@ class StoreReader:
         reported = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
         return with_ends(rows, reported.get(ingest_id))
 
-    def _made(self) -> bool:
+    def _exists(self) -> bool:
         """Return whether there is a table of transitions. Raises as `has_table` does."""
         return TRANSITIONS in self._listings or self.path.has_table(TRANSITIONS)
 
@@ -426,13 +426,13 @@ class StoreReader:
     def _listing(self, name: str) -> _Listing:
         """Return the listing of a table's newest version; reopen the table after new commits."""
         known = self._listings.get(name)
-        if known is None or self.path.goes_on(name, known.table):
-            return self._listed(name, self.path.open_table(name))
+        if known is None or self.path.has_new_commits(name, known.table):
+            return self._update_listing(name, self.path.open_table(name))
         if known.at[1] != known.table.version():  # after a commit by this store itself
-            return self._listed(name, known.table)
+            return self._update_listing(name, known.table)
         return known
 
-    def _listed(self, name: str, table: DeltaTable) -> _Listing:
+    def _update_listing(self, name: str, table: DeltaTable) -> _Listing:
         """Return the listing of a table that was just opened or updated, and cache it."""
         known, at = self._listings.get(name), (str(table.metadata().id), table.version())
         if known is None or known.at != at:
@@ -441,7 +441,7 @@ class StoreReader:
             self._listings[name] = known
         return known
 
-    def _read_on(self, name: str, table: DeltaTable) -> int:
+    def _read_own_commit(self, name: str, table: DeltaTable) -> int:
         """Update a table after a commit by this store, and return its new version."""
         before = table.version()
         table.update_incremental()
@@ -451,7 +451,7 @@ class StoreReader:
 
     def shown(self, version: Version | None = None) -> list[Ingest]:
         """Return the ingests whose transitions are in the store."""
-        if not self._made():
+        if not self._exists():
             return []
         held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
         return list({one.ingest_id: one for one in held}.values())

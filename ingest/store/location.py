@@ -249,12 +249,12 @@ class Location:
                 where=self.text,
             ) from error
 
-    def goes_on(self, name: str, table: DeltaTable) -> bool:
+    def has_new_commits(self, name: str, table: DeltaTable) -> bool:
         """Return whether a table that was read has newer commits, or was replaced meanwhile."""
         version = table.version()
         if self.folder is not None:  # looking for the next commit's file takes a hundredth
-            here, after = (f"{name}/{LOG}/{one:020}.json" for one in (version, version + 1))
-            return (self.folder / after).exists() or not (self.folder / here).exists()
+            current, following = (f"{name}/{LOG}/{one:020}.json" for one in (version, version + 1))
+            return (self.folder / following).exists() or not (self.folder / current).exists()
         with self.translate_errors():
             table.update_incremental()
         return bool(table.version() != version)
@@ -339,7 +339,7 @@ class Location:
         `list.field` reads only that field of a list of structs. Raises as `read` does.
         """
 
-        def is_asked(leaf: str) -> bool:
+        def is_requested(leaf: str) -> bool:
             # The path parts between a list and its field have other names with each writer.
             names = leaf.split(".")
             return names[0] in columns or f"{names[0]}.{names[-1]}" in columns
@@ -347,7 +347,7 @@ class Location:
         with self.reading(path) as file:
             whole = open_parquet(file)
             leaves = [whole.schema.column(number).path for number in range(len(whole.schema))]
-            read = [leaf for leaf in leaves if is_asked(leaf)]
+            read = [leaf for leaf in leaves if is_requested(leaf)]
             for group in range(whole.num_row_groups):
                 yield with_plain_text(whole.read_row_group(group, read))
 

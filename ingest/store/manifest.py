@@ -266,10 +266,10 @@ def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
     """Return the labels' version for these rules and corrections."""
     if not corrections:
         return rules
-    said = sorted(
+    content = sorted(
         (c.condition, c.value, c.episode_index, c.first_ns, c.last_ns) for c in corrections
     )
-    digest = hashlib.blake2b(msgspec.json.encode(said), digest_size=4).hexdigest()
+    digest = hashlib.blake2b(msgspec.json.encode(content), digest_size=4).hexdigest()
     return f"{rules}+{digest}"
 
 
@@ -300,7 +300,7 @@ def merged(
     return [*kept, *given]
 
 
-def lay_over(
+def correct_labels(
     rows: pa.Table,
     corrections: Sequence[Correction],
     conditions: Sequence[Condition],
@@ -314,26 +314,26 @@ def lay_over(
     rows any more. It then changes nothing, and is kept.
     """
     moments, known = Moments.of(rows, clock_offset_ns), [c.name for c in conditions]
-    said: dict[str, Ints] = {}  # condition -> (N,) 1: it holds, 0: it does not, -1: no verdict
+    verdicts: dict[str, Ints] = {}  # condition -> (N,) 1: it holds, 0: it does not, -1: no verdict
     counted = []
     for correction in corrections:
         covered = np.zeros(len(rows), np.bool_)
         if correction.condition in known:
             covered = moments.covered(correction)
-            values = said.setdefault(correction.condition, np.full(len(rows), -1, np.int64))
+            values = verdicts.setdefault(correction.condition, np.full(len(rows), -1, np.int64))
             values[covered] = int(correction.value)
         counted.append(replace(correction, rows=int(covered.sum())))
-    if said and len(rows):
-        rows = _with_labels(rows, said, conditions)
+    if verdicts and len(rows):
+        rows = _with_labels(rows, verdicts, conditions)
     version = corrected_version(rules_of(rows["labels_version"][0].as_py()), corrections)
     return replaced(rows, {"labels_version": version}), counted
 
 
 def _with_labels(
-    rows: pa.Table, said: Mapping[str, Ints], conditions: Sequence[Condition]
+    rows: pa.Table, verdicts: Mapping[str, Ints], conditions: Sequence[Condition]
 ) -> pa.Table:
     labels = held(rows["conditions"], [condition.name for condition in conditions])
-    for name, values in said.items():
+    for name, values in verdicts.items():
         labels[name] = np.where(values < 0, labels[name], values > 0)
     every = np.arange(len(rows))
     new: dict[str, Any] = {
@@ -341,14 +341,14 @@ def _with_labels(
         "conditions": names_of(labels, every),
     }
     open_to_doubt = held(rows["uncertain"], [condition.name for condition in conditions])
-    for name, values in said.items():
+    for name, values in verdicts.items():
         open_to_doubt[name] &= values < 0
     new["uncertain"] = names_of(open_to_doubt, every)
-    new["probabilities"] = _certain(rows["probabilities"].combine_chunks(), said)
+    new["probabilities"] = _set_certain(rows["probabilities"].combine_chunks(), verdicts)
     return replaced(rows, new)
 
 
-def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArray:
+def _set_certain(probabilities: pa.MapArray, verdicts: Mapping[str, Ints]) -> pa.MapArray:
     """Set probabilities of corrected conditions to 1 or 0, in rows that have a probability."""
     ends = np.asarray(probabilities.offsets)
     first, count = int(ends[0]), int(ends[-1] - ends[0])
@@ -356,7 +356,7 @@ def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArra
     keys = probabilities.keys.slice(first, count)
     items = np.array(probabilities.items.slice(first, count), np.float32)
     named = np.asarray(keys, object)
-    for name, values in said.items():
+    for name, values in verdicts.items():
         entry = np.flatnonzero(named == name)
         value = values[row[entry]]
         items[entry[value >= 0]] = value[value >= 0]
@@ -471,8 +471,8 @@ def events(holds: Bools, joined: Bools) -> Ints:
     `joined` (N,) marks the steps that follow the one before in the same episode.
     """
     begins = holds & ~np.concatenate([[False], holds[:-1] & joined[1:]])
-    goes_on = np.concatenate([holds[1:] & joined[1:], [False]])
-    return np.stack([np.flatnonzero(begins), np.flatnonzero(holds & ~goes_on) + 1], axis=1)
+    continues = np.concatenate([holds[1:] & joined[1:], [False]])
+    return np.stack([np.flatnonzero(begins), np.flatnonzero(holds & ~continues) + 1], axis=1)
 
 
 def widened(holds: Bools, joined: Bools, reach: int) -> Bools:

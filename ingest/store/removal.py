@@ -59,8 +59,8 @@ def remove_recordings(
             again meanwhile; the store cannot be written. Nothing is removed.
     """
     store.expect_store()
-    live = sorted(store.live().to_pylist(maps_as_pydicts="strict"), key=_by_path)
-    chosen = _chosen(live, names, str(store.path))
+    live = sorted(store.live().to_pylist(maps_as_pydicts="strict"), key=_path_key)
+    chosen = _choose(live, names, str(store.path))
     removed = [
         RemovedRecording(
             row["recording_id"],
@@ -80,22 +80,22 @@ def remove_recordings(
     return Removed(removed, left, before, version)
 
 
-def _by_path(row: Mapping[str, Any]) -> tuple[str, str]:
+def _path_key(row: Mapping[str, Any]) -> tuple[str, str]:
     return row["source_file"], row["recording_id"]
 
 
-def _chosen(
+def _choose(
     live: Sequence[dict[str, Any]], names: Iterable[str], where: str
 ) -> list[dict[str, Any]]:
     """Return the named manifest rows, or raise StoreError for ambiguous and unknown names."""
     chosen: dict[str, dict[str, Any]] = {}
     problems = []
     for name in dict.fromkeys(names):
-        found = _named(live, name)
+        found = _find_named(live, name)
         if len(found) == 1:
             chosen[found[0]["recording_id"]] = found[0]
         else:
-            problems.append(_problem(live, name, found))
+            problems.append(_explain(live, name, found))
     if problems:
         raise StoreError(
             "\n    ".join(["nothing was removed:", *problems]),
@@ -104,10 +104,10 @@ def _chosen(
             f" {PREFIX_DIGITS} digits) or its path; `restock sql {quoted(where)}"
             ' "SELECT recording_id, source_file FROM recordings"` lists them',
         )
-    return sorted(chosen.values(), key=_by_path)
+    return sorted(chosen.values(), key=_path_key)
 
 
-def _named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+def _find_named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     """Find the recordings that a name fits: by id or exact path, else by the path's end."""
     digits = name.lower()
     if len(digits) == ID_DIGITS and (found := [r for r in live if r["recording_id"] == digits]):
@@ -128,7 +128,7 @@ def _absolute(path: str) -> str:
     return os.path.normpath(Path(path).absolute())
 
 
-def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:
+def _explain(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:
     """Explain why a name does not select exactly one recording, and list candidates."""
     if found:
         what = f"{name!r} is the name of {len(found)} recordings"

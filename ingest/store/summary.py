@@ -305,10 +305,10 @@ class RepeatedDrive:
     @property
     def is_part(self) -> bool:
         """Return whether the new recording has (nearly) all that the stored one has, and more."""
-        return self.the_less and self.held >= NEARLY_ALL
+        return self.has_less and self.held >= NEARLY_ALL
 
     @property
-    def the_less(self) -> bool:
+    def has_less(self) -> bool:
         """Return whether the stored recording has less of the drive than the new one."""
         return self.share_of_other > self.share
 
@@ -400,12 +400,12 @@ def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive |
     The median shift between their stamps is subtracted. Rows whose stamps then differ by more than
     half a control period do not count as the same.
     """
-    mine, at = distinctive(rows)
-    theirs, there = distinctive(other)
-    _, here, where = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
-    if not len(here):
+    mine, my_rows = distinctive(rows)
+    theirs, their_rows = distinctive(other)
+    _, first, second = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
+    if not len(first):
         return None
-    later = _stamps(rows)[at[here]] - _stamps(other)[there[where]]
+    later = _stamps(rows)[my_rows[first]] - _stamps(other)[their_rows[second]]
     shift = np.sort(later)[len(later) // 2]
     same = int((np.abs(later - shift) <= period_s * 1e9 / 2).sum())
     least = min(len(mine), len(theirs))

@@ -162,7 +162,7 @@ def packed(table: pa.Table) -> bytes:
     return base64.b64encode(sink.getvalue())
 
 
-_OF_ONE_VALUE = ("recording_id", *(column.name for column in PROVENANCE))
+_CONSTANT_COLUMNS = ("recording_id", *(column.name for column in PROVENANCE))
 _SECTORS = "sector_clearance_m"  # the only signal with several numbers per step
 
 
@@ -219,17 +219,17 @@ def recording_table(
     for group in groups(episodes):
         rows = yield from episode_rows(profile, steps, episodes, group)
         made = transitions(profile, steps, episodes, rows, provenance)
-        tables.append(_sharing(made, same))
+        tables.append(_share_constants(made, same))
         del made
         ends.append(rows.ends_table())
         # Signals take most of the memory.
         parts.append(replace(rows, signals={}, custom=rows.custom.select([])))
         done(int(rows.tick.max()) + 1)
     metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
-    return _joined(tables).replace_schema_metadata(metadata), EpisodeRows.join(parts)
+    return _join(tables).replace_schema_metadata(metadata), EpisodeRows.join(parts)
 
 
-def _joined(tables: list[pa.Table]) -> pa.Table:
+def _join(tables: list[pa.Table]) -> pa.Table:
     """Join the groups' rows to one table, and empty `tables`.
 
     Each column is copied to new memory: a group's columns lie between arrays that are no longer
@@ -241,16 +241,16 @@ def _joined(tables: list[pa.Table]) -> pa.Table:
     for place, name in enumerate(schema.names):
         parts = [chunk for part in columns[place] for chunk in part.chunks]
         whole = pa.chunked_array(parts, schema.field(place).type)
-        shared = name in WIDE or name in _OF_ONE_VALUE
+        shared = name in WIDE or name in _CONSTANT_COLUMNS
         columns[place] = whole if shared else whole.combine_chunks()
         del parts, whole
     pa.default_memory_pool().release_unused()
     return pa.table(columns, schema=schema)
 
 
-def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
+def _share_constants(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
     """Let all groups share the memory of columns that have one value in the whole recording."""
-    for name in _OF_ONE_VALUE:
+    for name in _CONSTANT_COLUMNS:
         longest = same.setdefault(name, rows[name])
         if len(longest) < len(rows):
             same[name] = rows[name]

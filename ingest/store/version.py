@@ -147,11 +147,11 @@ def _problem_of_commit(file: Path) -> str | None:
         return "is damaged: it is not a Delta commit"
     if not actions:
         return "is empty"
-    said = actions[0].get("commitInfo")
-    if len(actions) == 1 and isinstance(said, dict):
-        ours = str(said.get("operation_name", "")).startswith("restock")
+    info = actions[0].get("commitInfo")
+    if len(actions) == 1 and isinstance(info, dict):
+        ours = str(info.get("operation_name", "")).startswith("restock")
         # Others write commits that change nothing.
-        if ours or said.get("operation") in ("ADD COLUMN", "CREATE TABLE"):
+        if ours or info.get("operation") in ("ADD COLUMN", "CREATE TABLE"):
             return "is truncated: it does not list its changes"
     return None
 
@@ -239,8 +239,8 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
         StoreError: the table uses a feature that Restock cannot read.
     """
     protocol = table.protocol()
-    requested = protocol.min_reader_version, _LISTED_READER, protocol.reader_features
-    for feature, what in _asked(table, *requested, _BY_READER_VERSION, "minReaderVersion"):
+    required = protocol.min_reader_version, _LISTED_READER, protocol.reader_features
+    for feature, what in _features(table, *required, _BY_READER_VERSION, "minReaderVersion"):
         if feature not in _READ:
             raise _unreadable(what, _name(table), where)
 
@@ -252,13 +252,13 @@ def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) ->
         StoreError: the table uses a feature that Restock cannot write.
     """
     protocol = table.protocol()
-    requested = protocol.min_writer_version, _LISTED_WRITER, protocol.writer_features
-    for feature, what in _asked(table, *requested, _BY_WRITER_VERSION, "minWriterVersion"):
+    required = protocol.min_writer_version, _LISTED_WRITER, protocol.writer_features
+    for feature, what in _features(table, *required, _BY_WRITER_VERSION, "minWriterVersion"):
         if feature not in _WRITTEN and (feature != "appendOnly" or removing):
             raise _unwritable(what, _name(table), where)
 
 
-def _asked(
+def _features(
     table: DeltaTable,
     version: int,
     newest: int,

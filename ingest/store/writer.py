@@ -256,7 +256,7 @@ class StoreWriter(TableCommits):
             StoreError: one was ingested again or removed in the meantime, or other writers were
                 faster too many times. The store is unchanged.
         """
-        versions = self.take_out(ingests, operation)
+        versions = self.remove_rows(ingests, operation)
         self.remove(RECORDINGS, {own_path(*ids) for ids in ingests.items()})
         return versions
 
@@ -412,10 +412,10 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
     """
     store.expect_store()
     done = Compacted()
-    groups = list(_groups(store))
+    groups = list(_group_files(store))
     files = store.files(TRANSITIONS)
     done.files_before = done.files_after = len(files)
-    changed = _changed(store, files)
+    changed = _find_changed(store, files)
     if dry_run:
         done.rows = sum(file.rows for group in groups for file in group)
         done.files_after -= sum(len(group) - 1 for group in groups)
@@ -539,10 +539,10 @@ def _summarise(store: StoreWriter, lacking: Sequence[Ingest], made: dict[str, pa
     for one in lacking:
         with suppress(FileNotFoundError):  # replaced meanwhile
             rows = store.rows(one.recording_id, one.ingest_id)
-            made[one.ingest_id] = summarised(_of(manifests, one), rows)
+            made[one.ingest_id] = summarised(_manifest_of(manifests, one), rows)
 
 
-def _of(manifests: pa.Table, one: Ingest) -> pa.Table:
+def _manifest_of(manifests: pa.Table, one: Ingest) -> pa.Table:
     import pyarrow.compute as pc  # slow to import
 
     return manifests.filter(pc.equal(manifests["ingest_id"], one.ingest_id))
@@ -560,11 +560,11 @@ def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
     for one in gone:
         path = f"{RECORDINGS}/{own_path(one.recording_id, one.ingest_id)}"
         with written_whole(store.path, path):
-            kept = _of(manifests, one)
+            kept = _manifest_of(manifests, one)
             store.path.write(kept, path, **parquet_options(kept.schema))
 
 
-def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
+def _find_changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
     """Return the ingests in these files whose rows their manifests may no longer describe."""
     names = pa.schema([("ingest_id", pa.string()), ("transitions", pa.int64())])
     reported = store.manifests([one for file in files for one in file.ingests], names)
@@ -572,7 +572,7 @@ def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
     return set(changed_by_others(files, written))
 
 
-def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
+def _group_files(store: StoreWriter) -> Iterator[list[StoredFile]]:
     """Group small files of transitions to join, ordered by robot, then time.
 
     A file that another tool wrote may form a group alone.
