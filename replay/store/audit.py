@@ -264,7 +264,7 @@ def check_thresholds(
             likely = get_close_matches(name, used, n=1, cutoff=0.9 if others else 0.6)
             if others and not likely and name not in AUDITS:
                 continue
-            remedy = _instead(name, likely, f"the audits are {', '.join(used)}")
+            remedy = _suggest(name, likely, f"the audits are {', '.join(used)}")
             raise ConfigError(f"no audit named {name!r}", where="thresholds", remedy=remedy)
         if unknown := sorted(table.keys() - used[name]):
             names = ", ".join(sorted(used[name])) or "none"
@@ -272,13 +272,13 @@ def check_thresholds(
             raise ConfigError(
                 f"{name}.{unknown[0]} is not a threshold of this audit",
                 where="thresholds",
-                remedy=_instead(unknown[0], likely, f"its thresholds are {names}"),
+                remedy=_suggest(unknown[0], likely, f"its thresholds are {names}"),
             )
         for key, value in table.items():
             _check_value(f"{name}.{key}", value, shipped.get(name, {}).get(key), "thresholds")
 
 
-def _instead(name: str, likely: Sequence[str], known: str) -> str:
+def _suggest(name: str, likely: Sequence[str], known: str) -> str:
     if name in AUDITS:
         return AUDITS[name]
     return f"did you mean {likely[0]!r}?" if likely else known
@@ -375,7 +375,7 @@ def recommend_capacity(
         )
     install_named(connection, "capacity_curve capacity_needed")
 
-    def ask() -> tuple[list[dict[str, Any]], tuple[Any, ...]]:
+    def run() -> tuple[list[dict[str, Any]], tuple[Any, ...]]:
         curve = rows_of(connection, "FROM capacity_curve()")
         needed = connection.execute(
             "FROM capacity_needed($cells, $episodes)",
@@ -383,7 +383,7 @@ def recommend_capacity(
         )
         return curve, needed.fetchall()[0]
 
-    curve, (cells, for_cells, for_episodes) = interruptible(connection, ask)
+    curve, (cells, for_cells, for_episodes) = interruptible(connection, run)
     if not curve:
         raise StoreError("it holds no transitions", remedy="`restock ingest` recordings first")
     rows = curve[-1]["capacity"]

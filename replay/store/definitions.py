@@ -44,14 +44,14 @@ UNITS = (
 
 def view_docs() -> dict[str, str]:
     """Return the description of each view, by name, in the order of columns.toml."""
-    return {name: table["doc"] for name, table in _read().items() if name != "shared"}
+    return {name: table["doc"] for name, table in _read_docs().items() if name != "shared"}
 
 
 def column_docs() -> dict[tuple[str, str], str]:
     """Return (view, column) -> meaning; ("shared", column) is for views that do not define it."""
     meanings = {
         (view, column): text
-        for view, table in _read().items()
+        for view, table in _read_docs().items()
         for column, text in table.items()
         if column != "doc"
     }
@@ -75,7 +75,7 @@ def unit(column: str) -> str:
 def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     """Create the view `columns`, which lists the views that exist and their columns."""
     docs, own_units = column_docs(), {}
-    for name, own_unit, meaning, topic, path in _custom(connection):
+    for name, own_unit, meaning, topic, path in _custom_signals(connection):
         docs["transitions", name] = meaning or f"{path} of {topic}"
         own_units["transitions", name] = own_unit
     for view, column in [key for key in docs if key[0] == "transitions"]:
@@ -105,7 +105,7 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     connection.register("columns", pa.Table.from_pylist(rows, schema=schema))
 
 
-def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
+def _custom_signals(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
     """Return the custom signals of the store's profiles: name, unit, meaning, topic and path."""
     has = connection.sql(
         "SELECT 1 FROM duckdb_columns() WHERE table_name = 'recordings' AND column_name = 'signals'"
@@ -118,7 +118,7 @@ def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
     ).fetchall()
 
 
-def _read() -> dict[str, dict[str, str]]:
+def _read_docs() -> dict[str, dict[str, str]]:
     text = (files("restock.replay.store") / "columns.toml").read_text(encoding="utf-8")
     tables: dict[str, dict[str, str]] = tomllib.loads(text)
     return tables
@@ -209,7 +209,7 @@ class Definitions:
         self._tables = dict(tables or {})
         self._connection, self.summaries = connection, summaries
         self._statements = dict(
-            _statements(_of_store(observation_type, (*VIEWS, FRAMES_SQL, *MACROS)))
+            _statements(_read_store_sql(observation_type, (*VIEWS, FRAMES_SQL, *MACROS)))
         )
         if summaries:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
@@ -218,7 +218,7 @@ class Definitions:
         self._replaced[("same_drives",)] = partial(install_same_drives, connection)
         self.made: set[str] = set()
         self._held: list[str] = []
-        _OF[connection] = ref(self)
+        _DEFINITIONS[connection] = ref(self)
         make_on_demand(connection, self)
 
     def make(self, text: str) -> None:
@@ -299,7 +299,7 @@ class Maker(Protocol):
 
 
 # Values are weak too: a Definitions refers to its store, and with it to the connection.
-_OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDictionary()
+_DEFINITIONS: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDictionary()
 _MAKERS: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Maker]] = WeakKeyDictionary()
 
 
@@ -309,46 +309,46 @@ def make_on_demand(connection: duckdb.DuckDBPyConnection, maker: Maker) -> None:
 
 
 def _maker(connection: duckdb.DuckDBPyConnection) -> Maker | None:
-    made = _MAKERS.get(connection)
-    return None if made is None else made()
+    reference = _MAKERS.get(connection)
+    return None if reference is None else reference()
 
 
-def _of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
-    made = _OF.get(connection)
-    return None if made is None else made()
+def _definitions_of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
+    reference = _DEFINITIONS.get(connection)
+    return None if reference is None else reference()
 
 
 def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
     """Create the views that a query names, if the connection has a maker (stores, recordings)."""
-    if (made := _maker(connection)) is not None:
-        made.make(text)
+    if (maker := _maker(connection)) is not None:
+        maker.make(text)
 
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
     """Keep views that many of these queries use in memory while the block runs them."""
-    made = _of(connection)
-    if made is None:
+    owner = _definitions_of(connection)
+    if owner is None:
         yield
         return
     named = [view for view in HELD_OF_MANY if sum(view in text for text in texts) > 1]
     try:
         try:
-            made.hold([*_held(connection, made), *named])
+            owner.hold([*_views_to_hold(connection, owner), *named])
         except duckdb.Error:  # unreadable rows are reported by the queries that need them
-            made.release()
+            owner.release()
             if was_interrupted():
                 raise
         yield
     finally:
-        made.release()
+        owner.release()
 
 
-def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
+def _views_to_hold(connection: duckdb.DuckDBPyConnection, owner: Definitions) -> list[str]:
     """Return the views to keep in memory for a store of this size."""
     rows = stored_rows(connection)
     return [
-        *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
+        *(HELD_SUMMARIES if owner.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
         *(HELD if 0 < rows <= FEW_ROWS else ()),
     ]
 
@@ -360,31 +360,31 @@ def stored_rows(connection: duckdb.DuckDBPyConnection) -> int:
 
 def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
     """Return whether a connection is a store's, and the store has no transitions."""
-    return connection in _OF and not stored_rows(connection)
+    return connection in _DEFINITIONS and not stored_rows(connection)
 
 
 def is_own(connection: duckdb.DuckDBPyConnection, view: str) -> bool:
     """Return whether a name is a store's view, and not one that a query created in its place."""
-    made = _of(connection)
-    if made is None:
+    owner = _definitions_of(connection)
+    if owner is None:
         return False
-    if view not in made.made:  # it will be created when a query names it
+    if view not in owner.made:  # it will be created when a query names it
         return True
     views = "SELECT 1 FROM duckdb_views() WHERE view_name = $1"
     return bool(connection.execute(views, [view]).fetchall())
 
 
-def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
+def install_all(connection: duckdb.DuckDBPyConnection) -> bool:
     """Create all views; return False if the connection has no maker."""
-    made = _maker(connection)
-    if made is not None:
-        made.make_all()
-    return made is not None
+    maker = _maker(connection)
+    if maker is not None:
+        maker.make_all()
+    return maker is not None
 
 
 def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
     """Create the views of COMMON in the current schema, which must have a store's tables."""
-    connection.execute("\n".join(_statements(_of_store(observation_type, COMMON)).values()))
+    connection.execute("\n".join(_statements(_read_store_sql(observation_type, COMMON)).values()))
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
@@ -397,7 +397,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
 
 def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
     """Create the macro `repeated_rows` over any `transitions`; a store's needs no scan of rows."""
-    if connection in _OF:
+    if connection in _DEFINITIONS:
         install_named(connection, "repeated_rows")
     else:
         connection.execute(definitions(names=["shared_rows.sql", "repeated_rows.sql"]))
@@ -405,7 +405,7 @@ def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
 
 def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
     """Create the table `novelty` over any `transitions`; a store may have it saved already."""
-    if connection in _OF:
+    if connection in _DEFINITIONS:
         install_named(connection, "novelty")
     else:
         from restock.replay.store.novelty import read_novelty  # pyarrow.compute is slow to import
@@ -413,12 +413,12 @@ def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
         connection.register("novelty", read_novelty(connection))
 
 
-def _of_store(observation_type: str, names: Sequence[str]) -> str:
+def _read_store_sql(observation_type: str, names: Sequence[str]) -> str:
     text = definitions(observation_type, names)
     return text.replace(_INGESTS, _INGESTS.replace("transitions", "ingests"))
 
 
-def made_by(name: str) -> list[str]:
+def names_created_in(name: str) -> list[str]:
     """Return the names of the views and macros that an SQL file creates."""
     return list(_statements(definitions(names=[name])))
 

@@ -148,24 +148,24 @@ def kept_novelty(store: Store) -> pa.Table:
     """
     if _is_kept(store):
         return store.path.read(KEPT)
-    table = read_novelty(store.connection).replace_schema_metadata(_mark(store))
+    table = read_novelty(store.connection).replace_schema_metadata(_fingerprint(store))
     with suppress(OSError, StoreError):
         store.path.write(table, KEPT)
     return table
 
 
-def at_hand(store: Store) -> bool:
+def is_quick(store: Store) -> bool:
     """Return whether the novelty of a store's rows was measured, or can be within seconds."""
     return stored_rows(store.bare) <= QUICK_ROWS or _is_kept(store)
 
 
 def _is_kept(store: Store) -> bool:
     with suppress(OSError, StoreError, pa.ArrowException):
-        return bool(store.path.read_schema(KEPT).metadata == _mark(store))
+        return bool(store.path.read_schema(KEPT).metadata == _fingerprint(store))
     return False
 
 
-def _mark(store: Store) -> dict[bytes, bytes]:
+def _fingerprint(store: Store) -> dict[bytes, bytes]:
     of = repr((REFERENCE, NEAREST, NOVEL_SHARE, sorted(store.files["stored_transitions"])))
     return {b"of": blake2b(of.encode(), digest_size=16).hexdigest().encode()}
 
@@ -209,7 +209,7 @@ def novel_rows(store: Store) -> dict[str, Any]:
     return dict(line)
 
 
-def novel_rows_said(found: Mapping[str, Any]) -> str:
+def explain_novel_rows(found: Mapping[str, Any]) -> str:
     """Return a sentence that explains the result of `novel_rows`."""
     return (
         f"Novel rows are the {NOVEL_SHARE:.0%} whose observations are furthest from those of other"

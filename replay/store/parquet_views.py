@@ -144,10 +144,10 @@ def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | Non
     named = _FILE.search(text)
     if named and (Path(named["store"]) / TRANSITIONS / "_delta_log").is_dir():
         missing = not (Path(named["store"]) / named["file"]).exists()
-        said = "is missing" if missing else f"cannot be read: {first_line(error)}"
+        problem = "is missing" if missing else f"cannot be read: {first_line(error)}"
         place = Location.of(named["store"])
         return StoreError(
-            f"its file {named['file']} {said}",
+            f"its file {named['file']} {problem}",
             where=str(place),
             remedy=damage_remedy(place, named["file"]),
         )
@@ -256,7 +256,7 @@ class StoredTable:
         schema = pa.schema(
             [field.with_type(_TEXT) if field.name in DOCUMENTS else field for field in self.schema]
         )
-        bare = []
+        parts = []
         for path in self.paths:
             place = f"{self.table}/{path}"
             with damage_named(self.place, place):
@@ -264,8 +264,8 @@ class StoredTable:
             kinds = pa.schema([schema.field(name) for name in part.column_names])
             if part.schema.types != kinds.types:  # other tools write text as views or large strings
                 part = part.cast(kinds)
-            bare.append(part.replace_schema_metadata(None))
-        return pa.concat_tables([schema.empty_table(), *bare], promote_options="default")
+            parts.append(part.replace_schema_metadata(None))
+        return pa.concat_tables([schema.empty_table(), *parts], promote_options="default")
 
 
 def manifest_tables(
@@ -311,8 +311,8 @@ def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFil
         for file in stored_files(place, RECORDINGS, recordings)
         if any(one.ingest_id in wanted for one in file.ingests)
     ]
-    here = {one.ingest_id for file in active for one in file.ingests}
-    ingests = (one for ingest_id, one in wanted.items() if ingest_id not in here)
+    active_ids = {one.ingest_id for file in active for one in file.ingests}
+    ingests = (one for ingest_id, one in wanted.items() if ingest_id not in active_ids)
     gone = sorted({own_path(one.recording_id, one.ingest_id) for one in ingests})
     infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
     found = [path for path, info in zip(gone, infos, strict=True) if info.is_file]

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import duckdb
 
 from restock.errors import QueryError, StoreError
-from restock.replay.store.definitions import install_every, install_named, is_own
+from restock.replay.store.definitions import install_all, install_named, is_own
 from restock.replay.store.parquet_views import damage
 
 T = TypeVar("T")
@@ -83,14 +83,14 @@ def query(
             " gone after them",
         )
     install_named(connection, text)
-    if any(_by_commas(connection, statement.query) for statement in statements):
+    if any(_joins_by_commas(connection, statement.query) for statement in statements):
         connection.execute("SET disabled_optimizers = ''")
     try:
         for statement in statements[:-1]:
-            _named(connection, partial(connection.execute, statement)).fetchall()
-        relation = _named(connection, partial(connection.sql, statements[-1].query))
+            _with_all_views(connection, partial(connection.execute, statement)).fetchall()
+        relation = _with_all_views(connection, partial(connection.sql, statements[-1].query))
     except duckdb.Error as error:
-        raise _translated(error, where, connection) from error
+        raise _translate(error, where, connection) from error
     if relation is None:
         raise QueryError(
             "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
@@ -118,7 +118,7 @@ def _pivots(statement: duckdb.Statement) -> bool:
     return statement.type.name == "MULTI" and _PIVOT.match(statement.query) is not None
 
 
-def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
+def _joins_by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
     """Return whether the query joins tables by commas.
 
     In the written order, such tables could become a cross join. So the caller lets DuckDB choose
@@ -128,7 +128,7 @@ def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
     return '"ref_type":"CROSS"' in tree
 
 
-def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
+def _with_all_views(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
     """Run the job; if a table is not found, create all views of the store and run it again.
 
     This serves queries that build a view's name from parts, and DuckDB's suggestions for misspelt
@@ -137,7 +137,7 @@ def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
     try:
         return job()
     except duckdb.CatalogException:
-        if not install_every(connection):
+        if not install_all(connection):
             raise
         return job()
 
@@ -178,7 +178,7 @@ def fetch(
             count = len(rows) if len(rows) <= at_most else len(relation)
             return _distinct(relation.columns), rows[:at_most], count
         except duckdb.Error as error:
-            raise _translated(error, where, connection) from error
+            raise _translate(error, where, connection) from error
 
     return interruptible(connection, run)
 
@@ -197,7 +197,7 @@ def write_parquet(
         try:
             relation.write_parquet(str(path))
         except duckdb.Error as error:
-            raise _translated(error, where, connection) from error
+            raise _translate(error, where, connection) from error
 
     interruptible(connection, run)
 
@@ -270,15 +270,15 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
                 raise
 
 
-def _translated(
+def _translate(
     error: duckdb.Error, where: str, connection: duckdb.DuckDBPyConnection
 ) -> QueryError | StoreError:
     """Turn DuckDB's error into one about the query, or about a file that it failed to read."""
     remedy = hint(error)
     if (near := _nearest(error, connection)) and remedy:
         remedy = f"the nearest names are {near}; {remedy}"
-    said = QueryError(_message(error), where=where, remedy=remedy)
-    return damage(error, where=where) or said
+    failure = QueryError(_message(error), where=where, remedy=remedy)
+    return damage(error, where=where) or failure
 
 
 _NO_TABLE = re.compile(r"Table with name (.+?) does not exist!")

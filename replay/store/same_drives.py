@@ -35,24 +35,24 @@ def install_shared_rows(
     `manifests(columns)` reads columns of all manifests, and is called twice. `recordings` maps each
     ingest whose rows count to its recording; `rows` is the number of their rows.
     """
-    observed = MetTwice(rows)
-    for _, _, each in _of_ingests(manifests(("ingest_id", CONTENT)), recordings):
-        observed.add(each.field("content").to_numpy())
+    repeats = RepeatFilter(rows)
+    for _, _, rows_of in _distinctive_rows(manifests(("ingest_id", CONTENT)), recordings):
+        repeats.add(rows_of.field("content").to_numpy())
     names: list[str] = []
     parts: dict[str, list[Ints]] = {"recording": [], "transition_id": [], "content": []}
-    for of_ingests, ingest, each in _of_ingests(manifests(("ingest_id", ROWS)), recordings):
-        at = np.flatnonzero(observed.maybe(each.field("content").to_numpy()))
-        parts["recording"].append(ingest[at] + len(names))
+    for ids, recording, rows_of in _distinctive_rows(manifests(("ingest_id", ROWS)), recordings):
+        at = np.flatnonzero(repeats.may_repeat(rows_of.field("content").to_numpy()))
+        parts["recording"].append(recording[at] + len(names))
         for name in ("transition_id", "content"):
-            parts[name].append(each.field(name).to_numpy()[at])
-        names += of_ingests
-    del observed
+            parts[name].append(rows_of.field(name).to_numpy()[at])
+        names += ids
+    del repeats
     found = {
         name: np.concatenate([np.empty(0, np.int64), *several]) for name, several in parts.items()
     }
     kept = occurs_again(found["content"])
-    recording = _named(names, found.pop("recording")[kept])
-    shared = {"recording_id": recording} | {name: values[kept] for name, values in found.items()}
+    ids_of_rows = _take_names(names, found.pop("recording")[kept])
+    shared = {"recording_id": ids_of_rows} | {name: values[kept] for name, values in found.items()}
     # A DuckDB table, so that joins know that it is the small side.
     connection.register("found_shared_rows", pa.table(shared))
     connection.execute(
@@ -62,12 +62,12 @@ def install_shared_rows(
     connection.unregister("found_shared_rows")
 
 
-class MetTwice:
+class RepeatFilter:
     """Hash filter that finds which of up to `count` numbers occur more than once.
 
-    First `add` all numbers, then call `maybe` with each. The filter takes four to eight bytes per
-    number, and does not store the numbers. It reports all numbers that occur more than once, and up
-    to a quarter of those that occur once.
+    First `add` all numbers, then call `may_repeat` with each. The filter takes four to eight bytes
+    per number, and does not store the numbers. It reports all numbers that occur more than once,
+    and up to a quarter of those that occur once.
     """
 
     def __init__(self, count: int) -> None:
@@ -78,7 +78,7 @@ class MetTwice:
 
     def add(self, values: NDArray[np.integer]) -> None:
         """Mark these 64-bit numbers, (n,)."""
-        for part in _stretches(values):
+        for part in _split(values):
             place = self._places(part)
             number = np.arange(len(part), dtype=np.int32)
             low = place & (len(self._last) - 1)
@@ -88,9 +88,9 @@ class MetTwice:
             self._marks[place] |= 1
             self._marks[place[again]] = 3
 
-    def maybe(self, values: NDArray[np.integer]) -> Bools:
+    def may_repeat(self, values: NDArray[np.integer]) -> Bools:
         """Return whether each of these numbers, (n,), may occur more than once."""
-        result = [self._marks[self._places(part)] == 3 for part in _stretches(values)]
+        result = [self._marks[self._places(part)] == 3 for part in _split(values)]
         return np.concatenate([np.empty(0, np.bool_), *result])
 
     def _places(self, values: NDArray[np.integer]) -> Ints:
@@ -108,7 +108,7 @@ def occurs_again(values: Ints) -> Bools:
     return np.asarray(several[place] == values, np.bool_)
 
 
-def _of_ingests(
+def _distinctive_rows(
     manifests: Iterable[pa.Table], recordings: Mapping[str, str]
 ) -> Iterator[tuple[list[str], Ints, pa.StructArray]]:
     """Yield, per batch, recording ids, each row's index into them (n,), and distinctive rows (n,).
@@ -129,12 +129,12 @@ def _of_ingests(
             yield names, ingest, each
 
 
-def _named(names: Sequence[str], which: Ints) -> pa.DictionaryArray:
+def _take_names(names: Sequence[str], which: Ints) -> pa.DictionaryArray:
     """Return names by index, without `take`, as pyarrow.compute is slow to import."""
     return pa.DictionaryArray.from_arrays(pa.array(which, pa.int32()), pa.array(names, pa.string()))
 
 
-def _stretches(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
+def _split(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
     for begin in range(0, len(values), MARKED):
         yield values[begin : begin + MARKED]
 
@@ -204,8 +204,8 @@ def same_drives(rows: MovingRows) -> pa.Table:
     reported = (same >= MIN_ROWS) & (share >= MIN_SHARE)
     return pa.table(
         {
-            "recording_id": _named(rows.names, keys[reported] // count),
-            "same_as": _named(rows.names, keys[reported] % count),
+            "recording_id": _take_names(rows.names, keys[reported] // count),
+            "same_as": _take_names(rows.names, keys[reported] % count),
             "rows": same[reported],
             "share": share[reported],
             "later_s": shift[reported] / 1e9,
@@ -226,13 +226,13 @@ def _moving_rows(connection: duckdb.DuckDBPyConnection) -> MovingRows:
         stamp.append(batch.column("stamp_ns").to_numpy().copy())
     return MovingRows(
         [name for name, _ in named],
-        _joined(recording, np.int32),
-        _joined(content, np.uint64),
-        _joined(stamp, np.int64),
+        _join(recording, np.int32),
+        _join(content, np.uint64),
+        _join(stamp, np.int64),
     )
 
 
-def _joined(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
+def _join(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
     """Concatenate the parts and free them."""
     whole = np.concatenate([np.empty(0, kind), *parts])
     parts.clear()
@@ -247,10 +247,10 @@ def _distinctive(
     Return their recording, content and stamp (M,), sorted by content and recording. Also return
     the number of rows per recording (R,) whose content occurs only once in it.
     """
-    observed = MetTwice(len(rows.content))
-    observed.add(rows.content)
-    again = observed.maybe(rows.content)
-    del observed
+    repeats = RepeatFilter(len(rows.content))
+    repeats.add(rows.content)
+    again = repeats.may_repeat(rows.content)
+    del repeats
     alone = np.bincount(rows.recording[~again], minlength=len(rows.names))
     rows = MovingRows(rows.names, rows.recording[again], rows.content[again], rows.stamp_ns[again])
     order = np.argsort(rows.content, kind="stable")

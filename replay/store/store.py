@@ -46,7 +46,7 @@ from restock.replay.store.definitions import (
     Definitions,
     definitions,
     install_common,
-    made_by,
+    names_created_in,
 )
 from restock.replay.store.parquet_views import (
     StoredTable,
@@ -112,12 +112,12 @@ class Store:
         version = self.path.version if version is None else version
         if version is not None:
             expect("version", version, (int, datetime), "give a number, or a moment")
-        _expect(self.path)
+        _expect_store(self.path)
         transitions = self.path.open_table(TRANSITIONS, version)
         recordings = self.path.open_table(RECORDINGS)
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
-        self._asking = threading.RLock()  # held during the several calls of a query
+        self._query_lock = threading.RLock()  # held during the several calls of a query
         self.bare = duckdb.connect(
             config={
                 "temp_directory": self._spill.name,
@@ -228,7 +228,7 @@ class Store:
                 reads the result of an earlier query.
         """
         try:
-            with self._asking:
+            with self._query_lock:
                 self._definitions.make(text)
                 for check in self.checks:
                     check(text)
@@ -503,7 +503,7 @@ def is_store(path: str | Path | Location) -> bool:
     return all(place.has_table(name) for name in (TRANSITIONS, RECORDINGS))
 
 
-def _expect(place: Location) -> None:
+def _expect_store(place: Location) -> None:
     if is_store(place):
         return
     place.expect_both_tables()
@@ -519,7 +519,7 @@ def init_script(store: Store) -> str:
 
     It names the files of the open version by absolute paths: write it again after an ingest.
     """
-    beside = set(made_by(FRAMES_SQL))  # left out: their files belong to no Delta table
+    beside = set(names_created_in(FRAMES_SQL))  # left out: their files belong to no Delta table
     columns = ", ".join(
         "(" + ", ".join(literal(value) for value in row) + ")"
         for row in store.sql("FROM columns").fetchall()

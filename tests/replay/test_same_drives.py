@@ -14,8 +14,8 @@ from restock.replay.store.same_drives import (
     MIN_ROWS,
     MIN_SHARE,
     WITHIN_NS,
-    MetTwice,
     MovingRows,
+    RepeatFilter,
     occurs_again,
     same_drives,
 )
@@ -80,11 +80,11 @@ NUMBERS = st.integers(-(2**63), 2**63 - 1)
 @given(st.lists(st.lists(st.one_of(NUMBERS, st.integers(0, 9)), max_size=40), max_size=6))
 def test_none_that_comes_again_is_missed(parts):
     arrays = [np.array(part, np.int64) for part in parts]
-    observed = MetTwice(sum(map(len, parts)))
+    observed = RepeatFilter(sum(map(len, parts)))
     for part in arrays:
         observed.add(part)
     every = np.concatenate([np.empty(0, np.int64), *arrays])
-    maybe = np.concatenate([np.empty(0, np.bool_), *(observed.maybe(part) for part in arrays)])
+    maybe = np.concatenate([np.empty(0, np.bool_), *(observed.may_repeat(part) for part in arrays)])
     exact = occurs_again(every)
     assert exact.tolist() == [int((every == value).sum()) > 1 for value in every]
     assert not (exact & ~maybe).any()
@@ -94,8 +94,8 @@ def test_of_many_that_come_once_few_are_taken_for_others():
     count = 20 * MARKED + 5
     values = np.random.default_rng(0).integers(-(2**63), 2**63 - 1, count)
     copies = np.concatenate([values, values[:100], values[MARKED - 3 : MARKED + 3]])
-    observed = MetTwice(len(copies))
+    observed = RepeatFilter(len(copies))
     observed.add(copies)
-    maybe = observed.maybe(copies)
+    maybe = observed.may_repeat(copies)
     assert maybe[occurs_again(copies)].all()
     assert maybe.mean() < 0.25

@@ -57,7 +57,7 @@ class CoverageCommand:
     def run(self) -> None:
         """Ask, print, and write the page."""
         from restock.files import expect_file_place
-        from restock.replay.store.novelty import at_hand, novel_rows, novel_rows_said
+        from restock.replay.store.novelty import explain_novel_rows, is_quick, novel_rows
         from restock.replay.store.store import Store
 
         if self.out is None:
@@ -68,7 +68,7 @@ class CoverageCommand:
             output.say_unverified(store)
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             order = store.priority()
-            novel = novel_rows(store) if self.out or at_hand(store) else None
+            novel = novel_rows(store) if self.out or is_quick(store) else None
             if self.out is not None:
                 with output.progress("page", 3) as advance:
                     page = self._write(store, self.out, advance)
@@ -80,7 +80,7 @@ class CoverageCommand:
             lines = [_line(row) for row in rows + known]
             output.print_table(lines, title="rows that hold each condition")
             output.print_text(by_priority(order))
-            said = "Novelty was not measured yet." if novel is None else novel_rows_said(novel)
+            said = "Novelty was not measured yet." if novel is None else explain_novel_rows(novel)
             said += f" `restock trace {quoted(self.store)}` lists the strangest rows."
             output.print_text(said)
             if guessed := {r["condition"]: n for r in rows if (n := r["uncertain_recordings"])}:

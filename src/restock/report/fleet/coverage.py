@@ -13,7 +13,7 @@ from restock.replay.fleet.drift import Drift
 from restock.replay.fleet.shopping_list import readable
 from restock.replay.store.definitions import UNITS, install_named
 from restock.replay.store.definitions import unit as unit_of
-from restock.replay.store.novelty import novel_rows, novel_rows_said, strangest
+from restock.replay.store.novelty import explain_novel_rows, novel_rows, strangest
 from restock.replay.store.store import Store
 from restock.report.look import blocks, charts, floor_map
 from restock.report.look.blocks import (
@@ -176,7 +176,7 @@ def _strangest(store: Store, place: str) -> Section | None:
     return Section(
         "strangest",
         "What does no rule name?",
-        intro=f"{novel_rows_said(novel)} These are the strangest, one an episode, with"
+        intro=f"{explain_novel_rows(novel)} These are the strangest, one an episode, with"
         " the entries of the observation that are furthest from the nearest rows (their mean)."
         f" `restock trace {quoted(place)} ROW` follows one to its recording.",
         tables=[Table(shown)],
