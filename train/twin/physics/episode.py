@@ -1,8 +1,8 @@
 """An episode: its start, its goal, and the obstacles, patches and traffic on its route.
 
-`draw_episode` makes all of it from an `EpisodeSpec` alone, so an episode can be repeated, named
-in a table, and looked at again. Its kind is a module of `restock.train.twin.missions`.
-`describe_floor` and the checks below it tell which kinds of episodes fit on a floor.
+`draw_episode` draws all of it from an `EpisodeSpec`, so an episode can be repeated, listed in a
+table, and watched again. Its kind is a module of `restock.train.twin.missions`.
+`describe_floor` and the checks below it find which kinds of episodes fit on a floor.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from restock.train.twin.missions import KINDS, MISSIONS
 from restock.train.twin.missions.mission import length_m, point_along
 from restock.train.twin.physics.perturbation import Perturbation
 
-TURN_ROOM_M = 0.45  # that the body needs on both sides to turn on the spot
+TURN_ROOM_M = 0.45  # room on each side of the body's middle for a turn on the spot
 
 
-Way = tuple[float, float, float, float, float]  # start x, y, yaw, goal x, y: on the floor
+Way = tuple[float, float, float, float, float]  # start x, y, yaw, goal x, y in the floor's frame
 
 
 class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The settings that determine an episode. `perturbation` None: the environment's.
+    """The settings that determine an episode. `perturbation` None is the environment's.
 
-    `layout` is the name of a floor; None: the environment's, or the one of its floors that the seed
-    draws. `way` is where it starts and goes, instead of what the seed draws.
+    `layout` is the name of a floor; None is the environment's only floor, or one of its floors that
+    the seed draws. `way` is the start and goal; None: the seed draws them.
     """
 
     condition: str
@@ -70,7 +70,7 @@ class Episode:
 
 
 def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> Episode:
-    """Draw the episode that `spec` determines: the same spec always gives the same episode."""
+    """Draw the episode of a spec; on one floor, the same spec always gives the same episode."""
     entropy = [spec.seed, zlib.crc32(spec.condition.encode())]
     layout, noise = np.random.SeedSequence(entropy).spawn(2)
     rng = np.random.Generator(np.random.PCG64(layout))
@@ -92,12 +92,12 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
 
 
 def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode:
-    """Return the episode, its robot turned if its outline would stand in a rack or wall.
+    """Return the episode with its start turned or moved if the outline would hit a rack or wall.
 
-    `outline_m` (K, 2) are points on the outline, about the pose. Starts are drawn for the twin's
-    own robot. A longer one is turned along its way or the aisle, and if that is not enough it is
-    moved to the aisle's middle. A start without room for any of these is kept, and so is one that
-    was requested.
+    `outline_m` (K, 2) are points on the outline, relative to the pose. Starts are drawn for the
+    twin's own robot. A longer robot is turned along its route or the aisle; if that is not enough,
+    it is also moved to the aisle's middle. The start is kept if none of this makes room, or if the
+    spec's `way` set it.
     """
     if episode.spec.way is not None or _has_room(warehouse, outline_m, episode.start):
         return episode
@@ -119,7 +119,7 @@ def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode
 
 
 def _has_room(warehouse: Warehouse, outline_m: F64, pose: tuple[float, float, float]) -> bool:
-    """Return whether an outline (K, 2) at a pose stands in no rack or wall."""
+    """Return whether an outline (K, 2) at a pose is clear of all racks and walls."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
     corners = points[None, :, 0], points[None, :, 1]
@@ -158,7 +158,7 @@ def _draw_way(
 
 
 _NO_BOXES: F64 = np.empty((1, 0, 4))
-AISLE_ROOM_M = 0.1  # beside a robot in an aisle: a cell of the planner's
+AISLE_ROOM_M = 0.1  # minimum room beside a robot in an aisle: one cell of the planner
 
 
 def describe_floor(floor: Warehouse) -> dict[str, Any]:
@@ -239,7 +239,7 @@ def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehou
 
 
 def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
-    """Return the kinds of episodes that some floor has no room for -> names of those floors."""
+    """Return the kinds of episodes that do not fit on every floor -> names of the unfit floors."""
     unfit: dict[str, list[str]] = {}
     for floor in floors:
         for kind in KINDS:
@@ -249,7 +249,7 @@ def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
 
 
 def sealed(floors: Iterable[Warehouse]) -> list[str]:
-    """Return a line for each floor with unreachable goals, which its episodes never go to."""
+    """Return a line per floor with unreachable goals, which its episodes never use."""
     return [
         f"{floor.name}: {count} of {len(floor.goals)} goals cannot be reached from the others"
         for floor in floors
@@ -258,7 +258,7 @@ def sealed(floors: Iterable[Warehouse]) -> list[str]:
 
 
 def unreachable_goals(floor: Warehouse) -> int:
-    """Count goals that a robot cannot reach, and return from, from the part with most of them."""
+    """Count the goals without a way to and from the part of the floor that has most goals."""
     planner = Planner(floor)
     cells = np.array([planner.cell(x, y) for x, y in floor.goals])
     return len(cells) - int(np.bincount(planner.parts()[cells]).max())
@@ -266,7 +266,7 @@ def unreachable_goals(floor: Warehouse) -> int:
 
 @lru_cache(maxsize=1024)
 def fitting_kinds(floor: Warehouse) -> tuple[str, ...]:
-    """Return the kinds of episodes that fit on a floor with each of three seeds."""
+    """Return the kinds of episodes that can be drawn on a floor with each of three seeds."""
     planner = Planner(floor)
     return tuple(
         kind for kind in KINDS if all(_fits(kind, seed, floor, planner) for seed in range(3))

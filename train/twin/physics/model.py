@@ -1,10 +1,10 @@
-"""The MuJoCo model of the twin, built with MjSpec, and its robot tried on an empty floor.
+"""The MuJoCo model of the twin, built with MjSpec, and measurements of its robot.
 
 Pallets and traffic are mocap bodies, so that a layout is only a set of positions.
 
-Wheels' soft contacts sink a little into the floor, which a small wheel rolls slower for, and a
-robot whose wheels scrub turns slower than they say. Both are measured here once, so that every
-robot drives the speed that it is commanded, and its odometry says what it drives.
+Wheels sink a little into the floor through their soft contacts, which makes small wheels roll more
+slowly. A robot whose wheels scrub turns more slowly than its wheel speeds suggest. Both effects are
+measured here once, so that every robot drives at the commanded speed, and its odometry is right.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from restock.train.twin.physics.robot_model import (
 )
 from restock.train.twin.physics.robot_parts import add_robot, wheels_of
 
-# Of the mocap bodies (M, 3), in their order; a person is a cylinder.
+# Half sizes of the mocap bodies (M, 3), in the model's order; a person is a cylinder.
 MOVING_HALF_M = np.repeat(
     [PALLET_HALF_M, (PERSON_RADIUS_M, PERSON_RADIUS_M, PERSON_HALF_HEIGHT_M), FORKLIFT_HALF_M],
     [PALLETS, PEOPLE, FORKLIFTS],
@@ -61,26 +61,26 @@ class Handles:
     """The indices of the twin's parts in the model's arrays."""
 
     chassis_body: int
-    wheel_bodies: tuple[int, ...]  # left, right; of a front axle before those of a rear one
+    wheel_bodies: tuple[int, ...]  # left before right, front axle before rear axle
     wheel_geoms: tuple[int, ...]
-    wheel_qpos: tuple[int, ...]  # the angle of each in qpos, and its speed in qvel
-    wheel_qvel: tuple[int, ...]
-    steering_qpos: tuple[int, ...]  # of the front wheels that steer, left and right
+    wheel_qpos: tuple[int, ...]  # the wheels' angles
+    wheel_qvel: tuple[int, ...]  # the wheels' speeds
+    steering_qpos: tuple[int, ...]  # the angles of steered front wheels, left and right
     building: slice  # the geoms of racks and walls
-    pallets: slice  # of the mocap bodies
+    pallets: slice  # in the mocap bodies
     people: slice
     forklifts: slice
-    accelerometer: slice  # of sensordata
+    accelerometer: slice  # in sensordata
     bumper: int
 
 
 def build_model(
     warehouse: Warehouse, robot: RobotModel, timestep_s: float = 0.01, rack_slots: int | None = None
 ) -> tuple[mujoco.MjModel, Handles]:
-    """Build the compiled model. State: free joint of the chassis, left and right wheel hinge(s).
+    """Build the compiled model, whose state is the chassis' free joint and the wheels' joints.
 
-    With `rack_slots` there are boxes for so many racks: those that the floor has none for lie
-    `PARKED_RACK_M` away, to be placed by `building_boxes`.
+    It has `rack_slots` boxes for racks (None: one per rack of the floor). Boxes without a rack are
+    parked at `PARKED_RACK_M`.
     """
     spec = _spec(timestep_s)
     slots = len(warehouse.racks) if rack_slots is None else rack_slots
@@ -110,7 +110,7 @@ def _spec(timestep_s: float) -> Any:
     option.impratio = 10
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.noslip_iterations = 0
-    # One robot among a handful of boxes: both only cost time here (8 % and 3 % of a step).
+    # With one robot and few boxes, both only cost time (8 % and 3 % of a step).
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
     return spec
@@ -121,7 +121,7 @@ def building_boxes(
 ) -> tuple[F64, F64]:
     """Return centres and half sizes (rack_slots + 4, 3) of racks and walls, in model order.
 
-    They are no lower than a lidar needs to see them.
+    They are at least so high that the lidar sees them.
     """
     thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
     rack_z_m, wall_z_m = (
@@ -213,7 +213,7 @@ def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
 
 
 def passed_over(lidar_z_m: float) -> list[str]:
-    """Return the kinds of obstacles that a lidar at this height passes over, with their heights."""
+    """Return the kinds of obstacles, with heights, that a lidar at this height passes over."""
     heights = {
         "pallets": PALLET_HALF_M[2],
         "forklifts": FORKLIFT_HALF_M[2],
@@ -232,16 +232,15 @@ def yaw_of(quat: F64) -> F64:
 TIMESTEP_S = 0.01
 SETTLE_S, DRIVE_S = 1.0, 1.5
 MAX_TILT_RAD = 0.05
-MIN_OUTSIDE_M = 0.01  # that is said of a part
-TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, or as fast as its limits allow
+MIN_OUTSIDE_M = 0.01  # smaller overhangs are not reported
+TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, but at most half the robot's limits
 
 
 def robot_model(robot: Robot | None, body: Body) -> RobotModel:
     """Return the model of a profile's `[robot]`, or the stand-in if it has none.
 
     Raises:
-        ConfigError: a drive that the twin does not have, parts that do not go together, or a robot
-            that does not stand or drive.
+        ConfigError: the robot's parts do not fit together, or it does not stand, drive or turn.
     """
     return stand_in(body) if robot is None else _tried(_Key(robot, body))
 
@@ -265,7 +264,7 @@ def _tried(key: _Key) -> RobotModel:
     robot = _settled(design(key.robot, key.body))
     speed = min(TRY_SPEED, robot.speed_limit[0] / 2)
     ahead, _ = _driven(robot, speed, 0.0)
-    # It rolls on the middle of what its wheels sink in.
+    # Scale the contact spheres, which sink in, so that the robot rolls on its wheels' radius.
     radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_m(robot, ahead, speed)
     robot = _settled(replace(robot, contact_radius_m=radius))
     if robot.drive == "skid_steer" and key.robot.track_ratio is None:
@@ -279,14 +278,14 @@ def _tried(key: _Key) -> RobotModel:
 
 
 def _rolling_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
-    """Return its wheels' rolling radius, from how fast it drives at a commanded speed."""
+    """Return the wheels' rolling radius, from the driven and the commanded speed."""
     if not 0.5 * speed_mps < ahead_mps < 2 * speed_mps:
         raise _unfit(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
     return robot.wheel_radius_m * ahead_mps / speed_mps
 
 
 def _settled(robot: RobotModel) -> RobotModel:
-    """Return the robot with the height at which it comes to rest."""
+    """Return the robot with its measured height at rest, `rest_z_m`."""
     model = build_robot_alone(replace(robot, rest_z_m=robot.contact_radius_m), TIMESTEP_S)
     data = mujoco.MjData(model)
     _run(model, data, SETTLE_S)
@@ -390,7 +389,7 @@ def _driven(
     data = mujoco.MjData(model)
     data.qpos[2] = robot.rest_z_m
     steps = round(1.0 / TIMESTEP_S)
-    for step in range(steps):  # no faster than it accelerates
+    for step in range(steps):  # ramp up over 1 s, since no robot starts at its full speed
         share = np.array((step + 1) / steps)
         _control(robot, model, data, speed_mps * share, yaw_rate_radps * share)
         mujoco.mj_step(model, data)

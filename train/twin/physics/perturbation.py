@@ -1,7 +1,7 @@
-"""A perturbation: the difference of floor, robot and sensors from the nominal twin.
+"""Perturbations: how floor, robot and sensors differ from the nominal twin.
 
-Every field is a number with a unit and a range; the defaults are the nominal twin, which has
-small noise as every robot has.
+Every field but the name is a number with a unit and a range. The defaults are the nominal twin,
+which has a little noise, as every robot has.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ class Perturbation(Checked, frozen=True):
     """A set of effective parameters. `Perturbation()` is the nominal twin."""
 
     name: str = "nominal"
-    friction_scale: Annotated[float, Meta(ge=0.05, le=2)] = 1.0  # factor of the floor's .8
-    patch_friction_scale: Scale = 1.0  # factor of the friction of slippery patches
-    left_friction_scale: Scale = 1.0  # factor under the left wheel (a worn tyre)
+    friction_scale: Annotated[float, Meta(ge=0.05, le=2)] = 1.0  # factor on the floor's .8
+    patch_friction_scale: Scale = 1.0  # factor on the friction of slippery patches
+    left_friction_scale: Scale = 1.0  # factor on friction under the left wheels (a worn tyre)
     payload_kg: Annotated[float, Meta(ge=0, le=150)] = 0.0  # mass on top of the chassis
     wheel_radius_scale: NearOne = 1.0  # factor, unknown to controller and odometry
-    track_scale: NearOne = 1.0  # factor of the track, likewise unknown
+    track_scale: NearOne = 1.0  # factor, unknown to controller and odometry
     latency_s: UpToHalf = 0.05  # delay from a command to the wheels' set points
-    gain: Gain = 1.0  # factor of the wheels' set points
-    left_gain: Gain = 1.0  # additional factor of the left wheel's
+    gain: Gain = 1.0  # factor on the wheels' set points
+    left_gain: Gain = 1.0  # additional factor on the left wheels' set points
     slope_x: Slope = 0.0  # rise of the floor to the east, metres per metre
     slope_y: Slope = 0.0  # rise of the floor to the north
     lidar_noise_m: UpToFifth = 0.01  # standard deviation of a range
     lidar_dropout: Annotated[float, Meta(ge=0, le=0.9)] = 0.005  # share of beams without a return
-    lidar_period_s: UpToTwo = 0.0  # whole control steps; 0: a scan every step
-    localisation_period_s: UpToTwo = 0.0  # likewise, for poses
+    lidar_period_s: UpToTwo = 0.0  # rounded to whole control steps; 0: a scan every step
+    localisation_period_s: UpToTwo = 0.0  # rounded to whole control steps; 0: a pose every step
     localisation_noise_m: UpToFifth = 0.004  # standard deviation, drawn at every step
     localisation_drift_m: UpToHalf = 0.02  # standard deviation of an error that varies over 3 s
     localisation_yaw_noise_rad: UpToFifth = 0.004
@@ -54,10 +54,10 @@ class Perturbation(Checked, frozen=True):
     gyro_bias_radps: Annotated[float, Meta(ge=-0.5, le=0.5)] = 0.0
     accel_noise_mps2: UpToTwo = 0.05
     accel_bias_mps2: Annotated[float, Meta(ge=-2, le=2)] = 0.0
-    timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # one per vector environment
+    timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # the same in a vector environment
 
     def changed(self) -> dict[str, float]:
-        """Return the fields that differ from the nominal twin's, which every transition keeps."""
+        """Return the values that are not nominal; they are stored with every transition."""
         values = {field: getattr(self, field) for field in RANGES}
         return {field: value for field, value in values.items() if value != NOMINAL[field]}
 
@@ -142,7 +142,7 @@ def find_perturbation(given: str | Mapping[str, Any], *, where: str) -> Perturba
     return typed(values, Perturbation, where=source, remedy=_FIELDS)
 
 
-# Ready-made ones for evaluation: each changes one thing, by about what a fleet shows.
+# Built-in perturbations for evaluation. Each changes one thing, by about as much as in real fleets.
 PERTURBATIONS: dict[str, Perturbation] = {
     item.name: item
     for item in (

@@ -1,12 +1,12 @@
 """The robot that the twin builds from a profile's `[robot]`, and its grip on the floor.
 
-`stand_in` is the twin's own robot, which drives where a profile has no `[robot]`. `design` makes
-one from a profile's: what that leaves out follows from the outline's size, by what is usual among
-wheeled robots, and motors are as strong for their load as the stand-in's. How a designed robot
-stands, rolls and turns is then measured (`restock.train.twin.physics.model`).
+`stand_in` is the twin's own robot, used if a profile has no `[robot]`. `design` builds a robot from
+`[robot]`. Values that it omits are estimated from the outline's size, by what is usual for wheeled
+robots, and motors are as strong for their load as the stand-in's. How a designed robot stands,
+rolls and turns is then measured (`restock.train.twin.physics.model`).
 
-The parameters of wheels are measured, not guessed: stiff wheel contacts chatter when they slide and
-then do not converge with the timestep; these soft ones do (see docs/twin.md).
+The contact parameters of wheels are measured, not guessed. Stiff contacts chatter when they slide,
+and do not converge as the timestep gets smaller; these soft contacts do (see docs/twin.md).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FLOOR = [FLOOR_FRICTION, 0.005, 0.0001]  # sliding, torsion (m), rolling (m)
 SLIPPERY_BELOW = 0.3  # friction under which a wheel counts as on a patch
 SOFT = {"solref": [0.02, 1], "solimp": [0, 0.95, 0.004, 0.5, 2]}  # wheels and casters
 
-# Of geoms: lidar rays end at the first alone, and what stays hidden lies beyond the last.
+# Groups of geoms. Lidar rays hit only the first group; groups after the last are hidden.
 OBSTACLE_GROUP, ROBOT_GROUP, FLOOR_GROUP, DRAWN_GROUP = 0, 1, 2, 3
 
 
@@ -36,25 +36,25 @@ def _mask(kind: int, touches: int) -> dict[str, int]:
     return {"contype": kind, "conaffinity": touches}
 
 
-# What rolls touches the floor alone; the robot's outline touches all that stands and moves about.
+# Wheels and casters touch only the floor. The chassis touches racks, walls, pallets and traffic.
 FLOOR_MASK, ROLLING_MASK = _mask(1, 0), _mask(0, 1)
 OBSTACLE_MASK, CHASSIS_MASK = _mask(2, 0), _mask(0, 2)
 NO_MASK = _mask(0, 0)
 
 
 class FloorFriction:
-    """Friction under the wheels of N robots: the floor's, less on patches, and under worn tyres.
+    """Friction under the wheels of N robots: the floor's or a patch's, times a factor per wheel.
 
-    Friction is looked up at the wheels' places and written into the batch's geoms.
+    It is looked up at the wheels' positions and written into the batch's geoms.
     """
 
     def __init__(self, geom_friction: F64, wheel_geoms: Sequence[int], wheels_m: F64) -> None:
-        """`geom_friction` (N, geoms, 3) is the batch's; wheels stand at `wheels_m` (W, 2)."""
+        """Take the batch's `geom_friction` (N, geoms, 3) and the wheels' positions (W, 2)."""
         self._written, self._geoms, self._wheels_m = geom_friction, wheel_geoms, wheels_m
         count = len(geom_friction)
         self.patches = np.tile(NO_PATCH, (count, PATCHES, 1)).astype(np.float64)
-        self.base = np.full(count, FLOOR_FRICTION)  # of the floor, where no patch lies
-        self.scale = np.ones((count, len(wheels_m)))  # times it, under each wheel
+        self.base = np.full(count, FLOOR_FRICTION)  # of the floor outside patches
+        self.scale = np.ones((count, len(wheels_m)))  # factor under each wheel
         self.icy: Ints = np.zeros(0, np.int64)  # the environments that have patches
 
     def lay(self, env: int, patches: F64) -> None:
@@ -78,7 +78,7 @@ class FloorFriction:
         return np.asarray(friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9), np.bool_)
 
     def _wheel_points(self, pose: F64) -> F64:
-        """Return where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
+        """Return the positions (n, W, 2) of the wheels of robots at poses (n, 3)."""
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         x, y = self._wheels_m[:, 0, None], self._wheels_m[:, 1, None]
         points: F64 = pose[:, None, :2] + stacked(-sin, cos)[:, None] * y
@@ -88,8 +88,8 @@ class FloorFriction:
 def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
     """Return the friction (N, K) at points (N, K, 2), from patches (N, P, 5) and base (N,).
 
-    A patch row is x, y, half x, half y (metres) and its friction coefficient. Where patches overlap
-    the slipperiest counts.
+    A patch row is x, y, half x, half y (metres) and its friction coefficient. If patches overlap,
+    the most slippery one counts.
     """
     gap = np.abs(points_m[:, :, None, :] - patches[:, None, :, 0:2])  # (N, K, P, 2)
     inside = (gap <= patches[:, None, :, 2:4]).all(axis=-1)
@@ -98,7 +98,7 @@ def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
     return friction
 
 
-WHEEL_RADIUS_M = 0.10  # of the stand-in, as all of these
+WHEEL_RADIUS_M = 0.10  # of the stand-in, like all constants up to REST_Z_M
 TRACK_M = 0.44  # between the wheels' contact points
 CASTER_RADIUS_M = 0.04
 CASTER_X_M = 0.27
@@ -106,37 +106,37 @@ CASTER_KG = 0.5
 WHEEL_KG = 2.0
 CHASSIS_KG = 50.0
 CHASSIS_HEIGHT_M = 0.26
-CHASSIS_Z_M = 0.17  # of the middle of the chassis over the floor
+CHASSIS_Z_M = 0.17  # height of the chassis' middle above the floor
 LIDAR_Z_M = 0.22
 LIDAR_BEAMS = 72
 MOTOR_KV = 8.0
 MOTOR_LIMIT_NM = 18.0
 ARMATURE, DAMPING = 0.02, 0.05
 ACCEL_LIMIT = (4.0, 10.0)  # m/s2 and rad/s2
-REST_Z_M = 0.09756  # of the chassis frame, standing still
+REST_Z_M = 0.09756  # height of the chassis frame at rest
 
-USUAL_ACCEL = (2.5, 6.0)  # m/s2 and rad/s2, where nothing says
-STIFF = 8.0  # times the motors' gain: whose wheels scrub needs torque where speed is as commanded
-SCRUB = 1.5  # and this times their torque
-USUAL_STEERING_RADPS = 2.0  # how fast wheels steer, where nothing says
+USUAL_ACCEL = (2.5, 6.0)  # default limits, m/s2 and rad/s2
+STIFF = 8.0  # factor on motors' gain if wheels scrub, which takes torque at the commanded speed
+SCRUB = 1.5  # factor on motors' torque limit if wheels scrub
+USUAL_STEERING_RADPS = 2.0  # default limit of the steering rate
 
 
 @dataclass(frozen=True)
 class RobotModel:
     """A robot with two or four wheels; x is ahead of the axle, z above the floor.
 
-    Of a robot that steers (ackermann) the axle is the rear one, whose wheels are driven; of the
-    others with two it is the point halfway.
+    The axle of a robot that steers (ackermann) is the rear one, whose wheels are driven. For other
+    robots with two axles, it is the line halfway between them.
     """
 
     length_m: float
     width_m: float
     axle_x_m: float  # of the axle, ahead of the outline's middle
-    wheel_radius_m: float  # that it rolls on, and that its odometry believes
+    wheel_radius_m: float  # rolling radius, which odometry uses too
     contact_radius_m: float  # of the wheels' spheres, which sink into the floor a little
     track_m: float  # between the wheels' contact points
-    turn_track_m: float  # by which controller and odometry reckon turns
-    wheelbase_m: float  # between two axles; 0: there is one
+    turn_track_m: float  # effective track, from which controller and odometry compute turns
+    wheelbase_m: float  # between two axles; 0 if there is one
     wheel_kg: float
     chassis_kg: float
     chassis_height_m: float
@@ -153,7 +153,7 @@ class RobotModel:
     damping: float
     accel_limit: tuple[float, float]  # m/s2 and rad/s2 of the base controller's ramp
     speed_limit: tuple[float, float]  # m/s and rad/s
-    rest_z_m: float  # of the chassis frame, standing still
+    rest_z_m: float  # height of the chassis frame at rest
     drive: Drive = "differential"
     max_steering_rad: float = 0.0
     steering_rate_radps: float = 0.0
@@ -193,7 +193,7 @@ class RobotModel:
         return speed, (right_radps - left_radps) * (self.wheel_radius_m / self.turn_track_m)
 
     def by_side(self, wheels: F64) -> F64:
-        """Return values of the left and right side (N, 2), from those of the wheels (N, W)."""
+        """Return means of the left and right wheels (N, 2), only of the rear ones if it steers."""
         if self.steers:
             return wheels[:, 2:]
         return wheels if wheels.shape[1] == 2 else wheels.reshape(-1, 2, 2).mean(axis=1)
@@ -203,7 +203,7 @@ class RobotModel:
     def steering_for(self, motion: F64, held_rad: F64) -> F64:
         """Return steering angles (...) for speeds and yaw rates (..., 2); `held_rad` at a stop.
 
-        For a turn on the spot, which it cannot drive, it steers as far as it can.
+        A turn on the spot, which is impossible, gets the maximum angle.
         """
         speed, turn = motion[..., 0], motion[..., 1]
         rolls = np.abs(speed) > 1e-6
@@ -260,10 +260,10 @@ def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
 
 
 def design(robot: Robot, body: Body) -> RobotModel:
-    """Return a profile's robot as designed, before it was tried.
+    """Design a profile's robot; it is not yet tried in the physics.
 
     Raises:
-        ConfigError: parts that do not go together.
+        ConfigError: its parts do not fit together.
     """
     known = measures(robot, body)
     radius, track, mass = known.wheel_radius_m, known.track_m, known.mass_kg
@@ -275,7 +275,7 @@ def design(robot: Robot, body: Body) -> RobotModel:
     wheel_kg, caster_kg = 0.072 / wheels * mass, 0.009 * mass
     # The pose of a robot that steers is its rear axle's.
     behind = known.wheelbase_m / 2 if steers else 0.0
-    # As the stand-in's motors, by the load that they move: a share of it each.
+    # Motors are the stand-in's, scaled by the share of the load that each one moves.
     load = mass / (CHASSIS_KG + 2 * WHEEL_KG + 2 * CASTER_KG) * 2 / driven
     turning = load * (radius / WHEEL_RADIUS_M) ** 2
     low = 0.13 * height
@@ -316,11 +316,11 @@ def design(robot: Robot, body: Body) -> RobotModel:
 
 @dataclass(frozen=True)
 class Measures:
-    """The dimensions of a robot, by its profile or estimated from its outline."""
+    """The dimensions of a robot, from its profile or estimated from its outline."""
 
     wheel_radius_m: float
     track_m: float
-    wheelbase_m: float  # 0: there is one axle
+    wheelbase_m: float  # 0 if there is one axle
     mass_kg: float
     height_m: float
     casters_m: tuple[tuple[float, float], ...]
@@ -329,7 +329,7 @@ class Measures:
 
 
 def measures(robot: Robot, body: Body) -> Measures:
-    """Return a robot's measures; what its profile omits is estimated from its outline."""
+    """Return a robot's dimensions; those that its profile omits are estimated from its outline."""
     size = math.sqrt(body.length_m * body.width_m)
     height = robot.height_m or max(0.5 * size, 2.2 * (robot.wheel_radius_m or 0.0))
     # An action has no sideways speed, so an omnidirectional robot drives as a differential one.
@@ -352,7 +352,7 @@ def measures(robot: Robot, body: Body) -> Measures:
 
 
 def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
-    """Return beams' bearings: all around, short of a full turn, or else from end to end."""
+    """Return the beams' bearings, from end to end; of a full turn, the last is one step short."""
     span = lidar.angle_max_rad - lidar.angle_min_rad
     around = span > 2 * math.pi * (1 - 0.5 / beams)
     step = span / beams if around else span / (beams - 1)
@@ -360,7 +360,7 @@ def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
 
 
 def _refuse_misfit(robot: Measures, body: Body, axle_x_m: float) -> None:
-    """Raise ConfigError for parts that cannot be on one robot."""
+    """Raise ConfigError for parts that do not fit together."""
     problem = None
     if 2 * robot.wheel_radius_m > 1.5 * body.length_m:
         problem = f"wheels of radius {robot.wheel_radius_m:g} m are longer than the outline"

@@ -21,7 +21,7 @@ from restock.train.twin.physics.robot_model import (
     RobotModel,
 )
 
-# Divergence is counted and reported: MuJoCo shall not write MUJOCO_LOG.TXT where the user stands.
+# Divergence is counted and reported. MuJoCo must not write MUJOCO_LOG.TXT into the user's folder.
 _log = mujoco.MjLogConfig.get()
 _log.logto_file = False
 _log.set()
@@ -89,7 +89,7 @@ def add_robot(spec: Any, robot: RobotModel) -> None:
             condim=3,
             priority=3,
             friction=FLOOR,
-            group=DRAWN_GROUP + 1,  # hidden by default: the cylinder is what is drawn
+            group=DRAWN_GROUP + 1,  # hidden by default: the cylinder is drawn instead
             **SOFT,
             **ROLLING_MASK,
         )
@@ -158,12 +158,12 @@ def _add_sensors(spec: Any) -> None:
 
 
 class Wheels(NamedTuple):
-    """The wheels of a model: left before right, front before rear."""
+    """Indices of the wheels of a model: left before right, front before rear."""
 
     bodies: list[int]
-    geoms: list[int]  # that touch the floor
+    geoms: list[int]  # the spheres that touch the floor
     joints: list[int]
-    steering: list[int]  # joints of the front wheels that steer, left and right
+    steering: list[int]  # joints of steered front wheels, left and right
 
 
 def wheels_of(model: mujoco.MjModel, robot: RobotModel) -> Wheels:

@@ -1,18 +1,17 @@
 """Racks, pallets, people and forklifts around the robots, written into the batch.
 
-Racks and walls are geoms, placed again where an episode is on another floor; pallets, people and
+Racks and walls are geoms, which are moved if an episode is on another floor. Pallets, people and
 forklifts are mocap bodies.
 
-Traffic walks a given way once the robot comes near, and may not look out. An attentive person or
-forklift stops .5 m off the robot. An inattentive one walks on into the way of a robot that drives
-at it, and stops only before one that stands, turns or backs off. Whoever has waited for 2 s, or was
-touched, steps back and lets the robot pass. Movement is kinematic: traffic pushes the robot, not
-the reverse.
+A person or forklift moves along a given path once the robot comes near. An attentive one stops .5 m
+from the robot. An inattentive one keeps walking toward a robot that drives at it, and stops only
+before a robot that stands, turns or backs off. Whoever has waited for 2 s, or was touched, steps
+back and lets the robot pass. Movement is kinematic: traffic pushes the robot, not the reverse.
 
-Lidar beams are level, and everything on a floor stands upright: boxes, and people, who are
-cylinders. So ranges are found in the plane, by compiled code if it is there (`restock.native`),
-which asks of each shape only the beams that may meet it. Without it MuJoCo casts the rays, all
-against all; the distances are the same, to the rounding of the last bits.
+Lidar beams are level, and everything on a floor stands upright: boxes, and cylinders for people. So
+ranges are computed in the plane, by compiled code if it is in use (`restock.native`), which tests
+each shape only against the beams that may hit it. Otherwise MuJoCo casts every ray against every
+shape. The distances are the same up to rounding.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import MOVING_HALF_M, Handles, building_boxes
 from restock.train.twin.physics.robot_model import OBSTACLE_GROUP
 
-FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
-YIELD_M = 0.5
-STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
-RETREAT_M = 2.0  # how far off the robot a retreat ends
-DRIVEN_AT_MPS = 0.15  # closing speed from which on a robot counts as driving at someone
-WAIT_S = 2.0
+FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for a forklift in gaps to robots
+YIELD_M = 0.5  # gap at which an attentive agent stops
+STANDING_M = 0.15  # gap at which an inattentive agent stops before a robot that stands or backs off
+RETREAT_M = 2.0  # distance from the robot at which a retreat ends
+DRIVEN_AT_MPS = 0.15  # a robot that closes in faster than this drives at someone
+WAIT_S = 2.0  # then an agent retreats
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 _TRUCK_HALF_M = FORKLIFT_HALF_M[:2]
 _EACH = np.arange(AGENTS)
@@ -56,7 +55,7 @@ _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 class Traffic(Stateful):
     """The people and forklifts of N environments over time. Arrays are (N, AGENTS, ...)."""
 
-    # What changes on the way; ways and triggers are those of the episodes.
+    # What changes during an episode. The episode itself has the paths and triggers.
     STATE = (
         *("state", "travelled_m", "waited_s", "position_m", "heading_rad", "attentive"),
         "closest_m",
@@ -67,9 +66,9 @@ class Traffic(Stateful):
         self.body_half_m = np.array(body_half_m)
         self.radius_m = np.array([PERSON_RADIUS_M] * PEOPLE + [FORKLIFT_RADIUS_M] * FORKLIFTS)
         circle_m = [PERSON_RADIUS_M] * PEOPLE + [float(np.hypot(*_TRUCK_HALF_M))] * FORKLIFTS
-        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # of two middles that may touch
-        # In the episode so far, from the robot's outline: infinite where nobody is about, NaN where
-        # it is not measured, which takes time.
+        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # centres farther apart: a gap
+        # Smallest gap to the robot's outline in the episode so far: inf if nobody is there, NaN if
+        # it is not measured, because measuring takes time.
         self.closest_m = np.full(num_envs, np.nan)
         self.way_m = np.zeros((*shape, WAY_POINTS, 2))
         self.length_m = np.ones(shape)
@@ -84,7 +83,7 @@ class Traffic(Stateful):
         self.active = np.zeros(num_envs, np.bool_)  # whether the environment has any traffic
 
     def reset(self, env: int, walks: tuple[Walk | None, ...]) -> None:
-        """Set the ways of one environment's agents."""
+        """Set the paths of one environment's agents."""
         self.active[env] = any(walk is not None for walk in walks)
         self.state[env] = HIDDEN
         self.closest_m[env] = np.nan
@@ -100,10 +99,10 @@ class Traffic(Stateful):
         self._place(np.array([env]))
 
     def advance(self, robot: F64, velocity: F64, touched: Bools, elapsed_s: float) -> Ints:
-        """Move the agents for `elapsed_s`; return the environments where any are under way.
+        """Move the agents for `elapsed_s`; return the environments where any agent is under way.
 
-        `robot` (N, 3) is x, y, yaw, `velocity` (N, 2) in the map frame; `touched` (N,) says whose
-        bumper was pressed in the time before.
+        `robot` (N, 3) is x, y, yaw. `velocity` (N, 2) is in the map frame. `touched` (N,) are the
+        robots whose bumper was pressed in the previous block.
         """
         (ids,) = self.active.nonzero()
         if not len(ids):
@@ -126,13 +125,13 @@ class Traffic(Stateful):
         halted = walking & toward & (gap < look_out)
         waited = np.where(halted, self.waited_s[ids] + elapsed_s, 0.0)
         hit = touched[ids, None] & (gap < 0.2) & (walking | (state == RETREATING))
-        self.attentive[ids] = attentive | hit  # having been touched, one looks out
+        self.attentive[ids] = attentive | hit  # an agent that was touched is attentive from then on
         state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
         state[(state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward))] = WALKING
         retreating, length_m = state == RETREATING, self.length_m[ids]
         pace = np.where(retreating, -0.6, np.where((state == WALKING) & ~halted, 1.0, 0.0))
         travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
-        # Who is back at the start or at the end of the way leaves the floor, out of sight.
+        # Agents at the end of their path, or back at its start, leave the floor.
         state[((travelled >= length_m) & (gap > 1.0)) | ((travelled <= 0.0) & retreating)] = HIDDEN
         self.state[ids] = state
         self.waited_s[ids] = waited
@@ -151,7 +150,7 @@ class Traffic(Stateful):
         return gaps
 
     def _place(self, ids: Ints) -> None:
-        """Set positions by how far each agent has gone along its way."""
+        """Set positions from how far each agent has gone along its path."""
         shown = self.state[ids] != HIDDEN
         share = self.travelled_m[ids] / self.length_m[ids] * (WAY_POINTS - 1)
         first = share.astype(np.int64).clip(0, WAY_POINTS - 2)
@@ -162,7 +161,7 @@ class Traffic(Stateful):
         self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
 
     def note_closest(self, robot: F64) -> None:
-        """Note the agents' current distance to the outlines of robots at (N, 3): x, y, yaw."""
+        """Update `closest_m` with the agents' gaps to outlines of robots at (N, 3): x, y, yaw."""
         (ids,) = (self.active & ~np.isnan(self.closest_m)).nonzero()
         if not len(ids):
             return
@@ -178,12 +177,13 @@ class Traffic(Stateful):
         """Return the gap (n,) from robots' outlines to the nearest person or forklift.
 
         Args:
-            delta: from the robots' middles to theirs, (n, AGENTS, 2); yaw: the robots', (n, 1).
+            delta: vectors from the robots' centres to the agents, (n, AGENTS, 2).
+            yaw: headings of the robots, (n, 1).
         """
         gap = np.empty(delta.shape[:2])
         outside = _outside_m(_turned(delta[:, :PEOPLE], -yaw), self.body_half_m)
         gap[:, :PEOPLE] = outside - PERSON_RADIUS_M
-        # Two rectangles apart are nearest at a corner of one of them.
+        # Two separate rectangles are nearest to each other at a corner of one of them.
         turn, truck = (self.heading_rad[ids, PEOPLE:] - yaw)[..., None], np.array(_TRUCK_HALF_M)
         away = _turned(delta[:, PEOPLE:], -yaw)[:, :, None]
         corners = away + _turned(_CORNERS * truck, turn)
@@ -195,33 +195,33 @@ class Traffic(Stateful):
         return np.asarray(np.maximum(gap.min(axis=1), 0.0), np.float64)
 
     def _gap(self, delta: F64, yaw: F64) -> F64:
-        """Return gaps from agents' circles to robots' outlines, as `_outline_gap` takes them."""
+        """Return gaps (n, AGENTS) from agents' circles to outlines; arguments of `_outline_gap`."""
         gap: F64 = _outside_m(_turned(delta, -yaw), self.body_half_m) - self.radius_m
         return gap
 
 
 def _driven_at(delta: F64, velocity: F64) -> Bools:
-    """Return which agents (n, AGENTS) the robot approaches by driving at (n, 1, 2)."""
+    """Return which agents (n, AGENTS) a robot approaches with its velocity (n, 1, 2)."""
     x, y = delta[..., 0], delta[..., 1]
     closing = (x * velocity[..., 0] + y * velocity[..., 1]) / np.maximum(np.hypot(x, y), 1e-9)
     return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
 
 def _turned(vectors: F64, angle_rad: F64) -> F64:
-    """Turn vectors (..., 2) to the left by angles that broadcast against (...)."""
+    """Rotate vectors (..., 2) to the left by angles that broadcast against (...)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors[..., 0], vectors[..., 1]
     return stacked(cos * x - sin * y, sin * x + cos * y)
 
 
 def _outside_m(points: F64, half_m: F64) -> F64:
-    """Return the distance from a rectangle around 0 to points (..., 2); 0 inside."""
+    """Return the distance from a rectangle around the origin to points (..., 2); 0 inside."""
     outside = np.maximum(np.abs(points) - half_m, 0.0)
     return np.asarray(np.hypot(outside[..., 0], outside[..., 1]), np.float64)
 
 
 class Scenery(Stateful):
-    """The scenery of N warehouses. Arrays lead with the environment."""
+    """The scenery of N warehouses. The first axis of arrays is the environment."""
 
     STATE = ("walked", "traffic")
 
@@ -237,21 +237,21 @@ class Scenery(Stateful):
     ) -> None:
         """Build the scenery of N warehouses.
 
-        `moves` (N, substeps, 3 * nmocap) are the mocap positions of the coming block: written here,
-        read by the simulation.
+        `moves` (N, substeps, 3 * nmocap) are the mocap positions of the next block. The scenery
+        writes them, and the simulation reads them.
         """
         num_envs = len(moves)
         self.batch, self.handles, self.moves = batch, handles, moves
         self.traffic = Traffic(num_envs, robot_half_m)
         self.pallets = np.full((num_envs, PALLETS, 3), PARKED_M[0])
-        self.walked = np.zeros(0, np.int64)  # where traffic moved in the last block
+        self.walked = np.zeros(0, np.int64)  # environments whose traffic moved in the last block
         self.position_m = batch.bind("mocap_pos")  # (N, nmocap, 3) of pallets, people, forklifts
         self.quat = batch.bind("mocap_quat")
         self.buildings = [building_boxes(floor, rack_slots, lidar_z_m) for floor in floors]
-        self.floor = np.zeros(num_envs, np.int64)  # whose building stands
+        self.floor = np.zeros(num_envs, np.int64)  # floor whose racks and walls are placed
 
     def build(self, env: int, floor: int) -> None:
-        """Put up the racks and walls of a floor."""
+        """Place the racks and walls of a floor."""
         if floor == self.floor[env]:
             return
         self.floor[env] = floor
@@ -276,12 +276,11 @@ class Scenery(Stateful):
         self.stand_still(ids)
 
     def walk(self, ids: Ints) -> None:
-        """Move the traffic in `ids` to its current place by the end of the coming block.
+        """Move the traffic of `ids` to its current positions over the next block.
 
-        On the way there it moves a little at every substep: a jump of a block's length would
-        strike the robot like a hammer.
+        It moves a little at every substep: one jump per block would strike the robot like a hammer.
         """
-        self.stand_still(self.walked)  # who stood still since
+        self.stand_still(self.walked)  # in case it moves no more
         self.walked = ids
         if not len(ids):
             return
@@ -295,7 +294,7 @@ class Scenery(Stateful):
         self.moves[ids] = path.reshape(len(ids), substeps, -1)
 
     def stand_still(self, ids: Ints) -> None:
-        """Keep everything in `ids` in place during the coming block."""
+        """Keep everything in `ids` in place during the next block."""
         self.moves[ids] = self.position_m[ids].reshape(len(ids), 1, self.moves.shape[2])
 
     def restored(self) -> None:
@@ -316,7 +315,7 @@ def quaternion(yaw_rad: F64) -> F64:
     return stacked(np.cos(half), zero, zero, np.sin(half))
 
 
-FAR_AWAY = (1e9, 1e9, 1.0, 0.0, 0.1, 0.1)  # of a shape that the beams pass over or under
+FAR_AWAY = (1e9, 1e9, 1.0, 0.0, 0.1, 0.1)  # stands for a shape that beams pass over or under
 
 
 class Lidar:
@@ -334,7 +333,7 @@ class Lidar:
         self._first = np.cumsum([0, *(len(boxes) for boxes in standing)])
         self._standing = np.concatenate(standing)
         self._half_m = MOVING_HALF_M[:, :2].copy()  # of pallets, people and forklifts
-        self._half_m[scenery.handles.people, 1] = 0.0  # they are round
+        self._half_m[scenery.handles.people, 1] = 0.0  # marks a cylinder
 
     def _in_plane(self, middle: F64, half: F64) -> F64:
         """Return the boxes (G, 4) that the beams' plane cuts: x, y and half sizes."""
@@ -365,7 +364,7 @@ class Lidar:
         return ranges
 
     def _moved(self, ids: Ints) -> F64:
-        """Return pallets, people and forklifts (n, M, 6) for `compiled.ranges`."""
+        """Return x, y, cos, sin and half sizes (n, M, 6) of mocap bodies for `compiled.ranges`."""
         position, quat = self.scenery.position_m[ids], self.scenery.quat[ids]
         shapes = np.empty((*position.shape[:2], 6))
         shapes[..., :2] = position[..., :2]
@@ -377,7 +376,7 @@ class Lidar:
         return shapes
 
     def _cast(self, ids: Ints, place_m: F64, rays: F64) -> F64:
-        """Return the ranges as MuJoCo's ray casting finds them."""
+        """Return the ranges by MuJoCo's ray casting."""
         origin = np.full((len(ids), 1, 3), self.height_m)
         origin[:, 0, :2] = place_m
         level = np.zeros((*rays.shape[:2], 3))

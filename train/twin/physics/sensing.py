@@ -1,8 +1,8 @@
 """The robot's sensors: the signals of `restock.ingest.task.task` from the simulation.
 
-The functions that turn ranges into clearances and plans into waypoints are ingest's own; here are
-only the sensors: lidar, localisation, encoders, gyroscope, accelerometer and bumper, with the
-noise of a perturbation. All noise of an episode is drawn from its own seed, some steps at a time.
+Functions of ingest turn ranges into clearances, and plans into waypoints. This module has only the
+sensors: lidar, localisation, encoders, gyroscope, accelerometer and bumper, with the noise of a
+perturbation. All noise of an episode is drawn from the episode's own seed, some steps at a time.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from restock.train.twin.physics.robot_model import LIDAR_Z_M, stand_in
 from restock.train.twin.physics.scenery import Lidar
 from restock.train.twin.physics.simulation import Simulation
 
-FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
-DRIFT_TIME_S = 3.0
-WIDEST_GAP_RAD = np.radians(20)  # between two beams that pass nothing by
+FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: timestamps are never 0
+DRIFT_TIME_S = 3.0  # time constant of the localisation's drift
+WIDEST_GAP_RAD = np.radians(20)  # beams this near to each other miss nothing
 DRAWN = 60  # steps of an episode whose noise is drawn together
 _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 
@@ -55,37 +55,37 @@ class Sensing(Stateful):
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation, self.task = simulation, task
-        # Truth is told by the beams of the lidar that the twin has, also where the robot has none,
-        # if these see everything.
+        # The twin always simulates a lidar. If its beams see everything, they give the true
+        # clearance, even if the task has no lidar.
         self.beams = SectorMap.build(simulation.bearings_rad, max(task.sectors, 4), task.body)
         self._fine = FineLidar(simulation.bearings_rad + task.body.lidar_yaw_rad)
         self.tracker = Tracker(task, simulation.num_envs) if task.tracks else None
         self._around = None if _sees_everything(simulation) else _Around(simulation)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
-        self._drawn = np.full(num, steps)  # how many have their noise: all, until a reset
+        self._drawn = np.full(num, steps)  # steps whose noise is drawn; all of them until a reset
         self._generators = [np.random.default_rng(0)] * num
-        self._drift = np.zeros((num, 2))  # of the localised x and y, at the last of these
+        self._drift = np.zeros((num, 2))  # of the localised x and y, at the last drawn step
         self._scale = np.zeros((num, _SCALARS))
         self._bias = np.zeros((num, 3))  # of a wheel's speed, the gyroscope, the accelerometer
         self._scan_every = np.ones(num, np.int64)  # steps
         self._pose_every = np.ones(num, np.int64)
-        self.pose = np.zeros((num, 3))  # as localised last
-        self.pose_stamp_ns = np.zeros(num, np.int64)  # when that was
+        self.pose = np.zeros((num, 3))  # last localised pose
+        self.pose_stamp_ns = np.zeros(num, np.int64)  # timestamp of that pose
         self._range_noise_m = np.zeros(num)
         self._dropout_beyond = np.full(num, np.inf)
-        self.ranges_m = np.zeros((num, simulation.beams))  # as measured at the last step
+        self.ranges_m = np.zeros((num, simulation.beams))  # last measured ranges
         self.true_clearance_m = np.zeros(num)
         scan: Signals = {name: np.zeros(num) for name in SCANNED}
         scan["sector_clearance_m"] = np.zeros((num, task.sectors))
         scan["stamp_ns"] = np.zeros(num, np.int64)
-        self.scanned: list[Signals] = [  # of the steps before, the last one first
+        self.scanned: list[Signals] = [  # signals of the previous steps, newest first
             {name: column.copy() for name, column in scan.items()}
             for _ in range(steps_remembered(task))
         ]
 
     def reset(self, env: int, seeds: np.random.SeedSequence, perturbation: Perturbation) -> None:
-        """Begin to draw an episode's noise."""
+        """Prepare an episode's noise, which is drawn when it is needed."""
         self._generators[env] = np.random.Generator(np.random.SFC64(seeds))
         self._drawn[env] = self._drift[env] = 0
         p = perturbation
@@ -100,15 +100,15 @@ class Sensing(Stateful):
         self._scan_every[env] = max(round(p.lidar_period_s / period_s), 1)
         self._pose_every[env] = max(round(p.localisation_period_s / period_s), 1)
         self._range_noise_m[env] = p.lidar_noise_m
-        # A beam is lost where its own noise falls in the tail of that probability.
+        # A beam is lost if its noise falls into the tails, whose probability is the dropout.
         self._dropout_beyond[env] = (
             NormalDist().inv_cdf(1 - p.lidar_dropout / 2) if p.lidar_dropout else np.inf
         )
 
     def _draw(self, env: int, step: int) -> None:
-        """Draw the noise of an episode up to a step and some more.
+        """Draw the noise of an episode up to a step or further, `DRAWN` steps at a time.
 
-        Localisation drift becomes an autoregressive walk of unit variance.
+        The localisation's drift is a first-order autoregressive process of unit variance.
         """
         keep = float(np.exp(-self.task.control_period_s / DRIFT_TIME_S))
         while (begin := int(self._drawn[env])) <= step:
@@ -117,13 +117,16 @@ class Sensing(Stateful):
             self._drawn[env] += len(noise)
             drift = noise[:, 3:5]
             drift[int(begin == 0) :] *= np.sqrt(1 - keep**2)
-            for axis, new in enumerate(drift.T.tolist()):  # scipy.signal takes 0.6 s to import
+            for axis, new in enumerate(drift.T.tolist()):  # scipy.signal would take .6 s to import
                 last = float(self._drift[env, axis])
                 walk = list(accumulate(new, lambda was, new: new + keep * was, initial=last))
                 drift[:, axis], self._drift[env, axis] = walk[1:], walk[-1]
 
     def sense(self, ids: Ints, step: Ints) -> Signals:
-        """Sense all but the route and localised speeds, for `ids` (n,) at their steps (n,)."""
+        """Return the signals of robots `ids` (n,) at their steps (n,).
+
+        They lack the route (`add_route`), and localised speeds and tracks (`add_motion`).
+        """
         sim, task = self.simulation, self.task
         late = step >= self._drawn[ids]
         for env, at in zip(ids[late].tolist(), step[late].tolist(), strict=True):
@@ -177,8 +180,8 @@ class Sensing(Stateful):
     def add_motion(self, ids: Ints, signals: Signals, before: Signals | None = None) -> None:
         """Add speeds from the last two localised poses, how far others came nearer, and tracks.
 
-        Signals are those of all robots. At the first step of an episode they are only those of
-        `ids` (n,), without `before`: then speeds are the wheels', and nobody came nearer.
+        `signals` are of all robots. At the first step of an episode, they are of `ids` (n,) alone
+        and `before` is None: then speeds are those of the wheels, and nobody came nearer.
         """
         forward, lateral = localised_velocity(signals, signals if before is None else before)
         signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
@@ -194,7 +197,7 @@ class Sensing(Stateful):
         self._track(ids, signals)
 
     def _track(self, ids: Ints, signals: Signals, *, begin: bool = False) -> None:
-        """Add the tracks of robots `ids` to their signals: all robots, unless episodes `begin`."""
+        """Add tracks to the signals of robots `ids`, which are all robots unless they `begin`."""
         if self.tracker is None:
             return
         scan_m = self._fine.scan(self.ranges_m[ids], self.task.range_min_m)
@@ -208,7 +211,7 @@ class Sensing(Stateful):
 
 
 class _Around:
-    """The room around robots whose lidar does not see all around, or sees over obstacles."""
+    """The true room around robots whose lidar does not see all around, or sees over obstacles."""
 
     def __init__(self, simulation: Simulation) -> None:
         body, bearings = simulation.task.body, np.array(stand_in(simulation.task.body).bearings_rad)
@@ -217,21 +220,21 @@ class _Around:
         self._lidar = Lidar(simulation.batch, simulation.scenery, bearings, LIDAR_Z_M)
 
     def room_m(self, ids: Ints) -> F64:
-        """Return distances (n, beams) from outlines (n,) to what is nearest along each bearing."""
+        """Return distances (n, beams) from outlines to the nearest obstacle along each bearing."""
         middle = self._simulation.middle(self._simulation.pose(ids))
         ranges: F64 = self._lidar.ranges(ids, middle[:, :2], middle[:, 2]) - self._reach_m
         return ranges
 
 
 def _sees_everything(simulation: Simulation) -> bool:
-    """Return whether beams cover all bearings and pass over nothing that stands on a floor."""
+    """Return whether the beams cover all bearings and do not pass over any obstacle."""
     bearings = np.sort(simulation.bearings_rad % (2 * np.pi))
     widest = np.diff(bearings, append=bearings[0] + 2 * np.pi).max()
     return bool(widest < WIDEST_GAP_RAD) and not passed_over(simulation.robot.lidar_z_m)
 
 
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
-    """Add what robots see of plans (n, P, 2) and goals (n, 2); return how far off plan they are."""
+    """Add the signals of plans (n, P, 2) and goals (n, 2); return distances (n,) off the plans."""
     x, y, yaw = signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]
     view = view_route(plans_m, x, y, yaw, plan_distances_m(task))
     near, far = view.look_ahead_m[:, PLAN_PARTS], view.look_ahead_m[:, 2 * PLAN_PARTS]

@@ -1,12 +1,12 @@
 """The physics of N warehouses at once: one `mujoco.batch.Batch` and its inputs.
 
-A control period is driven in blocks of .1 s, or where it is no multiple of that in equal parts.
-Before each block, friction is looked up under every wheel and traffic moves; within it the base
-controller's ramp and the actuators' latency act at every substep. Results do not depend on the
-number of threads.
+A control period is driven in blocks of .1 s, or in equal blocks if it is not a multiple of .1 s.
+Before each block, friction is looked up under every wheel and traffic moves. Within a block, the
+base controller's ramp and latency act at every substep. Results do not depend on the number of
+threads.
 
-The base controller takes late commands, ramps toward them and sets the wheel speeds of the motors.
-A robot's body has a payload, wheels and the pull of a slope, as a perturbation says.
+The base controller gets commands late, ramps toward them and sets the motors' wheel speeds. The
+perturbation sets the payload, wheels and slope that act on a robot's body.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from restock.train.twin.physics.robot_model import (
 from restock.train.twin.physics.scenery import Lidar, Scenery, quaternion
 
 GRAVITY_MPS2 = 9.81
-_HISTORY = 5  # commands kept, or as many more as the longest latency takes
+_HISTORY = 5  # minimum number of commands kept; more if the longest latency takes more
 
 
 class BaseController(Stateful):
@@ -62,23 +62,23 @@ class BaseController(Stateful):
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
         self.left_gain = np.ones(num_envs)
-        # By `since_s`: what `_change` returns.
+        # A cache: since_s -> result of `_change`.
         self._changes: dict[float, tuple[Ints, Ints, tuple[Bools, F64, F64]]] = {}
 
     def reset(self, env: int) -> None:
         """Reset to a standstill, as after a stop command long ago."""
         self.commands[env] = self.set_point[env] = 0.0
-        self._changes.clear()  # its latency may be another
+        self._changes.clear()  # the latency may change
 
     def begin(self, motion: F64) -> None:
-        """Begin at steady speeds and yaw rates (N, 2) of the wheels, as commanded long ago."""
+        """Begin at steady speeds and yaw rates (N, 2) of the wheels, as if commanded long ago."""
         command = motion / self.gain[:, None]
         self.commands[:], self.set_point[:] = command[:, None], command
 
     def command(self, command: F64) -> None:
-        """Give commands (N, 2): forward speed and yaw rate, at the start of a control period.
+        """Set commands (N, 2), forward speed and yaw rate, at the start of a control period.
 
-        What is beyond the robot's limits is driven as fast as they allow.
+        Commands are clipped to the robot's speed limits.
         """
         self.commands[:, 1:] = self.commands[:, :-1]
         self.commands[:, 0] = _limit(np.asarray(command, np.float64), self._speed_limit)
@@ -86,8 +86,8 @@ class BaseController(Stateful):
     def controls(self, since_s: float) -> F64:
         """Return the actuators' inputs over a block that begins `since_s` into a period.
 
-        (N, substeps, actuators), in the model's order: wheel speeds in rad/s. The controller ramps
-        toward the command in force.
+        They are wheel speeds in rad/s, (N, substeps, actuators), in the model's order. The
+        controller ramps toward the command in force.
         """
         old, new, reach = self._in_force(since_s)
         ramp = _ramp(self.set_point[:, None], old, new, reach)
@@ -96,10 +96,10 @@ class BaseController(Stateful):
         return speeds if self._axles == 1 else np.tile(speeds, self._axles)
 
     def _in_force(self, since_s: float) -> tuple[F64, F64, tuple[Bools, F64, F64]]:
-        """Return the commands (N, 1, 2) in force as a block begins and as it ends.
+        """Return the commands (N, 1, 2) in force at the first and last substep of a block.
 
-        Also returns in which substeps (N, S, 1) the former one is, and how far (N, S, 2) a ramp
-        gets by each toward the one and toward the other.
+        Also returns the substeps (N, S, 1) in which the first command is in force, and how far
+        (N, S, 2) a ramp gets by each substep toward the first command and toward the last.
         """
         if since_s not in self._changes:
             self._changes[since_s] = self._change(since_s)
@@ -108,16 +108,16 @@ class BaseController(Stateful):
         return self.commands[rows, first][:, None], self.commands[rows, last][:, None], reach
 
     def _change(self, since_s: float) -> tuple[Ints, Ints, tuple[Bools, F64, F64]]:
-        """Return how many periods old (N,) both commands are, and the rest of `_in_force`.
+        """Return the ages (N,), in periods, of both commands, and the other results of `_in_force`.
 
-        There is at most one change within a block.
+        The command changes at most once within a block.
         """
         step = np.arange(self._substeps)
         age_s = since_s + step * self._timestep_s - self.latency_s[:, None] + 1e-9
         age = np.clip(-np.floor(age_s / self._period_s), 0, self.commands.shape[1] - 1)
-        age = age.astype(np.int64)  # (N, S) how many periods old the command in force is
+        age = age.astype(np.int64)  # (N, S) age of the command in force, in periods
         first, last = age[:, 0], age[:, -1]
-        former = (age == first[:, None])[..., None]  # all substeps where nothing changes
+        former = (age == first[:, None])[..., None]  # all substeps if the command does not change
         switch, count = former.sum(axis=1, keepdims=True), (step + 1)[:, None]
         reach = self._accel_limit * self._timestep_s
         to_old, to_new = np.minimum(count, switch), np.maximum(count - switch, 0)
@@ -131,10 +131,10 @@ class BaseController(Stateful):
 
 
 class SteeringController(BaseController):
-    """Controllers of robots that steer, which ramp speed and steering angle.
+    """The controllers of N robots that steer. They ramp speed and steering angle.
 
-    The angle is that of the commanded circle, or of the tightest possible one. A stop command
-    leaves the steering as it is.
+    The angle is that of the commanded circle, or the maximum for a tighter circle. A stop command
+    keeps the steering angle.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (*BaseController.STATE, "steering_rad")
@@ -144,7 +144,7 @@ class SteeringController(BaseController):
     ) -> None:
         super().__init__(num_envs, robot, period_s, timestep_s, substeps)
         self._accel_limit = np.array([robot.accel_limit[0], robot.steering_rate_radps])
-        self.steering_rad = np.zeros(num_envs)  # of the wheel in the middle of the front axle
+        self.steering_rad = np.zeros(num_envs)  # of a virtual wheel, midway on the front axle
 
     def reset(self, env: int) -> None:
         """Reset to a standstill with the wheels straight ahead."""
@@ -184,7 +184,7 @@ def base_controller(
 
 
 def _ramp(begin: F64, old: F64, new: F64, reach: tuple[Bools, F64, F64]) -> F64:
-    """Ramp from `begin` (N, 1, 2) toward the commands in force, (N, substeps, 2), exactly."""
+    """Return the ramp (N, substeps, 2) from `begin` (N, 1, 2) toward the commands in force."""
     former, to_old, to_new = reach
     under_old = begin + _limit(old - begin, to_old)
     turned = under_old[:, -1:]
@@ -199,8 +199,8 @@ def _limit(change: F64, most: F64) -> F64:
 class RobotBody:
     """The perturbed properties of N robots, written into their batch.
 
-    Fields are made per-simulation when first needed: as long as no episode needs one, all share
-    the model's.
+    All environments share a field of the model until an episode needs its own value. From then on,
+    each environment has its own copy of the field.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class RobotBody:
         robot: RobotModel,
     ) -> None:
         self.batch, self.model, self.handles, self.robot = batch, model, handles, robot
-        self.radius_m = np.full(num_envs, robot.wheel_radius_m)  # (N,) that they roll on
+        self.radius_m = np.full(num_envs, robot.wheel_radius_m)  # (N,) the wheels' rolling radius
         self._masses = self._radii = self._sloped = False
 
     def apply(self, env: int, perturbation: Perturbation) -> None:
@@ -255,13 +255,13 @@ class RobotBody:
 
 
 BLOCK_S = 0.1
-OUTLINE_STEP_M = 0.05  # at most, between points on a robot's outline
+OUTLINE_STEP_M = 0.05  # maximum distance between points on a robot's outline
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
 @dataclass(frozen=True)
 class BodyState:
-    """The true state of every environment at an instant between two blocks, for recorders."""
+    """The true state of every environment at one moment, for recorders."""
 
     time_s: F64  # (N,) since the episode began
     x_m: F64
@@ -271,17 +271,17 @@ class BodyState:
     yaw_rate_radps: F64
     wheel_angle_rad: F64  # (N, 2) left, right
     wheel_speed_radps: F64  # (N, 2)
-    accel_mps2: F64  # (N, 3) of the accelerometer, mean since the call before
-    bumped: Bools  # (N,) at any substep since the call before
+    accel_mps2: F64  # (N, 3) of the accelerometer, mean since the previous call
+    bumped: Bools  # (N,) at any substep since the previous call
 
 
 class Simulation(Stateful):
-    """N robots in N warehouses. Arrays lead with the environment.
+    """N robots in N warehouses. The first axis of arrays is the environment.
 
-    To restore a state, every environment must have been reset to the same episode.
+    Before a state is restored, every environment must be reset to the episode of that state.
     """
 
-    # The scenery comes after the physics: it is shown where that has it.
+    # The scenery is restored after the physics, because it reads positions from there.
     STATE = (
         "time_s",
         "bumped",
@@ -305,7 +305,7 @@ class Simulation(Stateful):
     ) -> None:
         """Build N warehouses; with several `floors`, `reset` chooses the one of each episode.
 
-        Without a `robot` it is the stand-in.
+        `robot` None is the stand-in.
         """
         floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
         self.num_envs, self.task = num_envs, task
@@ -329,7 +329,7 @@ class Simulation(Stateful):
         self._control = np.zeros((num_envs, self.substeps, width))
         length_m, width_m = task.body.length_m, task.body.width_m
         points = math.ceil(max(length_m, width_m) / OUTLINE_STEP_M) + 1
-        self.outline_m = rectangle(length_m, width_m, robot.axle_x_m, points)  # (K, 2) of the pose
+        self.outline_m = rectangle(length_m, width_m, robot.axle_x_m, points)  # (K, 2) from pose
         half_m = length_m / 2, width_m / 2
         self.scenery = Scenery(
             *(self.batch, self.handles, floors, slots, half_m, robot.lidar_z_m),
@@ -346,11 +346,11 @@ class Simulation(Stateful):
         )
         self.time_s = np.zeros(num_envs)
         self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
-        self.accel = np.zeros((num_envs, 3))  # mean over the last half block
+        self.accel = np.zeros((num_envs, 3))  # mean over the second half of the last block
         self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
         self.travelled_m = np.zeros(num_envs)  # in the last control period, over ground
         self.diverged = np.zeros(num_envs, np.bool_)
-        # As the last control period began: poses, gaps to traffic, and who stood on a patch.
+        # At the start of the last control period: poses, gaps to traffic, robots on a patch.
         self.start, self.traffic_gap_m = np.zeros((num_envs, 3)), np.zeros((num_envs, AGENTS))
         self.on_patch = np.zeros(num_envs, np.bool_)
 
@@ -425,7 +425,7 @@ class Simulation(Stateful):
     def _run(self, actuators: F64) -> tuple[Bools, F64]:
         """Run one block of substeps under controls (N, S, actuators).
 
-        Returns whose bumper was pressed, (N,), and the accelerations at each substep (N, S, 3).
+        Returns which bumpers were pressed (N,), and the accelerations at each substep (N, S, 3).
         """
         control = self._control
         control[:, :, : self._actuators] = actuators
@@ -472,7 +472,7 @@ class Simulation(Stateful):
         return stacked(qpos[:, 0], qpos[:, 1], yaw_of(qpos[:, 3:7]))
 
     def middle(self, pose: F64) -> F64:
-        """Return outlines' centres and headings (..., 3) for axles at poses (..., 3)."""
+        """Return the centres and headings (..., 3) of outlines with axles at poses (..., 3)."""
         if not self.robot.axle_x_m:
             return pose
         back = self.robot.axle_x_m
@@ -484,12 +484,12 @@ class Simulation(Stateful):
         return self.robot.by_side(self._turning(ids))
 
     def _turning(self, ids: Ints | slice = slice(None)) -> F64:
-        """Return the speeds (n, W) of the wheels, in rad/s."""
+        """Return the speeds (n, W) of all wheels, in rad/s."""
         spin: F64 = self.qvel[ids].take(self._wheel_qvel, axis=1)
         return spin
 
     def roll(self, speed_mps: F64, yaw_rate_radps: F64) -> None:
-        """Set the wheels' speeds to those for speeds (N,) and yaw rates (N,) of their own."""
+        """Set the wheels' speeds for robots that drive at speeds (N,) and yaw rates (N,)."""
         left, right = self.robot.wheel_commands(speed_mps, yaw_rate_radps)
         for wheel, dof in enumerate(self.handles.wheel_qvel):
             self.qvel[:, dof] = right if wheel % 2 else left
@@ -501,7 +501,7 @@ class Simulation(Stateful):
             self.qpos[:, self._steering_qpos] = angles
 
     def _slipping(self, ids: Ints, heading: F64, slippery: Bools) -> Bools:
-        """Return where (n,) a wheel on a patch (n, W) slides over the floor above the limit."""
+        """Return robots (n,) with a wheel on a patch (n, W) that slides faster than the limit."""
         velocity = self.qvel[ids]
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]
