@@ -117,7 +117,7 @@ def row_to_gradient(folder: Path, *, plain: bool) -> Callable[[], object]:
             main(["mix", str(folder / "store-1"), "--mixture", "coverage", "--out", str(panel)])
     session = prepare_new(folder / "run", panel, None, PLAIN if plain else SHORT).open()
     loop.train(session)
-    return partial(loop._updates, session, 1, "online", lambda event, values: None)
+    return partial(loop._run_updates, session, 1, "online", lambda event, values: None)
 
 
 SHORT = [

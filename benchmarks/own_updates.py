@@ -18,7 +18,7 @@ from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches, LogTerms
 from restock.train.feed.fresh_labels import EpisodeLabels
 from restock.train.feed.logs import Coded, Logs
-from restock.train.feed.update_blocks import Made, UpdateBlocks
+from restock.train.feed.update_blocks import MadeUpdate, UpdateBlocks
 from restock.train.run.run import Run
 
 
@@ -126,7 +126,7 @@ class Restock:
             if self.feed is not None and step % 500 == 0:
                 self.feed.flush(step * 4, step, "online")
 
-    def _made(self, updates: int) -> Iterator[Made]:
+    def _made(self, updates: int) -> Iterator[MadeUpdate]:
         draw, learner = self.batches.draw_online, self.learner
         if self.blocks is not None:
             yield from self.blocks.make(updates, draw, conservative=0.0, labelled=False)

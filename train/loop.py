@@ -26,11 +26,11 @@ from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measure
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batch_record import LEAVE_OUT, TRAIN_SLOWER, refuse
-from restock.train.feed.batches import ReplayBatch, drawn_ahead
+from restock.train.feed.batches import ReplayBatch, draw_ahead
 from restock.train.feed.logs import PROBE_ROWS, Probe
 from restock.train.feed.teacher import TeacherFailed
-from restock.train.feed.update_blocks import LONGEST, Made
-from restock.train.run.run import resuming
+from restock.train.feed.update_blocks import LONGEST, MadeUpdate
+from restock.train.run.run import resume_command
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 
@@ -38,7 +38,7 @@ _CONSERVATIVE_STEPS = 20_000  # environment steps in which the CQL term's weight
 _OFFLINE_BLOCK = 64  # updates between two checks of the clock and of Ctrl-C
 # Shares of a budget in seconds after which cloning, and then the updates on the logs, must end: the
 # other half is for the twin.
-_OF_CLONING, _OF_LOGS = 0.25, 0.5
+_CLONING_UNTIL, _LOGS_UNTIL = 0.25, 0.5
 Notify = Callable[[str, dict[str, Any]], None]  # name of an event, its values
 
 
@@ -89,7 +89,7 @@ def train(
     except TeacherFailed as error:
         _save(session)
         session.write_held()
-        again = f"; then continue with {resuming(session.run.path)}"
+        again = f"; then continue with {resume_command(session.run.path)}"
         raise TeacherFailed(
             f"{error.what}; a checkpoint was written",
             where=error.where,
@@ -104,11 +104,11 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     # 1. Offline, on the logs alone: clone the teacher, then learn values.
     _clone_teacher(session, stop)
-    of_logs = _OF_LOGS if config.env.twin else 1.0
+    logs_until = _LOGS_UNTIL if config.env.twin else 1.0
     began_s, made = session.wall_s, learner.gradient_steps
-    while (left := offline_updates - learner.gradient_steps) > 0 and time_left(session, of_logs):
-        _interrupt(session, stop)
-        _updates(
+    while (left := offline_updates - learner.gradient_steps) > 0 and time_left(session, logs_until):
+        _stop_if_requested(session, stop)
+        _run_updates(
             session, min(left, 1 if session.blocks is None else _OFFLINE_BLOCK), "offline", notify
         )
     if learner.gradient_steps > made:
@@ -124,7 +124,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         progress.driving_from_s = session.wall_s
     _evaluate_if_due(session, notify, stop)  # if the run was stopped during an evaluation
     while progress.env_steps < schedule.env_steps and time_left(session):
-        _interrupt(session, stop)
+        _stop_if_requested(session, stop)
         # 2. Warm-up: the policy from the logs drives; nothing is learnt from its rows yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
         if progress.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
@@ -145,8 +145,8 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         # 4. … while ended episodes are labelled, and the learner learns from the rows that the ring
         # had before this step.
         session.run.append("episodes", session.collector.label())
-        due = _updates_due(session)
-        _updates(session, due, "online", notify)
+        due = _count_due_updates(session)
+        _run_updates(session, due, "online", notify)
         progress.online_updates += due
 
         # 5. The step's transitions go into the ring.
@@ -209,15 +209,15 @@ def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
     if behaviour is None or imitation is None or session.learner.gradient_steps:
         return
     seconds = session.config.schedule.seconds
-    most_s = math.inf if seconds is None else _OF_CLONING * seconds
+    limit_s = math.inf if seconds is None else _CLONING_UNTIL * seconds
     while behaviour.updates < imitation.offline_updates and (
-        session.wall_s < most_s or behaviour.updates < session.config.record.every_updates
+        session.wall_s < limit_s or behaviour.updates < session.config.record.every_updates
     ):
-        _interrupt(session, stop)
+        _stop_if_requested(session, stop)
         behaviour.learn(imitation.draw_offline())
 
 
-def _updates_due(session: Session) -> int:
+def _count_due_updates(session: Session) -> int:
     progress = session.progress
     if progress.online_from is None:
         return 0
@@ -225,22 +225,22 @@ def _updates_due(session: Session) -> int:
     return int(collected * session.config.schedule.updates_per_env_step) - progress.online_updates
 
 
-def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
+def _run_updates(session: Session, count: int, phase: str, notify: Notify) -> None:
     """Make `count` gradient steps, record each, and advance the target."""
     while count > 0:
-        made = _until_due(session, count)
+        made = _updates_to_make(session, count)
         target = session.learner.target
         sync = target.last_sync
-        for number, (batch, loss, tail) in enumerate(_made(session, made, phase), start=1):
-            _note(session, batch, loss, sync, tail, phase)
-            if number < made:  # `_follow` does it for the last update
+        for number, (batch, loss, tail) in enumerate(_make_updates(session, made, phase), start=1):
+            _record_update(session, batch, loss, sync, tail, phase)
+            if number < made:  # `_advance_target` does it for the last update
                 target.after(session.learner.gradient_steps)
             sync = target.last_sync
-        _follow(session, phase, notify)
+        _advance_target(session, phase, notify)
         count -= made
 
 
-def _until_due(session: Session, count: int) -> int:
+def _updates_to_make(session: Session, count: int) -> int:
     """Return how many of `count` updates to make up to the next interval's end or target copy."""
     if session.blocks is None:
         count = 1 if session.batches.needs_td else min(count, LONGEST)
@@ -251,7 +251,7 @@ def _until_due(session: Session, count: int) -> int:
     return min(count, *(every - step % every for every in due))
 
 
-def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
+def _make_updates(session: Session, count: int, phase: str) -> Iterator[MadeUpdate]:
     """Make `count` updates."""
     progress, learner = session.progress, session.learner
     conservative = _conservative_weight(session, phase)
@@ -268,7 +268,7 @@ def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
         )
         return
     # All are drawn first: an update displaces the data of draws from the CPU's caches.
-    drawn, failed = drawn_ahead(draw, count)
+    drawn, failed = draw_ahead(draw, count)
     labelled = [None if imitation is None else imitation.draw_online() for _ in drawn]
     for batch, labels in zip(drawn, labelled, strict=True):
         expert = session.log_terms.expert_rows(batch.log_rows)
@@ -285,7 +285,7 @@ def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
         raise failed
 
 
-def _note(
+def _record_update(
     session: Session,
     batch: ReplayBatch,
     loss: Loss,
@@ -303,7 +303,7 @@ def _note(
     interval.loss += value
 
 
-def _follow(session: Session, phase: str, notify: Notify) -> None:
+def _advance_target(session: Session, phase: str, notify: Notify) -> None:
     """Advance the target after the last update, and close the interval if it ends here."""
     learner, interval = session.learner, session.interval
     step, every = learner.gradient_steps, session.config.record.every_updates
@@ -395,7 +395,7 @@ def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bo
         discount=config.loss.discount,
         measures=measures_of(session.task, dataset),
         config=ope,
-        between=lambda: _interrupt(session, stop),
+        between=lambda: _stop_if_requested(session, stop),
     )
     session.run.append("off_policy", [{**session.steps, **row} for row in rows])
 
@@ -421,7 +421,7 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
     discount = config.loss.discount
     began_s = session.wall_s
     results = session.evaluation_buffer.drive(
-        policy, session.fixed_episodes, discount, between=lambda: _interrupt(session, stop)
+        policy, session.fixed_episodes, discount, between=lambda: _stop_if_requested(session, stop)
     )
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
@@ -479,7 +479,7 @@ def nothing_to_do(session: Session) -> str | None:
     return None
 
 
-def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
+def _stop_if_requested(session: Session, stop: Callable[[], bool]) -> None:
     """Save and end the run if `stop` returns True.
 
     An evaluation or another stage that is abandoned here is repeated from its beginning when the
@@ -492,7 +492,7 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
             f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",
             where=str(session.run.path),
-            remedy=f"continue with {resuming(session.run.path)}",
+            remedy=f"continue with {resume_command(session.run.path)}",
         )
 
 

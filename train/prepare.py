@@ -37,14 +37,14 @@ from restock.train.feed.batch_record import STOPPED
 from restock.train.feed.collector import FreshStrata, conditions_in_twin
 from restock.train.feed.logs import Logs
 from restock.train.feed.practice import check_missions, make_twin
-from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher, refuse_nothing_to_learn
+from restock.train.feed.teacher import CheckedTeacher, Teacher, open_teacher, refuse_no_rows
 from restock.train.loop import Notify, TrainResult
 from restock.train.resolve import (
     check_new_run,
-    mirrors,
     planned_draws,
     resolve_config,
     resolve_teacher,
+    should_mirror,
     without_twin,
 )
 from restock.train.run.run import (
@@ -82,7 +82,7 @@ class Prepared:
     document: dict[str, Any]  # config.json
     resumed: Run | None = None
     teacher: Any = None  # a teacher that Python code passed in
-    requested: AskedTeacher | None = None  # the teacher that a new run's config names
+    requested: CheckedTeacher | None = None  # the teacher that a new run's config names
 
     def open(self) -> Session:
         """Make or reopen the run directory, and build the twin and the learner.
@@ -97,13 +97,13 @@ class Prepared:
                 self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
             )
         if teacher is not None and self.resumed is None:  # an error before anything is written
-            teacher.ask(env, env.reset(seed=self.config.seed)[0])
+            teacher.query(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
         lock = RunLock(self.path)
         try:
             run = self._run()
             try:
-                session = self._session(run, env, teacher, layouts)
+                session = self._build(run, env, teacher, layouts)
             except BaseException:
                 if self.resumed is None:  # remove the folder of a run that never began
                     shutil.rmtree(self.path, ignore_errors=True)
@@ -122,7 +122,7 @@ class Prepared:
         (self.path / STOPPED).unlink(missing_ok=True)
         return self.resumed
 
-    def _session(self, run: Run, env: Twin, teacher: AskedTeacher | None, layouts: str) -> Session:
+    def _build(self, run: Run, env: Twin, teacher: CheckedTeacher | None, layouts: str) -> Session:
         profile = self.profile
         conditions, exposures = conditions_of_twin(profile)
         session = open_session(
@@ -233,7 +233,7 @@ def prepare_new(
     check_missions(config, profile)
     config = resolve_teacher(config, profile, panel)
     drivers = None if panel is None else sorted(rows_by_policy(panel))
-    refuse_nothing_to_learn(config.teacher, drivers)
+    refuse_no_rows(config.teacher, drivers)
     config = resolve_config(config, panel)
     check_new_run(config, profile.task, panel)
     requested = None
@@ -265,7 +265,7 @@ def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
             remedy="start a new run: values of one task have no meaning in another",
         )
     if config.teacher.mirror:
-        mirrors(config.teacher, profile.task)
+        should_mirror(config.teacher, profile.task)  # raises if an action has no opposite
     panel = run_panel(run.document)  # raises if it is gone or was replaced
     if panel is not None:
         panel = open_panel(panel.path, config, profile)
@@ -368,7 +368,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         }
     # Left out in runs of earlier Restocks, whose target had the target network's value, and for a
     # user's own algorithm, which defines its own target.
-    lower = config.loss.algorithm == "dqn" and config.loss.double and not config.teacher.filters
+    lower = config.loss.algorithm == "dqn" and config.loss.double and not config.teacher.has_filter
     return {
         "created_ns": now_ns(),
         "config": msgspec.to_builtins(config),

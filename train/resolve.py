@@ -22,7 +22,7 @@ from restock.toml import changed
 from restock.train.dqn.config import PLANNER, TeacherConfig, TrainConfig, refuse_untaught
 from restock.train.feed.batches import check_terms
 from restock.train.feed.practice import mission_orders
-from restock.train.feed.teacher import cloned
+from restock.train.feed.teacher import select_cloned
 from restock.train.twin.env.interface import AFTER_LOGS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
 
@@ -42,7 +42,7 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 
-FIRST_GUESS = 800.0  # environment steps per second, assumed until the speed is measured
+ASSUMED_STEPS_PER_S = 800.0  # environment steps per second, assumed until the speed is measured
 
 
 def planned_env_steps(config: TrainConfig) -> int:
@@ -50,7 +50,7 @@ def planned_env_steps(config: TrainConfig) -> int:
     schedule = config.schedule
     if schedule.seconds is None:
         return schedule.env_steps
-    return min(schedule.env_steps, round(FIRST_GUESS * schedule.seconds))
+    return min(schedule.env_steps, round(ASSUMED_STEPS_PER_S * schedule.seconds))
 
 
 def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedDraws:
@@ -92,12 +92,14 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
         )
     teacher = msgspec.structs.replace(teacher, successes=_clones_successes(teacher, profile))
     if teacher.offline_updates is None:
-        rows = 0 if panel is None or not teacher.filters else int(cloned(panel, teacher).sum())
+        rows = 0
+        if panel is not None and teacher.has_filter:
+            rows = int(select_cloned(panel, teacher).sum())
         times = min(max(rows / _ROWS_OF_UPDATES, 1.0), _MAX_UPDATES)
         count = round(config.schedule.offline_updates * times)
         teacher = msgspec.structs.replace(teacher, offline_updates=count)
     if teacher.mirror is not False:
-        teacher = msgspec.structs.replace(teacher, mirror=mirrors(teacher, profile.task))
+        teacher = msgspec.structs.replace(teacher, mirror=should_mirror(teacher, profile.task))
     return msgspec.structs.replace(config, teacher=teacher)
 
 
@@ -111,10 +113,10 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
             remedy="leave it out, or add drivers to teacher.policies",
         )
     # If a teacher answers in the twin from the first step on, they slow learning: docs/train.md.
-    return logged and not teacher.asks if teacher.successes is None else teacher.successes
+    return logged and not teacher.queried if teacher.successes is None else teacher.successes
 
 
-def mirrors(teacher: TeacherConfig, task: Task) -> bool:
+def should_mirror(teacher: TeacherConfig, task: Task) -> bool:
     """Decide whether the behaviour network learns from mirror images.
 
     Raises:

@@ -31,9 +31,9 @@ from restock.train.feed.batches import Batches, LogTerms
 from restock.train.feed.collector import Collector, FreshStrata, ring_conditions
 from restock.train.feed.logs import PROBE_ROWS, LogFidelity, Logs, Probe
 from restock.train.feed.practice import Practice
-from restock.train.feed.teacher import AskedTeacher, Imitation
+from restock.train.feed.teacher import CheckedTeacher, Imitation
 from restock.train.feed.update_blocks import UpdateBlocks
-from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
+from restock.train.resolve import ASSUMED_STEPS_PER_S, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
 from restock.train.run.events import Events, tracker_sinks
 from restock.train.run.run import Run, RunLock
@@ -162,7 +162,7 @@ class Session(Stateful):
         """Return environment steps per second, updates and evaluations included."""
         progress, wall_s = self.progress, self.wall_s
         if progress.online_from_s is None or progress.driving_from_s is None:
-            return FIRST_GUESS
+            return ASSUMED_STEPS_PER_S
         made = progress.env_steps - (progress.online_from or 0)
         if made >= self.config.record.every_updates:
             return made / max(wall_s - progress.online_from_s, 1e-9)
@@ -259,7 +259,7 @@ def open_session(
     env: Twin,
     evaluation_env: Twin,
     logs: Logs | None,
-    teacher: AskedTeacher | None = None,
+    teacher: CheckedTeacher | None = None,
     resume: bool = False,
     exposures: Sequence[Condition] = (),
 ) -> Session:
@@ -334,7 +334,7 @@ def open_session(
             seed=seed,
             mirror=Mirror.of(task) if config.teacher.mirror else None,
         )
-        if config.teacher.filters
+        if config.teacher.has_filter
         else None,
     )
     session.collector.check_conditions()

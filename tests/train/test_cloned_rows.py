@@ -19,7 +19,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train.dqn.config import TeacherConfig
 from restock.train.feed.logs import Coded
-from restock.train.feed.teacher import cloned, rows_of_policies, rows_of_successes
+from restock.train.feed.teacher import rows_of_policies, rows_of_successes, select_cloned
 from restock.train.prepare import prepare_new
 
 # An episode a line: who drove its steps, and how it ended.
@@ -78,8 +78,8 @@ def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -
     prepared = prepare_new(tmp_path / "run", panel.path, None, logged)
     teacher = prepared.config.teacher
     assert teacher.successes is True
-    rows = cloned(panel, teacher)
-    alone = cloned(panel, TeacherConfig(policies=teacher.policies, successes=False))
+    rows = select_cloned(panel, teacher)
+    alone = select_cloned(panel, TeacherConfig(policies=teacher.policies, successes=False))
     assert alone.sum() < rows.sum() < len(panel)
     others = int((rows & ~alone).sum())
     assert f"{alone.sum():,} logged rows of operator, and {others:,} rows of" in describe_run(

@@ -334,7 +334,7 @@ def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:
     def drive(steps: int) -> list[list[int]]:
         answers = []
         for _ in range(steps):
-            answers.append(teacher.ask(env, observation).tolist())
+            answers.append(teacher.query(env, observation).tolist())
             env.step(np.array(answers[-1]))
         return answers
 

@@ -149,7 +149,7 @@ def make_policy(
     values = _of_runs([make_network(config, observation_size, actions) for _ in range(runs)])
     if config.teacher.source == PLANNER:
         return ProposalNetwork(values, None, config.teacher.margin)
-    if not config.teacher.filters:
+    if not config.teacher.has_filter:
         return values
     behaviours = [make_behaviour(observation_size, actions) for _ in range(runs)]
     return FilteredNetwork(values, _of_runs(behaviours))

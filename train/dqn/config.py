@@ -140,12 +140,12 @@ class TeacherConfig(Checked, frozen=True):
     mirror: bool | None = None
 
     @property
-    def filters(self) -> bool:
+    def has_filter(self) -> bool:
         """Return whether there is a behaviour network."""
         return self.source not in (None, "none", PLANNER)
 
     @property
-    def asks(self) -> bool:
+    def queried(self) -> bool:
         """Return whether a teacher is queried in the twin."""
         return self.source not in (None, "none", "logs", PLANNER)
 

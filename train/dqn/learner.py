@@ -107,7 +107,7 @@ class Learner(Stateful):
         self._preference: Callable[[Tensor], Tensor] | None = None
         self._acting: PolicyNetwork = self.network
         self.policy: PolicyNetwork = self.policy_network  # what is evaluated and kept
-        if config.teacher.filters:
+        if config.teacher.has_filter:
             self.behaviour = Behaviour(
                 config.teacher,
                 observation_size,

@@ -40,7 +40,7 @@ from restock.train.run.run import (
     chosen_policy,
     env_steps_of,
     now_ns,
-    resuming,
+    resume_command,
 )
 from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.env.interface import Policy
@@ -109,7 +109,7 @@ def load_agent(run: Run) -> GreedyPolicy:
         raise RunError(
             "has no policy yet: it stopped before its first update",
             where=str(run.path),
-            remedy=f"continue it with {resuming(run.path)}",
+            remedy=f"continue it with {resume_command(run.path)}",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     task = profile_of_run(run).task

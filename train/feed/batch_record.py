@@ -199,9 +199,9 @@ class FeedRecord(Stateful):
                 "logs_share": len(self._logged) / drawn,
             }
         if self.logs is not None and len(self._logged):
-            self._write(self._of_logs(self.logs), clocks, phase)
+            self._write(self._logged_source(self.logs), clocks, phase)
         if drawn:
-            self._held.append(self._closed(clocks, phase))
+            self._held.append(self._held_interval(clocks, phase))
         self._release()
         for rows in (self._logged, self._fresh, self._greedy):
             rows.clear()
@@ -221,11 +221,11 @@ class FeedRecord(Stateful):
         held: Sequence[Any] = self._held
         self._held = [HeldInterval(**interval) for interval in held]
 
-    def _closed(self, clocks: dict[str, int], phase: str) -> HeldInterval:
+    def _held_interval(self, clocks: dict[str, int], phase: str) -> HeldInterval:
         """Return the fresh rows of the open interval."""
         ring, filled = self.ring, len(self.ring)
         waiting = ring.by_condition.stratum[:filled] == WAITING
-        available = self._by_stratum(ring.stratum[:filled][~waiting])
+        available = self._count_by_stratum(ring.stratum[:filled][~waiting])
         open_rows = {}
         if self.labels is None:
             available[-1] += waiting.sum()
@@ -235,15 +235,15 @@ class FeedRecord(Stateful):
             for name in ("condition", "stratum"):
                 open_rows[name] = np.full(len(slots), WAITING, np.int16)
         rows = dict(self._fresh.columns)
-        quotas = self._quotas_met()
+        quotas = self._interval_quotas()
         return HeldInterval(clocks, phase, rows, available, open_rows, self._audits, quotas)
 
-    def _by_stratum(self, stratum: NDArray[Any]) -> Ints:
+    def _count_by_stratum(self, stratum: NDArray[Any]) -> Ints:
         """Count fresh rows (n,) by stratum (S + 1,); the last count is of rows in none."""
         size = len(self.ring.strata)
-        return np.bincount(_told(stratum, size), minlength=size + 1)
+        return np.bincount(_with_unlabelled(stratum, size), minlength=size + 1)
 
-    def _quotas_met(self) -> dict[str, NDArray[Any]] | None:
+    def _interval_quotas(self) -> dict[str, NDArray[Any]] | None:
         """Return the open interval's `quotas` for `sampled_rows.fed`; None without quotas."""
         quotas = self.quotas
         if quotas is None or not self._batches:
@@ -273,13 +273,13 @@ class FeedRecord(Stateful):
 
     def _write_fresh(self, interval: HeldInterval) -> None:
         if len(interval.rows["td"]):
-            self._write(self._of_ring(interval), interval.clocks, interval.phase)
+            self._write(self._fresh_source(interval), interval.clocks, interval.phase)
         for audit in interval.audits:
             columns = add_names(audit, self.ring.conditions, self.ring.strata, UNLABELLED)
             self.run.append_columns("audit", columns)
         if interval.quotas is not None and self.quotas is not None:
             steps = {**interval.clocks, "phase": interval.phase}
-            fresh = self._by_stratum(interval.rows["stratum"])
+            fresh = self._count_by_stratum(interval.rows["stratum"])
             columns = sampled_rows.fed(
                 self.quotas.names[: len(fresh) - 1], interval.quotas, fresh, interval.available
             )
@@ -304,7 +304,7 @@ class FeedRecord(Stateful):
             columns = {"source": source.name, **sampled_rows.ages(unit, age)}
             self.run.append_columns("ages", {**clocks, **columns})
 
-    def _of_logs(self, logs: Logs) -> SourceRows:
+    def _logged_source(self, logs: Logs) -> SourceRows:
         rows, greedy = self._logged.columns, self._greedy.columns
         row = rows["row"]
         return SourceRows(
@@ -330,30 +330,30 @@ class FeedRecord(Stateful):
             ),
         )
 
-    def _of_ring(self, interval: HeldInterval) -> SourceRows:
+    def _fresh_source(self, interval: HeldInterval) -> SourceRows:
         ring, rows = self.ring, interval.rows
         conditions = [*ring.conditions, UNLABELLED]
         strata = [*ring.strata, UNLABELLED]
         if interval.open_rows:
-            interval.available[:] += self._by_stratum(interval.open_rows["stratum"])
+            interval.available[:] += self._count_by_stratum(interval.open_rows["stratum"])
             interval.open_rows.clear()
 
         def audited(name: str, kinds: int) -> Ints:
-            found = [_told(audit[name], kinds) for audit in interval.audits]
+            found = [_with_unlabelled(audit[name], kinds) for audit in interval.audits]
             return np.concatenate([np.empty(0, np.int64), *found])
 
         wanted = [audit["greedy_action"] for audit in interval.audits]
         return SourceRows(
             name="fresh",
             rows=rows,
-            stratum=_told(rows["stratum"], len(ring.strata)),
+            stratum=_with_unlabelled(rows["stratum"], len(ring.strata)),
             strata=strata,
             row=rows["episode"] * (int(rows["episode_step"].max(initial=0)) + 1)
             + rows["episode_step"],
             available=interval.available,
             timings=[None] * len(strata),
             quota=[None] * len(strata),
-            condition=_told(rows["condition"], len(ring.conditions)),
+            condition=_with_unlabelled(rows["condition"], len(ring.conditions)),
             conditions=conditions,
             episode=rows["episode"],
             episodes=None,
@@ -401,7 +401,7 @@ class FeedRecord(Stateful):
             self._audits.append(whole(slice(logged, len(packed)), rows))
 
 
-def _told(code: NDArray[Any], kinds: int) -> Ints:
+def _with_unlabelled(code: NDArray[Any], kinds: int) -> Ints:
     """Return codes (n,) of `kinds` names, with `kinds` in place of negative codes (no name)."""
     return np.where(code < 0, kinds, code).astype(np.int64)
 
@@ -483,7 +483,7 @@ def refuse(
     if named:
         more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
         message += f"; {len(named)} of the {len(rows)} rows of the batch {why}:"
-        message += f" {', '.join(map(_name, named[:_NAMED]))}{more}"
+        message += f" {', '.join(map(_describe_row, named[:_NAMED]))}{more}"
     if run is not None:
         document = {
             **steps,
@@ -497,7 +497,7 @@ def refuse(
     raise NotFinite(message, where=None if run is None else str(run), remedy=remedy)
 
 
-def _name(row: dict[str, Any]) -> str:
+def _describe_row(row: dict[str, Any]) -> str:
     if row["source"] == "logs":
         return f"panel row {row['panel_row']} (transition {row['transition_id']})"
     return f"step {row['episode_step']} of the twin's episode {row['episode']}"

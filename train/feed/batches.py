@@ -99,7 +99,7 @@ class Batches(Stateful):
         self._fresh_quotas = Quotas(np.append(np.zeros(strata), 1.0), batch_size)
         if logs is not None:
             self._draws = logs.sampler(batch_size, logs_share, seed, fresh)
-            self._share_out()
+            self._apply_shares()
             if logs.panel is not None:
                 self._max_age = logs.panel.header.mixture.max_age_env_steps
 
@@ -140,7 +140,7 @@ class Batches(Stateful):
             stock = self.ring.by_stratum.counts / self.batch_size
             moved = self._draws.move_to(env_steps, stock)
             if moved or self._draws.controller.logs_share != self._taken_over:
-                self._share_out()
+                self._apply_shares()
             if self._logged:
                 drawn = self._draws.draw(self._logged)
         slots = _NO_ROWS
@@ -152,9 +152,9 @@ class Batches(Stateful):
         """Plan the shares again, for another number of draws."""
         if self._draws is not None:
             self._draws.replan(planned)
-            self._share_out()
+            self._apply_shares()
 
-    def _share_out(self) -> None:
+    def _apply_shares(self) -> None:
         """Set the numbers of logged and fresh rows by the controller's shares."""
         controller = self.controller
         if controller is None:
@@ -235,7 +235,7 @@ class LogTerms:
             return cls(None)
         if not config.loss.margin:
             return cls(None)
-        expert = _expert(config.teacher.policies, logs.behaviour_policy)
+        expert = _expert_mask(config.teacher.policies, logs.behaviour_policy)
         return cls(torch.from_numpy(expert).to(device))
 
     def expert_rows(self, log_rows: Ints) -> Tensor | None:
@@ -245,7 +245,7 @@ class LogTerms:
         return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
 
 
-def drawn_ahead(
+def draw_ahead(
     draw: Callable[[], ReplayBatch], count: int
 ) -> tuple[list[ReplayBatch], MixtureError | None]:
     """Draw `count` batches; return them, and the error that ended the draws early, if any."""
@@ -275,7 +275,7 @@ def _refuse_without_logs(loss: LossConfig) -> None:
         )
 
 
-def _expert(experts: Sequence[str], policy: Coded) -> Bools:
+def _expert_mask(experts: Sequence[str], policy: Coded) -> Bools:
     """Select the rows (n,) of these behaviour policies."""
     _refuse_unknown(experts, policy.names)
     return np.isin(policy.codes, [policy.names.index(name) for name in experts])

@@ -35,7 +35,7 @@ from restock.replay.sampling.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.behaviour import UNKNOWN
 from restock.train.feed.fresh_labels import EpisodeLabels, FreshPerturbations, values_entries
-from restock.train.feed.teacher import AskedTeacher, Label
+from restock.train.feed.teacher import CheckedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
@@ -93,7 +93,7 @@ class Collector(Stateful):
         conditions: Sequence[Condition],
         task: Task,
         executor: Executor | None,
-        teacher: AskedTeacher | None = None,
+        teacher: CheckedTeacher | None = None,
         strata: FreshStrata | None = None,
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
@@ -164,7 +164,7 @@ class Collector(Stateful):
 
     def _step(self, action: NDArray[np.int64]) -> Any:
         if self.teacher is not None:
-            self._label = self.teacher.ask(self.env, self.observation)
+            self._label = self.teacher.query(self.env, self.observation)
         return self.env.step(action)
 
     def finish(

@@ -263,7 +263,7 @@ class LogFidelity:
         self._names, self._bounds = rows.conditions, rows.bounds
         packed = np.asarray(rows.rows.numpy(), np.float64)
         self._observation = packed[:, :observation_size]
-        self.unexplained = self._unexplained(
+        self.unexplained = self._unexplained_shares(
             packed[:, observation_size : 2 * observation_size], packed[:, 2 * observation_size]
         )
 
@@ -293,12 +293,12 @@ class LogFidelity:
             if name in names
         }
 
-    def _unexplained(self, next_observation: F64, action: F64) -> dict[str, float]:
+    def _unexplained_shares(self, next_observation: F64, action: F64) -> dict[str, float]:
         """Return the unexplained share of variance of `next_observation` (n, D)."""
         taken = np.eye(int(action.max()) + 1)[action.astype(np.int64)]
-        features = _standard(np.concatenate([self._observation, taken], axis=1))
+        features = _standardise(np.concatenate([self._observation, taken], axis=1))
         features = np.concatenate([features, np.ones((len(features), 1))], axis=1)
-        target = _standard(next_observation)
+        target = _standardise(next_observation)
         fit = np.arange(len(features)) % 2 == 0  # a random half, as rows are ordered by hash
         x, y = features[fit], target[fit]
         weights = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ y)
@@ -335,6 +335,6 @@ def discriminant(classes: list[F64], rows: F64) -> NDArray[np.int64]:
     return np.asarray(score.argmax(axis=1), np.int64)
 
 
-def _standard(values: F64) -> F64:
+def _standardise(values: F64) -> F64:
     spread = values.std(axis=0)
     return np.asarray((values - values.mean(axis=0)) / np.where(spread > 1e-9, spread, 1.0))

@@ -88,7 +88,7 @@ class Practice(Stateful):
         self.shares: F64 = (
             self.natural if config.rule == "natural" else with_floor(self.weights, self.floor)
         )
-        self._tell()
+        self._send_shares()
 
     # -- counts and shares ----------------------------------------------------------------------
 
@@ -96,7 +96,7 @@ class Practice(Stateful):
         """Count ended missions."""
         fades = 0.5 ** (1 / HALF_LIFE_EPISODES)
         for episode in episodes:
-            place = self._place(episode)
+            place = self._arm_index(episode)
             if place is None:
                 continue
             success = bool(episode.success)
@@ -121,7 +121,7 @@ class Practice(Stateful):
         self._interval_episodes[:] = self._interval_successes[:] = 0
         if self._fixed is None and not last:
             self.shares = moved(self.shares, with_floor(self.weights, self.floor), MAX_CHANGE)
-            self._tell()
+            self._send_shares()
         return rows
 
     @property
@@ -156,7 +156,7 @@ class Practice(Stateful):
             self.shares = self.natural
         elif self._fixed is not None:
             self.shares = with_floor(self._fixed, self.floor)
-        self._tell()
+        self._send_shares()
 
     def mismatch(self, name: str, value: Any) -> Exception:
         """Return the error for a run that practised other arms."""
@@ -166,7 +166,7 @@ class Practice(Stateful):
             remedy="resume it with its own env, or start another run",
         )
 
-    def _tell(self) -> None:
+    def _send_shares(self) -> None:
         if self._set is not None and self.config.rule != "natural":
             self._set(self.shares.tolist())
 
@@ -192,7 +192,7 @@ class Practice(Stateful):
             for place, arm in enumerate(self.arms)
         ]
 
-    def _place(self, episode: EndedEpisode) -> int | None:
+    def _arm_index(self, episode: EndedEpisode) -> int | None:
         """Return the index of an episode's arm; None if it belongs to no arm."""
         if episode.arm >= 0:
             return episode.arm

@@ -61,7 +61,7 @@ class SampledRows(Stateful):
         self._kinds = {name: np.dtype(kind) for name, kind in kinds.items()}
         self._places = {name: place for place, name in enumerate(kinds)}
         self._count = self._last = 0
-        self._held = self._made(0)  # arrays with room for more rows
+        self._held = self._allocate(0)  # arrays with room for more rows
 
     def __len__(self) -> int:
         return self._count
@@ -71,7 +71,7 @@ class SampledRows(Stateful):
         begin, self._last = self._count, self._count
         self._count += rows
         if self._count > len(self._held[0]):
-            longer = self._made(max(2 * self._count, _MIN_ROOM))
+            longer = self._allocate(max(2 * self._count, _MIN_ROOM))
             for column, old in zip(longer, self._held, strict=True):
                 column[:begin] = old[:begin]
             self._held = longer
@@ -86,13 +86,13 @@ class SampledRows(Stateful):
     def clear(self) -> None:
         """Remove all rows; columns returned earlier stay valid."""
         if self._count:
-            self._held = self._made(self._count)  # room for as many rows as before
+            self._held = self._allocate(self._count)  # room for as many rows as before
         self._count = self._last = 0
 
     @property
     def last(self) -> dict[str, NDArray[Any]]:
         """Return the rows last appended."""
-        return self._since(self._last)
+        return self._rows_from(self._last)
 
     def last_of(self, *names: str) -> tuple[NDArray[Any], ...]:
         """Return some columns of the rows last appended."""
@@ -102,18 +102,18 @@ class SampledRows(Stateful):
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return all rows."""
-        return self._since(0)
+        return self._rows_from(0)
 
     @columns.setter
     def columns(self, columns: Arrays) -> None:
         self._held = tuple(np.array(columns[name], kind) for name, kind in self._kinds.items())
         self._count, self._last = len(self._held[0]), 0
 
-    def _since(self, begin: int) -> dict[str, NDArray[Any]]:
+    def _rows_from(self, begin: int) -> dict[str, NDArray[Any]]:
         named = zip(self._kinds, self._held, strict=True)
         return {name: column[begin : self._count] for name, column in named}
 
-    def _made(self, rows: int) -> tuple[NDArray[Any], ...]:
+    def _allocate(self, rows: int) -> tuple[NDArray[Any], ...]:
         return tuple(np.empty(rows, kind) for kind in self._kinds.values())
 
 

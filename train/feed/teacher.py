@@ -89,7 +89,7 @@ class OperatorTeacher(Stateful):
         return self._operator.choose(env)
 
 
-class _Called:
+class _FunctionTeacher:
     """A function wrapped as a teacher."""
 
     def __init__(self, function: Any) -> None:
@@ -100,7 +100,7 @@ class TeacherFailed(ConfigError):
     """The teacher raised an error or returned invalid actions."""
 
 
-class AskedTeacher(Stateful):
+class CheckedTeacher(Stateful):
     """A teacher whose answers are checked.
 
     Args:
@@ -114,13 +114,13 @@ class AskedTeacher(Stateful):
     def __init__(self, teacher: Teacher, task: Task, name: str) -> None:
         self._teacher, self._actions, self._name = teacher, task.action_names, name
 
-    def ask(self, env: Any, observation: F32) -> Label:
+    def query(self, env: Any, observation: F32) -> Label:
         """Return the teacher's action in each environment, (N,); UNKNOWN if it has no opinion.
 
         Raises:
             TeacherFailed: the teacher raised an error, or did not return N actions of the task.
         """
-        with _of_the_user(f"the teacher {self._name}", self._teacher.act):
+        with _user_errors(f"the teacher {self._name}", self._teacher.act):
             # A copy, so that the teacher cannot change what the agent sees and the run keeps.
             given = self._teacher.act(env, observation.copy())
         count = len(observation)
@@ -161,7 +161,7 @@ class AskedTeacher(Stateful):
 
 def open_teacher(
     config: TeacherConfig, task: Task, *, seed: int, given: Any = None
-) -> AskedTeacher | None:
+) -> CheckedTeacher | None:
     """Make the teacher that a run queries in the twin; None if there is none.
 
     Args:
@@ -172,15 +172,15 @@ def open_teacher(
         ConfigError: there is no such module or name, or it has no `act` and cannot be called.
         TeacherFailed: creating or importing the teacher raised an error.
     """
-    if config.source is None or not config.asks:
+    if config.source is None or not config.queried:
         return None
     if config.source == "operator":
-        return AskedTeacher(OperatorTeacher(seed), task, config.source)
+        return CheckedTeacher(OperatorTeacher(seed), task, config.source)
     if given is None:
-        given = _imported(config.source)
+        given = _import_teacher(config.source)
     name = config.source if config.source != GIVEN else type(given).__name__
     if isinstance(given, type):
-        with _of_the_user(f"making the teacher {name}", given):
+        with _user_errors(f"making the teacher {name}", given):
             given = given()
     if not hasattr(given, "act"):
         if not callable(given):
@@ -189,12 +189,12 @@ def open_teacher(
                 where="teacher.source",
                 remedy="give an object with act(env, observation), or such a function",
             )
-        given = _Called(given)
-    return AskedTeacher(given, task, name)
+        given = _FunctionTeacher(given)
+    return CheckedTeacher(given, task, name)
 
 
 @contextmanager
-def _of_the_user(what: str, called: Any) -> Iterator[None]:
+def _user_errors(what: str, called: Any) -> Iterator[None]:
     """Turn an error in the user's code into a TeacherFailed that names its file and line.
 
     This includes SystemExit, which would end the run without a message.
@@ -204,20 +204,20 @@ def _of_the_user(what: str, called: Any) -> Iterator[None]:
     except RestockError:
         raise
     except (Exception, SystemExit) as error:
-        raise _raised(what, called, error) from error
+        raise _teacher_error(what, called, error) from error
 
 
-def _raised(what: str, called: Any, error: BaseException) -> TeacherFailed:
-    said = f": {first_line(error)}" if str(error) else ""
+def _teacher_error(what: str, called: Any, error: BaseException) -> TeacherFailed:
+    message = f": {first_line(error)}" if str(error) else ""
     return TeacherFailed(
-        f"{what} raised {type(error).__name__}{said}",
-        where=_place(called, error),
+        f"{what} raised {type(error).__name__}{message}",
+        where=_user_location(called, error),
         remedy="correct it: it is called as act(env, observation), and a class is created without "
         "arguments",
     )
 
 
-def _place(called: Any, error: BaseException) -> str:
+def _user_location(called: Any, error: BaseException) -> str:
     """Return FILE:LINE of the user's innermost line in the traceback, or of the called object.
 
     Frames of libraries and of Restock, which the user's code may call, do not count.
@@ -239,7 +239,7 @@ def _place(called: Any, error: BaseException) -> str:
         return "teacher.source"
 
 
-def _imported(source: str) -> Any:
+def _import_teacher(source: str) -> Any:
     """Import `module:name`; modules in the working directory are found, too."""
     if source == GIVEN:
         raise ConfigError(
@@ -260,12 +260,12 @@ def _imported(source: str) -> Any:
             "the name of the teacher in it",
         ) from error
     except (Exception, SystemExit) as error:
-        raise _raised(f"importing {source}", None, error) from error
+        raise _teacher_error(f"importing {source}", None, error) from error
     finally:
         sys.path.remove(here)
 
 
-_MEASURED = 128  # rows per condition
+_MAX_MEASURED = 128  # rows per condition
 _LOGS_SHARE = 0.25  # share of an online batch, if a teacher is queried
 
 
@@ -299,7 +299,7 @@ def packed_successes(policy: Coded, episode: Coded, packed: F32, policies: Seque
     return rows_of_successes(policy, episode, reward, discount, policies)
 
 
-def cloned(panel: Panel, teacher: TeacherConfig) -> Bools:
+def select_cloned(panel: Panel, teacher: TeacherConfig) -> Bools:
     """Select the rows (n,) of a panel that are cloned before the first environment step."""
     policy = Coded.of(panel.meta["behaviour_policy"])
     rows = rows_of_policies(policy, teacher.policies)
@@ -335,7 +335,7 @@ class Imitation(Stateful):
         self.logs, self.ring, self._mirror = logs, ring, mirror
         self.batch_size, self._seed = batch_size, seed
         self._rng = np.random.default_rng([seed, 7])
-        self._offline = self._online = _Drawn(np.empty(0, np.int64), np.empty(0))
+        self._offline = self._online = _WeightedRows(np.empty(0, np.int64), np.empty(0))
         if logs is not None:
             by_teacher = rows_of_policies(logs.behaviour_policy, config.policies)
             every = by_teacher
@@ -343,16 +343,16 @@ class Imitation(Stateful):
                 every = by_teacher | packed_successes(
                     *(logs.behaviour_policy, logs.episode, logs.rows.numpy(), config.policies)
                 )
-            self._offline = _Drawn.of(logs, every)
+            self._offline = _WeightedRows.of(logs, every)
             # Answers in the agent's own states are worth more than other drivers' successes.
-            self._online = _Drawn.of(logs, by_teacher) if config.asks else self._offline
+            self._online = _WeightedRows.of(logs, by_teacher) if config.queried else self._offline
         if not len(self._offline.rows):
             names = None if logs is None else logs.behaviour_policy.names[:-1]  # the last: unknown
-            refuse_nothing_to_learn(config, names)
+            refuse_no_rows(config, names)
         self.offline_updates = (config.offline_updates or 0) if len(self._offline.rows) else 0
         self._logged = 0  # rows of an online batch
         if len(self._online.rows):
-            self._logged = round(batch_size * _LOGS_SHARE) if config.asks else batch_size
+            self._logged = round(batch_size * _LOGS_SHARE) if config.queried else batch_size
 
     @property
     def cloned(self) -> Ints:
@@ -367,7 +367,7 @@ class Imitation(Stateful):
         """Draw a batch (M,) of logged rows, then fresh ones; all logged while the ring is empty."""
         return self._gather(self._online, self._logged if len(self.ring) else self.batch_size)
 
-    def _gather(self, drawn: _Drawn, logged: int) -> Labelled:
+    def _gather(self, drawn: _WeightedRows, logged: int) -> Labelled:
         rows = drawn.sample(logged, self._rng)
         fresh = self.batch_size - logged
         slots = self.ring.sample(fresh, self._rng) if fresh else np.empty(0, np.int64)
@@ -400,24 +400,24 @@ class Imitation(Stateful):
         if self.logs is not None and len(self.cloned):
             codes = self.logs.condition.codes[self.cloned]
             for code in np.unique(codes).tolist():
-                rows = _some(self.cloned[codes == code], rng)
+                rows = _sample_rows(self.cloned[codes == code], rng)
                 groups["logs", self.logs.condition.names[code]] = self._states(rows, none)
         for code, name in enumerate(self.ring.conditions):
-            slots = _some(np.sort(self.ring.by_condition.members(code)), rng)
+            slots = _sample_rows(np.sort(self.ring.by_condition.members(code)), rng)
             if len(slots):
                 groups["fresh", name] = self._states(none, slots)
         return [
-            {"source": source, "condition": name, **_measured(learner, *states)}
+            {"source": source, "condition": name, **_measure_filter(learner, *states)}
             for (source, name), states in groups.items()
         ]
 
 
-def _some(rows: Ints, rng: np.random.Generator) -> Ints:
-    return rows if len(rows) <= _MEASURED else rng.choice(rows, _MEASURED, replace=False)
+def _sample_rows(rows: Ints, rng: np.random.Generator) -> Ints:
+    return rows if len(rows) <= _MAX_MEASURED else rng.choice(rows, _MAX_MEASURED, replace=False)
 
 
 @torch.no_grad()
-def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, Any]:
+def _measure_filter(learner: Learner, observation: F32, action: Ints) -> Mapping[str, Any]:
     """Measure the filter in states (n, D) with the teacher's actions (n,)."""
     if learner.behaviour is None:
         raise RuntimeError("there is no behaviour network to measure")
@@ -446,7 +446,7 @@ def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, 
     }
 
 
-def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None) -> None:
+def refuse_no_rows(config: TeacherConfig, logged: Sequence[str] | None) -> None:
     """Raise ConfigError if the logs must have rows of the teacher's policies, but have none.
 
     They must if no teacher is queried in the twin, or if there are logs and the config names other
@@ -455,10 +455,10 @@ def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None)
     Args:
         logged: names of the logs' behaviour policies; None: there are no logs.
     """
-    if not config.filters or set(config.policies) & set(logged or ()):
+    if not config.has_filter or set(config.policies) & set(logged or ()):
         return
     chosen = config.policies and config.policies != TeacherConfig().policies
-    if config.asks and (logged is None or not chosen):
+    if config.queried and (logged is None or not chosen):
         return
     have = "this run has no logs" if logged is None else f"the logs have {', '.join(logged)}"
     raise ConfigError(
@@ -470,14 +470,14 @@ def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None)
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _WeightedRows:
     """Logged rows (n,) with their cumulative probabilities, by the shares of their strata."""
 
     rows: Ints
     cumulative: F64
 
     @classmethod
-    def of(cls, logs: Logs, chosen: Bools) -> _Drawn:
+    def of(cls, logs: Logs, chosen: Bools) -> _WeightedRows:
         weight = np.zeros(len(logs))
         for share, members in zip(logs.shares, logs.stratum_rows, strict=True):
             inside = members[chosen[members]]

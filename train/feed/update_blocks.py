@@ -28,12 +28,12 @@ from restock.train.dqn.behaviour import Labelled
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner, Terms
 from restock.train.dqn.network import averaging_rate
-from restock.train.feed.batches import Batches, LogTerms, ReplayBatch, drawn_ahead
+from restock.train.feed.batches import Batches, LogTerms, ReplayBatch, draw_ahead
 from restock.train.feed.teacher import Imitation
 
 LONGEST = 16  # most updates of a block
 # A batch, its loss, and its rows' action, reward and discount (B, 3); None: read from the batch.
-Made = tuple[ReplayBatch, Loss, Tensor | None]
+MadeUpdate = tuple[ReplayBatch, Loss, Tensor | None]
 
 
 class DeviceTable:
@@ -97,7 +97,7 @@ class UpdateBlocks:
 
     def make(
         self, count: int, draw: Callable[[], ReplayBatch], *, conservative: float, labelled: bool
-    ) -> Iterator[Made]:
+    ) -> Iterator[MadeUpdate]:
         """Make `count` updates, and yield each once the learner has counted it.
 
         Args:
@@ -112,20 +112,20 @@ class UpdateBlocks:
         waiting: list[ReplayBatch] = []
         launched: Launched | None = None
         while count:
-            drawn, failed = drawn_ahead(draw, min(longest, count))
+            drawn, failed = draw_ahead(draw, min(longest, count))
             before, made = waiting, launched
             if drawn:
                 launched = self._launch(drawn, conservative, labelled, ahead=len(before))
             if made is not None:
-                yield from self._given_out(before, made, labelled)
+                yield from self._yield_updates(before, made, labelled)
             waiting, count = drawn, count - len(drawn)
             if launched is not None and (self.batches.needs_td or failed is not None):
-                yield from self._given_out(waiting, launched, labelled)
+                yield from self._yield_updates(waiting, launched, labelled)
                 waiting, launched = [], None
             if failed is not None:
                 raise failed
         if launched is not None:
-            yield from self._given_out(waiting, launched, labelled)
+            yield from self._yield_updates(waiting, launched, labelled)
 
     def _launch(
         self, drawn: Sequence[ReplayBatch], conservative: float, labelled: bool, ahead: int
@@ -150,9 +150,9 @@ class UpdateBlocks:
         )
         return self._updates.launch(block, ahead)
 
-    def _given_out(
+    def _yield_updates(
         self, drawn: Sequence[ReplayBatch], launched: Launched, labelled: bool
-    ) -> Iterator[Made]:
+    ) -> Iterator[MadeUpdate]:
         outcome = launched.outcome()
         for k, batch in enumerate(drawn):
             self.learner.count(1, labelled=labelled)
@@ -273,13 +273,13 @@ class CapturedUpdates:
             self._send(self._labelled.observation, block.labelled.observation)
             self._send(self._labelled.action, block.labelled.action)
         if self._rows.is_cuda and labels not in self._graphs:
-            self._graphs[labels] = self._captured(labels)
+            self._graphs[labels] = self._capture(labels)
         self._cursor.zero_()
         for _ in range(count):
             if self._rows.is_cuda:
                 self._graphs[labels].replay()
             else:
-                self._one(labels)
+                self._update_once(labels)
         return Launched(self._per_row[:count], self._loss[:count])
 
     def _scalars_of(self, block: UpdateBlock, ahead: int) -> Tensor:
@@ -298,19 +298,19 @@ class CapturedUpdates:
             values = values.pin_memory()
         place[: len(values)].copy_(values, non_blocking=True)
 
-    def _now(self, of_block: Tensor) -> Tensor:
+    def _at_cursor(self, of_block: Tensor) -> Tensor:
         """Return the current update's slice of (K, ...)."""
         return of_block.index_select(0, self._cursor).squeeze(0)
 
-    def _one(self, labels: bool) -> None:
+    def _update_once(self, labels: bool) -> None:
         """Make the update at the cursor, and advance the cursor."""
-        row = self._now(self._rows)
+        row = self._at_cursor(self._rows)
         rows = self.table.index_select(0, row)
-        logged, conservative, rate, behaviour_rate = self._now(self._scalars).unbind()
+        logged, conservative, rate, behaviour_rate = self._at_cursor(self._scalars).unbind()
         is_logged = self._place < logged
         expert = None if self._expert is None else self._expert[row]
         terms = Terms(
-            weight=self._now(self._weight),
+            weight=self._at_cursor(self._weight),
             logged=len(rows),
             conservative=is_logged * conservative if self._has_conservative else 0.0,
             expert=expert,
@@ -318,7 +318,7 @@ class CapturedUpdates:
         labelled = None
         if labels and self._labelled is not None:
             given = self._labelled
-            labelled = Labelled(self._now(given.observation), self._now(given.action))
+            labelled = Labelled(self._at_cursor(given.observation), self._at_cursor(given.action))
         loss = self.learner.move(rows, terms, labelled, rate, behaviour_rate)
         tail = rows[:, -3:].T
         per_row = torch.cat([loss.td.unsqueeze(0), loss.q.unsqueeze(0), tail])
@@ -326,7 +326,7 @@ class CapturedUpdates:
         self._loss.index_copy_(0, self._cursor, loss.value.view(1))
         self._cursor.add_(1)
 
-    def _captured(self, labels: bool) -> torch.cuda.CUDAGraph:
+    def _capture(self, labels: bool) -> torch.cuda.CUDAGraph:
         """Capture an update as a graph, and restore the parameters that warming up changed."""
         moved = self.learner.moved
         before = [tensor.clone() for tensor in moved]
@@ -335,11 +335,11 @@ class CapturedUpdates:
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
             for _ in range(min(_WARM_UP, self.longest)):
-                self._one(labels)
+                self._update_once(labels)
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            self._one(labels)
+            self._update_once(labels)
         with torch.no_grad():
             for tensor, value in zip(moved, before, strict=True):
                 tensor.copy_(value)

@@ -250,11 +250,11 @@ def check_free(path: Path, remedy: str | None = None) -> None:
             "already exists",
             where=str(path),
             remedy=remedy
-            or f"choose another --out, remove it, or continue it with {resuming(path)}",
+            or f"choose another --out, remove it, or continue it with {resume_command(path)}",
         )
 
 
-def resuming(path: Path) -> str:
+def resume_command(path: Path) -> str:
     """Return the command that continues a run, to paste into a shell."""
     return f"`restock train --resume {quoted(path)}`"
 

@@ -104,7 +104,7 @@ class TrainCommand:
 def _train(prepared: Prepared) -> TrainResult:
     """Train to the end of the budget, with a progress bar."""
     from restock.train.loop import TrainingInterrupted, nothing_to_do, train
-    from restock.train.run.run import resuming
+    from restock.train.run.run import resume_command
 
     config = prepared.config
     session = prepared.open()
@@ -147,7 +147,7 @@ def _train(prepared: Prepared) -> TrainResult:
                     if kept
                     else "ended at once, before its first checkpoint",
                     where=str(path),
-                    remedy=f"continue with {resuming(path)}"
+                    remedy=f"continue with {resume_command(path)}"
                     if kept
                     else "remove it, and train again",
                 ) from None
@@ -253,7 +253,7 @@ def describe_run(prepared: Prepared) -> str:
     ]
     if panel is not None:
         lines += describe_forecast(document["panel"], config)
-    if config.teacher.filters:
+    if config.teacher.has_filter:
         lines.append(_teacher(config.teacher, panel))
     elif config.teacher.source == PLANNER:
         lines.append(
@@ -326,7 +326,7 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
 
 
 def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
-    from restock.train.feed.teacher import cloned
+    from restock.train.feed.teacher import select_cloned
     from restock.train.prepare import rows_by_policy
 
     logged = {} if panel is None else rows_by_policy(panel)
@@ -337,7 +337,7 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
     if there and absent:
         cloned_rows += f" (none of {', '.join(absent)}: the panel has {', '.join(sorted(logged))})"
     if panel is not None and teacher.successes:
-        others = int(cloned(panel, teacher).sum()) - rows
+        others = int(select_cloned(panel, teacher).sum()) - rows
         cloned_rows += (
             f", and {others:,} rows of episodes in which other drivers alone reached the goal,"
         )
