@@ -1,4 +1,4 @@
-"""Stores, mixtures and panels: what is there, what a run samples, and where a row came from."""
+"""Query stores, build panels from mixtures, sample batches, and trace rows to their recordings."""
 
 from __future__ import annotations
 

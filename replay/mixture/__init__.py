@@ -1,1 +1,1 @@
-"""Mixtures: which transitions a learner samples, in which shares, as a file."""
+"""Mixture files (which transitions a learner samples, in which shares) and the shares of a run."""

@@ -1,7 +1,7 @@
 """A mixture: which transitions a learner samples, in which shares, as a TOML file.
 
-Only what the file says happens: unknown keys are refused with their path, and every default is
-visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.
+Unknown keys are refused with their path. `restock mix --dry-run` shows every default, and
+`docs/mixture.md` explains each key.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ Correction = Literal["none", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
 Uncertain = Literal["drop", "keep", "nominal"]
-Within = Annotated[str, Meta(extra_json_schema={"enum": list(RULES)})]  # a rule of RULES
-Represents = Literal["natural", "archive"] | dict[str, Fraction]  # rates of rows, by stratum
+Within = Annotated[str, Meta(extra_json_schema={"enum": list(RULES)})]  # a key of RULES
+Represents = Literal["natural", "archive"] | dict[str, Fraction]  # or: stratum -> rate of rows
 
 
 class OtherStore(Checked, frozen=True):
-    """One more store that batches are drawn from, with the same strata and shares of its own."""
+    """Another store to draw from. It has the mixture's strata, and a share of each batch."""
 
     name: str  # its strata are named `name/stratum`
-    path: str  # absolute, or relative to the mixture's file; PATH@VERSION: not the newest
+    path: str  # absolute, or relative to the mixture's file; PATH@VERSION for an older version
     share: Fraction  # share of a batch
-    # What its rows stand for: how often things occur, the main store's rates, or these.
+    # Rates that its rows represent: their own ("natural"), the main store's ("archive"), or these.
     represents: Represents | None = None
 
     def check(self) -> None:
@@ -57,11 +57,11 @@ class OtherStore(Checked, frozen=True):
 
 
 class SourceShares(Checked, frozen=True):
-    """Shares of an online batch by source; what is left is fresh."""
+    """Shares of an online batch by source; fresh rows take the rest."""
 
     logs: Fraction = 0.5
     stores: tuple[OtherStore, ...] = ()
-    represents: Represents | None = None  # rates of the main store, if its rows are a selection
+    represents: Represents | None = None  # natural rates, if the main store's rows are a selection
 
     def check(self) -> None:
         _check_rates(self.represents)
@@ -83,11 +83,11 @@ class SourceShares(Checked, frozen=True):
 
     @property
     def said(self) -> dict[str, Represents | None]:
-        """Return what the rows of each source except fresh ones represent; None if not stated."""
+        """Return `represents` of each source except fresh rows; None if the mixture omits it."""
         return {"logs": self.represents, **{store.name: store.represents for store in self.stores}}
 
     def chosen(self, name: str) -> bool:
-        """Return whether a source's rows stand for other rates than their own."""
+        """Return whether the mixture gives a source other rates than those of its own rows."""
         return self.said[name] not in (None, "natural")
 
 
@@ -110,10 +110,10 @@ def _check_within(name: str) -> None:
 
 
 class EvaluationSplit(Checked, frozen=True):
-    """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`.
+    """Whole episodes kept out of the panel: `share` of the rows, in groups given by `by`.
 
-    A store of one episode has none to spare. Nor has a store of few episodes, if a whole one is
-    more than twice the share. Then the end of the longest is held out, as by "within_episode".
+    If the store has a single episode, or the one episode chosen is more than twice the share, the
+    end of the longest episode is held out instead, as with "within_episode".
     """
 
     by: Literal["episode", "recording", "robot", "site", "time", "within_episode", "none"] = (
@@ -130,7 +130,7 @@ class EvaluationSplit(Checked, frozen=True):
 
     @property
     def is_empty(self) -> bool:
-        """Return whether it keeps nothing out, whatever the rows."""
+        """Return whether the split holds nothing out, whatever the rows."""
         return self.by == "none" or (self.share == 0 and not self.robots)
 
 
@@ -138,28 +138,28 @@ class Safety(Checked, frozen=True):
     """Rows that must not be learned from."""
 
     unsafe: str  # SQL predicate over `transitions`
-    leave_out: Literal["rows", "episodes"] = "rows"  # only these rows, or all of their episodes
+    leave_out: Literal["rows", "episodes"] = "rows"  # unsafe rows, or whole episodes with one
 
 
 class CorrectionRule(Checked, frozen=True):
-    """Importance weights against the boost of strata, by what their condition may look at."""
+    """Importance weights that offset the boost of strata, by the timing of their condition."""
 
-    pre: Correction = "none"  # chosen on the state: does not bias Q
-    post: Correction = "density_ratio"  # chosen on the outcome: biases Q if uncorrected
-    clip: FromOne = 4.0  # largest weight of "clipped" (and smallest inverse) and "density_ratio"
-    # Of weights that take a stratum's share of the gradient below its share of the rows.
+    pre: Correction = "none"  # selected by state: a boost does not bias Q
+    post: Correction = "density_ratio"  # selected by outcome: an uncorrected boost biases Q
+    clip: FromOne = 4.0  # largest weight; "clipped" weights are also at least 1 / clip
+    # What to do if weights take a stratum's share of the gradient below its share of the rows.
     below_natural: Literal["refuse", "allow"] = "refuse"
 
 
 class StratumLimits(Checked, frozen=True, kw_only=True):
-    """Keys of one stratum and of all at once."""
+    """Keys that [[strata]] and [each_condition] share."""
 
-    unit: Unit = "step"  # "episode": all rows of its episodes; nominal: the rest
-    min_steps: AtLeastOne = 1  # number of steps of an episode in which it must hold
+    unit: Unit = "step"  # "episode": all rows of episodes that met it; nominal: all other episodes
+    min_steps: AtLeastOne = 1  # with unit "episode": steps of the episode in which it must hold
     floor: Fraction = 0.0
     cap: Fraction = 1.0
     correction: Correction | None = None  # default: the mixture's rule for its timing
-    within: Within | None = None  # default: the mixture's
+    within: Within | None = None  # default: the mixture's `within`
 
     def check(self) -> None:
         name = getattr(self, "name", "each_condition")
@@ -176,11 +176,11 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
 
 
 class StratumRule(StratumLimits, frozen=True, kw_only=True):
-    """What one stratum gets. A row goes to the matching stratum of the lowest priority number."""
+    """One stratum of [[strata]]. A row goes to the matching stratum with the lowest `priority`."""
 
     name: str  # name of a condition or exposure, "nominal", or any name with `where`
     where: str | None = None  # SQL predicate over `transitions`
-    share: Share = "natural"  # share of its source's part of a batch
+    share: Share = "natural"  # share of the rows that a batch takes from its source
     priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
     timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
 
@@ -198,7 +198,7 @@ class EachCondition(StratumLimits, frozen=True, kw_only=True):
 
     share: Literal["natural", "equal"] = "natural"
     kind: Literal["outcome", "exposure"] = (
-        "outcome"  # conditions, or situations whatever the outcome
+        "outcome"  # "exposure": strata of situations met, whatever their outcome
     )
 
 
@@ -209,7 +209,7 @@ class Mixture(Checked, frozen=True):
     seed: int = 0
     # How rows are packed.
     discount: Fraction = 0.99  # discount (gamma) per step
-    n_step: AtLeastOne = 1  # steps of a logged row's return; ends with the episode, or the policy
+    n_step: AtLeastOne = 1  # steps of a return; stops where the episode or the policy ends
     evaluation_split: EvaluationSplit = EvaluationSplit()
     # Which rows may be drawn.
     where: str | None = None  # SQL predicate: only these transitions
@@ -221,11 +221,11 @@ class Mixture(Checked, frozen=True):
     max_rows_per_episode: AtLeastOne | None = None  # per stratum
     max_rows_per_recording: AtLeastOne | None = None
     unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
-    uncertain: Uncertain = "nominal"  # uncertain conditions: not held; keep: as labelled
+    uncertain: Uncertain = "nominal"  # nominal: uncertain labels do not count; keep: they do
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
     # In which shares.
     sources: SourceShares = SourceShares()
-    # Rows that will be drawn, as far as `restock mix` can know; a run puts its own in its place.
+    # Rows that a run is assumed to draw. A run replaces this number with its own.
     planned_draws: AtLeastOne = 20_000 * 128
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
@@ -238,7 +238,7 @@ class Mixture(Checked, frozen=True):
 
     @property
     def most_draws(self) -> int | None:
-        """Return the maximum number of draws of one row, rounded down."""
+        """Return `max_replays_per_row` rounded down; None for no limit."""
         return None if self.max_replays_per_row is None else int(self.max_replays_per_row)
 
     def check(self) -> None:
@@ -264,7 +264,7 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
     """Load a shipped mixture by name, or a TOML file.
 
     Raises:
-        ConfigError: no such name or file, no TOML, an unknown key or a value that is not valid.
+        ConfigError: no such name or file, invalid TOML, an unknown key or an invalid value.
     """
     name = str(name_or_path)
     path = Path(name)
@@ -282,7 +282,7 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
 
 
 def parse_mixture(text: str, *, where: str = "mixture") -> Mixture:
-    """Return a mixture from TOML text. Raises ConfigError with the path of what is wrong."""
+    """Parse a mixture from TOML text. Raises ConfigError with the path of the invalid key."""
     return _mixture(parse_toml(text, where=where), where)
 
 

@@ -1,14 +1,15 @@
-"""The shares of a run: which part of a batch each stratum gets now, and what was drawn of each.
+"""The shares of a run: the share of a batch that each stratum gets now, and its draws so far.
 
-A panel's shares are a plan for the mixture's `planned_draws`. A run knows how much it will draw,
-and at which environment step: the controller plans the mixture for that run, and counts what is
-drawn, so that no stratum gives more than its rows may give under `max_replays_per_row`.
+A panel's shares are planned for the mixture's `planned_draws`. The controller plans them again for
+the draws and environment steps of the actual run. It counts draws, so that no row is drawn more
+than `max_replays_per_row` times on average over its stratum.
 
-A quota is a stratum's share of the batch, whether its rows are logged or fresh. Logged rows give
-what the mixture asks of the logs, as far as `max_replays_per_row` lets them, spread evenly over the
-run. Fresh rows of the same stratum give the rest. If the ring has too few of them, logged rows that
-may still be drawn fill in. What neither has is short, and its places go to fresh rows of any kind.
-A learner without a ring has logged rows alone: there, `shortfall` decides.
+A quota is a stratum's share of the batch, whether its rows are logged or fresh. Logged rows fill
+the share that the mixture wants from the logs, as far as `max_replays_per_row` allows, spread
+evenly over the run. Fresh rows of the same stratum fill the rest. If the ring has too few of them,
+logged rows that may still be drawn fill in. If there are still too few, the stratum is short, and
+fresh rows of any stratum take its places. A learner without a ring has only logged rows: for it,
+the mixture's `shortfall` decides what happens.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from restock.replay.mixture.mixture import (
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.state import Stateful
 
-REFRESH_BATCHES = 64  # shares that move are worked out again after so many
-_SAME = 0.01  # of a share: a smaller change waits
-_SHORT = 1e-3  # of the rows fed: less is rounding
+REFRESH_BATCHES = 64  # online batches between two updates of the shares
+_SAME = 0.01  # relative change of a share below which shares are kept
+_SHORT = 1e-3  # share of all rows fed below which a shortfall counts as rounding
 
 
 @dataclass(frozen=True)
 class PlannedDraws:
-    """How many rows a run will draw: offline, and online over a span of environment steps."""
+    """Number of rows that a run will draw: offline, and online over a span of environment steps."""
 
-    offline: float = 0.0  # all from logs
-    online: float = 0.0  # from logs and fresh rows
+    offline: float = 0.0  # logged rows only
+    online: float = 0.0  # logged and fresh rows
     begin_env_steps: int = 0
     end_env_steps: int = 0
 
@@ -53,15 +54,15 @@ class SampledStratum:
     name: str
     source: str
     rule: StratumRule
-    rows: int  # in the panel; 0 where it is never drawn
+    rows: int  # in the panel; 0 if it is never drawn
     episodes: int
-    occurs: float | None = None  # how often, where its rows were chosen (an archive, a cap)
-    corrected: bool = False  # whether importance weights take its boost away
+    occurs: float | None = None  # natural share, if its rows are a selection (an archive, a cap)
+    corrected: bool = False  # whether importance weights offset its boost
 
 
 @dataclass
 class _SourceDraws:
-    """The strata of one source, and what it is planned to give."""
+    """The strata of one source, its planned draws, and its shares."""
 
     name: str
     strata: slice
@@ -70,25 +71,26 @@ class _SourceDraws:
     caps: F64
     offline: float  # planned draws
     online: float
-    got: F64  # shares of its strata now
-    natural: Ints | F64  # what divides "natural" shares: rows, or how often strata occur
-    wanted: F64  # the shares asked for
+    got: F64  # current shares of its strata
+    natural: Ints | F64  # "natural" shares are in proportion to it: rows, or natural shares
+    wanted: F64  # shares that the mixture wants
 
 
 class ShareController(Stateful):
-    """Shares in force and draws so far, over the strata of a panel, (S,).
+    """Current shares and draws so far of a panel's strata.
 
     Args:
-        mixture: of the panel.
-        strata: of the panel, source by source.
-        planned: what the run will draw.
-        logs_share: a share of an online batch, in place of the mixture's.
-        fresh: (S,) which strata rows of a ring can be told to be in; None: there is no ring.
+        mixture: the panel's mixture.
+        strata: the panel's strata, source by source.
+        planned: number of rows that the run will draw.
+        logs_share: share of logged rows in an online batch; None: the mixture's.
+        fresh: (S,) whether labels can put fresh rows into each stratum; None: there is no ring.
 
-    With K sources of S strata, `shares` (K * S,) are of the logged part of a batch and sum to 1,
-    `logs_share` is that part of an online batch, `drawn` (K * S,) what was drawn of each stratum.
-    Of a whole batch, `wanted` (S,) is the quota of each stratum, `fresh_shares` (S + 1,) what the
-    ring is to give of it and, last, of rows of any kind.
+    With K sources of S strata, `shares` (K * S,) are shares of a batch's logged rows and sum to 1.
+    `logs_share` is the share of logged rows in an online batch, and `drawn` (K * S,) the number of
+    rows drawn from each stratum. `wanted` (S,) is each stratum's quota in the whole batch.
+    `fresh_shares` (S + 1,) are the shares of the whole batch that the ring gives by stratum; the
+    last entry is for fresh rows of any stratum.
 
     Raises:
         MixtureError: too few rows for the offline phase, or a shortfall the mixture refuses.
@@ -110,25 +112,25 @@ class ShareController(Stateful):
         fresh: Bools | None = None,
     ) -> None:
         self.mixture, self.strata, self.planned = mixture, list(strata), planned
-        self.max_replays = mixture.most_draws  # draws of one row at most; None: any number
+        self.max_replays = mixture.most_draws  # largest number of draws of one row; None: no limit
         self.fresh, self.online = fresh, False
         size = len(strata) // len(mixture.sources.parts)
-        self._of: Ints = np.arange(len(strata)) % size  # the stratum of each source's stratum
+        self._of: Ints = np.arange(len(strata)) % size  # index of each entry's stratum, 0..S - 1
         self.wanted: F64 = np.zeros(size)
         self.fresh_shares: F64 = np.append(np.zeros(size), 1.0)
-        self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in batches
+        self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in units of a batch
         self.drawn: Ints = np.zeros(len(strata), np.int64)
-        self.batches = 0  # drawn
+        self.batches = 0  # number drawn
         self.env_steps = 0.0
         self.shares: F64 = np.zeros(len(strata))
         self.logs_share = 0.0
-        self.parts = dict(mixture.sources.parts)  # of an online batch, whatever rows there are
+        self.parts = dict(mixture.sources.parts)  # wanted shares of an online batch, by source
         if logs_share is not None:
             total = max(sum(self.parts.values()), 1e-12)
             self.parts = {name: part * logs_share / total for name, part in self.parts.items()}
         self.sources = [self._source(name) for name in self.parts]
         shares = [stratum.rule.share for stratum in strata]
-        # Where no stratum has a quota, a ring is drawn from as it is.
+        # If no stratum has a quota, the ring is sampled uniformly.
         self._steers = any(share != "natural" for share in shares)
         self._work_out(mixture.shortfall)
         self.planned_shares, self._wanted_offline = self.shares.copy(), self.wanted
@@ -139,7 +141,7 @@ class ShareController(Stateful):
     def fixed(
         cls, names: Sequence[str], rows: Sequence[int], shares: F64, logs_share: float
     ) -> ShareController:
-        """Build a controller whose shares are given and never change."""
+        """Build a controller with fixed shares."""
         rules = tuple(
             StratumRule(name=name, share=float(share))
             for name, share in zip(names, shares, strict=True)
@@ -167,7 +169,7 @@ class ShareController(Stateful):
         )
 
     def _draws_of(self, name: str) -> tuple[float, float]:
-        """Return the rows that a source is to give offline, and online."""
+        """Return the planned draws from a source: offline, and online."""
         part = self.parts[name]
         offline = self.planned.offline * part / max(sum(self.parts.values()), 1e-12)
         return offline, self.planned.online * part
@@ -175,7 +177,7 @@ class ShareController(Stateful):
     def at(self, env_steps: float, stock: F64 | None = None) -> bool:
         """Advance to the next online batch; return whether the shares changed.
 
-        `stock` (S,) is how many fresh rows of each stratum may be drawn, in batches.
+        `stock` (S,) is how many fresh rows of each stratum may be drawn, in units of a batch.
         """
         self.env_steps = env_steps
         if self.fresh is None:
@@ -188,7 +190,7 @@ class ShareController(Stateful):
         return self._work_out("redistribute")
 
     def replan(self, planned: PlannedDraws) -> bool:
-        """Plan for other draws from the next batch on. True if the shares changed."""
+        """Plan for other draws from the next batch on; return whether the shares changed."""
         self._plan_for(planned)
         return self._work_out("redistribute")
 
@@ -203,11 +205,11 @@ class ShareController(Stateful):
         self.drawn += np.bincount(stratum, minlength=len(self.drawn))
 
     def give_up(self) -> bool:
-        """Redistribute shares once a stratum's draws are used up; return whether they changed."""
+        """Redistribute shares after a stratum used up its draws; return whether they changed."""
         return self._work_out("redistribute")
 
     def _work_out(self, shortfall: Shortfall) -> bool:
-        """Compute the shares for now, within the draws that the rows still allow."""
+        """Compute the current shares within the draws left; return whether they changed."""
         if self.online:
             return self._beside_ring()
         if self.mixture.shortfall == "shrink" and self.fresh is None:
@@ -227,17 +229,17 @@ class ShareController(Stateful):
 
     @property
     def _requested(self) -> F64:
-        """Return the shares (K * S,) of an online batch that the mixture asks of the logs."""
+        """Return the shares of an online batch that the mixture wants from the logs, (K * S,)."""
         return np.concatenate([self.parts[source.name] * source.wanted for source in self.sources])
 
     def _beside_ring(self) -> bool:
-        """Compute the shares of logged and fresh rows in an online batch; tell if they moved."""
+        """Compute shares of logged and fresh rows in an online batch; return if they changed."""
         logs, fresh, wanted = self._split(self.stock, self._limits())
         self.wanted = wanted
         fresh_shares = np.append(fresh, max(1.0 - logs.sum() - fresh.sum(), 0.0))
         logs_share = float(logs.sum())
         before = self.shares * self.logs_share
-        # A small change waits: with each, what was drawn ahead is drawn again.
+        # Ignore small changes: after each change, batches drawn ahead must be drawn again.
         same = np.abs(np.append(logs, fresh_shares) - np.append(before, self.fresh_shares))
         if (same < _SAME * np.append(logs, fresh_shares) + 1e-9).all():
             return False
@@ -246,9 +248,9 @@ class ShareController(Stateful):
         return True
 
     def _split(self, stock: F64, limit: F64) -> tuple[F64, F64, F64]:
-        """Split a batch: shares from the logs (K * S,), from the ring (S,), and wanted (S,).
+        """Return shares of a batch: from the logs (K * S,), from the ring (S,), and wanted (S,).
 
-        `stock` (S,) bounds what the ring gives, `limit` (K * S,) what logged rows bear.
+        `stock` (S,) limits the shares from the ring, `limit` (K * S,) those from the logs.
         """
         requested, logged = self._requested, sum(self.parts.values())
         wanted = np.bincount(self._of, requested) + max(1.0 - logged, 0.0) * self._wanted_fresh(
@@ -259,7 +261,7 @@ class ShareController(Stateful):
             return logs, np.zeros(len(wanted)), wanted
         rest = np.maximum(wanted - np.bincount(self._of, logs), 0.0)
         fresh = np.minimum(rest * self.boosted, stock)
-        # Logged rows fill in for what the ring does not give, if they may be drawn more often.
+        # Logged rows that may be drawn more often replace missing fresh rows.
         room = limit - logs
         of_stratum = np.bincount(self._of, room)
         lack = np.minimum(rest - fresh, of_stratum)
@@ -268,25 +270,29 @@ class ShareController(Stateful):
 
     @property
     def natural(self) -> F64:
-        """Return how often each stratum occurs in the logs, (S,)."""
+        """Return the natural share of each stratum in the logs, (S,)."""
         rows = np.sum([source.natural for source in self.sources], axis=0, dtype=np.float64)
         return np.asarray(rows / max(rows.sum(), 1e-12))
 
     @property
     def boosted(self) -> Bools:
-        """Return whether fresh rows of a stratum (S,) are drawn by quota.
+        """Return which strata (S,) draw fresh rows by quota.
 
-        They are not if importance weights offset the stratum's boost: fresh rows have no weights.
+        A stratum whose boost importance weights offset does not, because fresh rows have no
+        weights.
         """
         corrected = np.array([stratum.corrected for stratum in self.strata[: len(self.wanted)]])
         known = np.zeros(len(corrected), np.bool_) if self.fresh is None else self.fresh
         return np.asarray(known & ~corrected, np.bool_)
 
     def _wanted_fresh(self, stock: F64) -> F64:
-        """Return the shares (S,) of fresh rows: natural strata as often as the ring has them."""
+        """Return wanted shares of fresh rows, (S,).
+
+        "natural" shares are in proportion to the ring's rows, or to the logs' if it has none.
+        """
         source = self.sources[0]
         if all(rule.share != "natural" for rule in source.rules):
-            return source.wanted  # whatever the rows
+            return source.wanted  # does not depend on the rows
         have = stock if np.isfinite(stock).all() and stock.sum() > 0 else source.natural
         return wanted_shares(source.rules, have)
 
@@ -299,7 +305,7 @@ class ShareController(Stateful):
         begin, end = planned.begin_env_steps, planned.end_env_steps
         now = begin if from_start else min(max(self.env_steps, begin), end)
         drawn: F64 = self.drawn.astype(np.float64)
-        if from_start:  # as the offline phase will have drawn
+        if from_start:  # assume that the offline phase draws as planned
             offline = [source.offline * source.got for source in self.sources]
             drawn = np.maximum(drawn, np.concatenate(offline))
         left = np.maximum(self.max_replays * rows - drawn, 0.0)
@@ -307,10 +313,11 @@ class ShareController(Stateful):
         return np.minimum(left / max(ahead, 1.0), 1.0)
 
     def forecast(self) -> list[dict[str, Any]]:
-        """Forecast what a run will be fed: one row per stratum, (S,).
+        """Forecast what a run will be fed, one dict per stratum.
 
-        Shares of all rows of its batches: natural, wanted, from logs, from the ring, and short,
-        with the reason. It counts on the ring for every stratum that fresh rows can be in.
+        The shares are of all rows that the run draws: natural, wanted, from the logs, from the
+        ring, and short, with the reason. The forecast assumes that the ring has enough rows of
+        every stratum that fresh rows can be in.
         """
         planned, size = self.planned, len(self.wanted)
         online = planned.online if self.fresh is not None else 0.0
@@ -321,7 +328,7 @@ class ShareController(Stateful):
             limits = self._limits(from_start=True)
             of_logs, of_ring, requested = self._split(np.full(size, np.inf), limits)
             by_stratum = np.bincount(self._of, of_logs)
-            if not self._steers:  # the ring as it is: nothing is asked of it
+            if not self._steers:  # the ring is sampled uniformly and gives what logs do not
                 of_ring = np.maximum(requested - by_stratum, 0.0)
             part = online / total
             logs, fresh, wanted = (
@@ -346,7 +353,7 @@ class ShareController(Stateful):
         ]
 
     def why_short(self, stratum: int) -> str:
-        """Return in words why a stratum gets less of a batch than its quota."""
+        """Explain why a stratum gets less of a batch than its quota."""
         rows = sum(of.rows for of, i in zip(self.strata, self._of, strict=True) if i == stratum)
         limit = self.max_replays
         reason = "the logs have no rows of it"
@@ -364,7 +371,7 @@ class ShareController(Stateful):
         return f"{reason}, and the ring has too few fresh rows of it"
 
     def _refuse_short(self) -> None:
-        """Raise MixtureError if a quota cannot be met, where the mixture refuses that."""
+        """Raise MixtureError if a quota cannot be met."""
         short = [row for row in self.forecast() if row["short_share"] > _SHORT]
         if short:
             raise MixtureError(
@@ -378,7 +385,10 @@ class ShareController(Stateful):
             )
 
     def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
-        """Plan a source: its shares, and how much of its remaining and online draws it can fill."""
+        """Plan a source; return its shares and the fractions of its draws that its rows can fill.
+
+        The first fraction is of all its remaining draws, the second of those online.
+        """
         wanted, drawn = source.wanted, self.drawn[source.strata]
         ahead = max(self._ahead(source, float(drawn.sum())), 1.0)
         limit = np.where(source.rows > 0, 1.0, 0.0)
@@ -414,9 +424,9 @@ class ShareController(Stateful):
     def _ahead(self, source: _SourceDraws, drawn: float) -> float:
         """Return how many draws of a source remain.
 
-        Only the planned draws of later batches count, not those that earlier ones missed.
+        Only the planned draws of later batches count. Draws that earlier batches missed are lost.
         """
-        if self.fresh is not None:  # online, the ring gives what these rows do not bear
+        if self.fresh is not None:  # online, the ring fills in: only offline draws count here
             return source.offline - drawn
         by_draws = source.offline + source.online - drawn
         begin, end = self.planned.begin_env_steps, self.planned.end_env_steps
@@ -426,7 +436,7 @@ class ShareController(Stateful):
         return min(by_draws, source.online * left)
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return a row a stratum, for people and for a run's table `shares`."""
+        """Return one dict per stratum, for the terminal and for a run's table `shares`."""
         limit = self.max_replays
         rows = []
         for i, (stratum, share) in enumerate(zip(self.strata, self.shares.tolist(), strict=True)):
@@ -450,15 +460,15 @@ class ShareController(Stateful):
 
     @property
     def names(self) -> list[str]:
-        """Return the strata's shares, (S,)."""
+        """Return the strata's names, source by source."""
         return [stratum.name for stratum in self.strata]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return arrays and JSON values for a checkpoint."""
+        """Return the state as arrays and JSON values, with the current plan."""
         return super().state_dict() | {"planned": asdict(self.planned)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the state, with the plan of that time.
+        """Restore the state, with the plan that was in force when it was saved.
 
         Raises:
             MixtureError: the state is of other strata.

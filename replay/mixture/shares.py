@@ -1,11 +1,11 @@
-"""Shares of strata: what the mixture wants, within floors, caps and what the rows allow.
+"""Shares of strata: those the mixture wants, limited by floors, caps and the number of rows.
 
-Also the rates that a source's rows stand for. An archive of incident bags is not a natural sample:
-a near collision in every other mission shows what was kept, not how the floor is. `represents` in
-the mixture's sources states the rates. Natural shares (of rows, by stratum) are then the
-represented ones, `share = "natural"` means those, and corrections weigh the rows back to them. A
-cap on an episode's or a recording's rows is a selection, too: the remaining rows stand for all rows
-that the mixture admits.
+Also the natural rates that a source's rows represent. An archive of incident bags is not a natural
+sample: a near collision in every other mission shows which bags were kept, not how often they
+happen on the floor. `represents` in the mixture's sources states the natural rates.
+`share = "natural"` then means these rates, and corrections weight the rows back to them. A cap on
+an episode's or a recording's rows is a selection, too: the remaining rows represent all rows that
+the mixture admits.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from restock.replay.mixture.mixture import (
     StratumRule,
 )
 
-# How many times the others' odds of a condition, by episode, are reason to warn, and to refuse an
-# archive that does not say that it is one; and of how many such episodes. Odds, because what a
-# fifth of all episodes meet can never be five times as frequent.
+# Odds ratio of a condition (by episode, one source against the others) from which to warn of a
+# possible archive, and from which to refuse it if at least ARCHIVE_EPISODES episodes met the
+# condition. Not a ratio of frequencies: more than a fifth can never be five times as frequent.
 WARNING_ODDS, ARCHIVE_ODDS, ARCHIVE_EPISODES = 2.0, 5.0, 5
-Z_99 = 2.576  # standard errors of a normal distribution's two-sided 99 % interval
+Z_99 = 2.576  # half width of a normal distribution's 99 % interval, in standard errors
 
 
 class Source(Protocol):
-    """What must be known of a source's rows, (n,) each."""
+    """The rows of a source; arrays are (n,) unless noted."""
 
     @property
     def name(self) -> str: ...
     @property
     def code(self) -> NDArray[np.int16]: ...
     @property
-    def admitted(self) -> Ints: ...  # (S,) rows of each stratum, those beyond a cap too
+    def admitted(self) -> Ints: ...  # (S,) rows of each stratum, including those beyond a cap
 
 
 class Resolved(Protocol):
-    """What must be known of a stratum."""
+    """A stratum's rule, and its correction as resolved."""
 
     @property
     def rule(self) -> StratumRule: ...
@@ -58,12 +58,13 @@ class Resolved(Protocol):
 def represented_shares(
     mixture: Mixture, strata: Sequence[Resolved], sources: Sequence[Source]
 ) -> list[F64 | None]:
-    """Return the natural share of each stratum (S,) that each source represents.
+    """Return the natural shares of strata (S,) that each source represents.
 
-    It is None if a source represents just its own rows.
+    They are None for a source that represents only its own rows.
 
     Raises:
-        MixtureError: rates that are of no stratum or leave no room for the others.
+        MixtureError: a rate for an unknown stratum, rates below 1 with no other stratum to take
+            the rest, or weighted rows of a stratum with rate 0.
     """
     names = [stratum.rule.name for stratum in strata]
     rows = [np.bincount(source.code, minlength=len(names)) for source in sources]
@@ -85,13 +86,13 @@ def represented_shares(
 
 
 def stands_for_others(mixture: Mixture, source: str) -> bool:
-    """Return whether a source's rows in a panel may stand for other rates than their own."""
+    """Return whether a source's rows in a panel may represent other rates than their own."""
     capped = mixture.max_rows_per_episode or mixture.max_rows_per_recording
     return mixture.sources.chosen(source) or capped is not None
 
 
 def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:
-    """Return the rates as given; what is left to the other strata by their rows."""
+    """Return natural shares (S,): the given rates, and the rest divided by the others' rows."""
     if unknown := sorted(set(rates) - set(names)):
         raise MixtureError(
             f"source {source!r}: `represents` gives a rate for {', '.join(unknown)}, which is not "
@@ -111,7 +112,7 @@ def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: 
 
 
 def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: str) -> None:
-    """Raise if a stratum has rows but no known natural rate: they cannot be weighted back to it."""
+    """Raise MixtureError if a stratum has rows and natural rate 0, which no weights can restore."""
     if all(stratum.correction == "none" for stratum in strata):
         return
     untold = [
@@ -131,18 +132,18 @@ def look_for_archives(
     observed: Mapping[str, Sequence[tuple[int, int]]],
     strata: Collection[str],
 ) -> tuple[str, ...]:
-    """Return warnings for a source where a condition is far more frequent than in the others.
+    """Return a warning if a condition is far more frequent in one source than in the others.
 
-    Of several such conditions, the clearest. Only a source that does not say what it represents is
-    looked at, and compared with those that do not stand for other rates than their own.
+    If there are several, only the clearest is reported. The check covers sources without
+    `represents`, and compares each with the others that represent their own rates.
 
     Args:
-        said: what each source says of itself.
-        observed: condition or exposure -> per source, episodes that met it, and all episodes.
-        strata: names of strata: the rates of others change nothing.
+        said: `represents` of each source.
+        observed: condition or exposure -> for each source, episodes that met it, and all episodes.
+        strata: names of the strata; only their rates affect a panel.
 
     Raises:
-        MixtureError: the same, of a stratum, by ARCHIVE_ODDS.
+        MixtureError: the condition is a stratum and its odds ratio is ARCHIVE_ODDS or more.
     """
     found = []
     for number, (source, represents) in enumerate(said.items()):
@@ -182,12 +183,12 @@ def look_for_archives(
 
 
 def odds_ratio(mine: tuple[int, int], theirs: tuple[int, int]) -> tuple[float, float, float]:
-    """Return the odds as a multiple of the others' odds, with a 99 % interval.
+    """Return the odds ratio of `mine` to `theirs`, and the ends of its 99 % interval.
 
-    The interval is wide because several conditions are compared.
+    The confidence level is high because several conditions are compared.
 
     `mine` and `theirs` are (episodes that met it, episodes). Half an episode is added to each count
-    (Haldane 1956, Anscombe 1956), so that none is 0.
+    (Haldane 1956, Anscombe 1956), so that no count is 0.
     """
     counts = np.array([mine[0], mine[1] - mine[0], theirs[0], theirs[1] - theirs[0]]) + 0.5
     log_odds = float(np.log(counts) @ [1, -1, -1, 1])
@@ -197,11 +198,11 @@ def odds_ratio(mine: tuple[int, int], theirs: tuple[int, int]) -> tuple[float, f
 
 @dataclass(frozen=True)
 class SharePlan:
-    """Shares of the logs' part of a batch, (S,) each."""
+    """Shares of a batch's logged rows, (S,) each."""
 
     wanted: F64  # after floors and caps
     got: F64  # sums to 1
-    scale: float  # of the logs' part of a batch: below 1 only where the mixture shrinks
+    scale: float  # fraction of the logged rows of a batch that can be filled
     notes: tuple[str, ...]  # per stratum, why it got less or more than wanted
 
 
@@ -218,12 +219,12 @@ def plan_shares(
 ) -> SharePlan:
     """Plan shares from the mixture's rules and the number of rows (S,) and episodes (S,).
 
-    `draws` is how many rows will be drawn in all, `natural` (S,) the shares that the rows stand
-    for, where that is not their own. `unknown` are
-    strata that no row could be in, and why; `lacking` others with too few rows, and what to change.
+    `draws` is the number of rows that will be drawn in all. `natural` (S,) are the shares that the
+    rows represent; None: their own. `unknown` maps strata that no recording can label to the
+    reason, `lacking` maps strata with too few rows to what is wrong and what to change.
 
     Raises:
-        MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
+        MixtureError: shares that cannot sum to 1, or a shortfall that the mixture refuses.
     """
     wanted = wanted_shares(rules, rows if natural is None else natural)
     limit = row_limits(mixture, rows, draws)
@@ -255,10 +256,11 @@ def within_limits(
 ) -> SharePlan:
     """Limit wanted shares (S,) to what the rows allow, `limit` (S,).
 
-    `caps` (S,) bound what a stratum takes of the others' surplus; `complaints` says who is short.
+    `caps` (S,) limit the surplus that a stratum takes over from others. `complaints` returns the
+    text for an error: which strata are short.
 
     Raises:
-        MixtureError: a shortfall where it is to be refused, or no rows at all.
+        MixtureError: a shortfall that the mixture refuses, or no rows at all.
     """
     granted = np.minimum(wanted, limit)
     missing = 1.0 - granted.sum()
@@ -282,7 +284,7 @@ def within_limits(
         )
     roof = np.maximum(granted, np.minimum(limit, caps))
     scale = min(float(roof.sum()), 1.0)
-    if scale < 1.0 - 1e-9:  # every stratum is at its limit: what is left cannot come from the logs
+    if scale < 1.0 - 1e-9:  # every stratum is at its limit: the logs cannot fill their share
         notes = np.where(short, "short of rows", np.where(roof > 0, "gives all it can", ""))
         return SharePlan(wanted, roof / scale, scale, tuple(notes.tolist()))
     got = scaled_within(granted, granted, roof)
@@ -291,9 +293,10 @@ def within_limits(
 
 
 def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64) -> F64:
-    """Keep given shares; divide the rest among "equal" and "natural" strata, in floor and cap.
+    """Keep given shares, and divide the rest among "equal" and "natural" strata.
 
-    "natural" strata are divided by their rows (S,), or by what is in their place.
+    Floors and caps limit the divided shares. "natural" ones are in proportion to `rows` (S,), which
+    may also be natural shares.
 
     Raises:
         MixtureError: shares that cannot sum to 1 within their floors and caps.
@@ -322,7 +325,10 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64) -> F64:
 
 
 def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints | F64) -> F64:
-    """Return relative sizes: equal parts; the natural strata's are pooled and split by rows."""
+    """Return relative sizes: 1 for each flexible stratum, "natural" ones pooled and split by rows.
+
+    Sizes of strata with a given share are 0.
+    """
     natural = np.array([share == "natural" for share in shares], np.bool_)
     parts = flexible.astype(np.float64)
     if natural.any():
@@ -341,9 +347,9 @@ def rest_within(base: F64, low: F64, high: F64, total: float) -> F64:
 
 
 def scaled_within(base: F64, low: F64, high: F64) -> F64:
-    """clip(factor * base, low, high) with the factor for which it sums to 1, by bisection.
+    """Return clip(factor * base, low, high), with the factor found by bisection so it sums to 1.
 
-    Where even `high` on every positive part of the base is below 1, the others take the rest.
+    If the entries with a positive base cannot reach 1 even at `high`, the others take the rest.
     """
     usable = np.where(base > 0, high, low)
     if usable.sum() < 1.0:
@@ -371,10 +377,10 @@ def row_limits(mixture: Mixture, rows: Ints, draws: float) -> F64:
 
 
 def missing_rows(mixture: Mixture, rows: Ints, wanted: F64, draws: float) -> Ints:
-    """Return how many rows more each stratum needs, to be drawn as often as it is wanted, (S,)."""
+    """Return how many more rows each stratum needs to fill its wanted share of `draws`, (S,)."""
     needed = np.ones(len(rows))
     if mixture.most_draws is not None:
         needed = np.maximum(needed, wanted * draws / mixture.most_draws)
-    # Rounded down by a hair: what fits exactly misses nothing.
+    # The margin keeps rounding errors from adding a row where the rows just suffice.
     missing = np.ceil(np.where(wanted > 0, needed - rows, 0.0) - 1e-6)
     return np.asarray(np.maximum(missing, 0), np.int64)
