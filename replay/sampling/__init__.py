@@ -1,1 +1,1 @@
-"""From a panel to batches: quotas, priorities, chunks."""
+"""Sample batches: quotas per stratum, rules within a stratum, and the ring of fresh rows."""

@@ -1,18 +1,18 @@
-"""Packed rows: their layout.
+"""The layout of packed rows.
 
-A row is one float32 vector, the same for the panel of logs and the fresh ring:
+A row is one float32 vector. The panel and the fresh ring use the same layout:
 
     [ observation | next_observation | action | reward | discount ]
 
-One gather of packed rows costs about two thirds of gathering five columns. `reward` is the n-step
-return sum(gamma^k r_k), `next_observation` the one n steps later, and `discount` is gamma^n * (not
-terminated), so the target is `reward + discount * max Q(next_observation)` whatever n a row has.
-Truncation is not termination: such a row bootstraps, with the n that it reached.
+Gathering packed rows takes about two thirds of the time of gathering five columns. `reward` is the
+n-step return sum(gamma^k r_k). `next_observation` is the observation n steps later. `discount` is
+gamma^n * (not terminated), so the target is `reward + discount * max Q(next_observation)` for any
+n. A row cut short by truncation has a smaller n and bootstraps.
 """
 
 from __future__ import annotations
 
-# Raised when packing changes, of a row or of what stands beside it; part of a panel's id.
+# Raised when packed rows or a panel's other columns change; part of a panel's id.
 PACKING_VERSION = 6
 
 

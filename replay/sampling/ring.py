@@ -1,15 +1,15 @@
-"""The fresh ring: what the twin just produced, packed like the panel, first in first out.
+"""The fresh ring: the twin's latest transitions, packed like the panel, first in, first out.
 
-Steps of N parallel environments go in; n-step rows come out when they are complete, cut at the end
-of an episode (a truncated one bootstraps with the shortened n). Labels arrive only when an episode
-has ended, because some conditions look ahead: until then its rows can be drawn uniformly, and
-belong to no stratum.
+Steps of N parallel environments go in. Each step becomes an n-step row once it is complete or its
+episode ends (a truncated row bootstraps with the smaller n). Labels arrive only when an episode has
+ended, because some conditions look ahead. Until then its rows can be drawn uniformly, and belong to
+no stratum.
 
-Frequent conditions would push out rare ones. Rows may be reserved for it: then the next row
-overwrites the oldest of those conditions that hold more than what is reserved for them.
+Frequent conditions would push out rare ones. To prevent that, rows may be reserved for a condition:
+a new row then overwrites the oldest row of conditions that hold more rows than are reserved.
 
-Labelled rows also have a stratum, of the mixture that the logs are drawn by, so that a quota can be
-filled with fresh rows where the logs have too few.
+Labelled rows also have a stratum of the mixture, so that fresh rows can fill a quota for which the
+logs have too few rows.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from restock.replay.sampling.rules import uniform_places
 from restock.state import Stateful
 
 NONE = -1
-_VICTIMS = 1024  # slots to be overwritten that are chosen at a time
+_VICTIMS = 1024  # slots to overwrite that are chosen at a time
 
 
 class StratumSlots(Stateful):
     """Slots (0..capacity - 1) in disjoint strata, with constant-time moves and uniform draws.
 
-    A slot that leaves its stratum is replaced by the stratum's last one, so members stay dense.
+    When a slot leaves its stratum, the stratum's last slot takes its place, so members stay dense.
     """
 
     # Draws within a stratum depend on the order of its members, so the order is kept.
@@ -41,14 +41,14 @@ class StratumSlots(Stateful):
 
     def __init__(self, capacity: int, strata: int) -> None:
         self.stratum: NDArray[np.int16] = np.full(capacity, NONE, np.int16)
-        self._place = np.zeros(capacity, np.int64)  # of a slot among its stratum's members
+        self._place = np.zeros(capacity, np.int64)  # index of each slot in its stratum's members
         self._members = [np.empty(64, np.int64) for _ in range(strata)]
         self.counts: Ints = np.zeros(strata, np.int64)
 
     def move(self, slots: Ints, stratum: int) -> None:
-        """Put distinct slots (n,) into a stratum, or into none (-1)."""
+        """Move distinct slots (n,) to a stratum, or out of all strata (-1)."""
         if stratum != NONE and (self.stratum[slots] == NONE).all():
-            self._add_all(slots, stratum)  # as when an episode's labels come
+            self._add_all(slots, stratum)  # the usual case: labels of an ended episode
             return
         for slot in slots.tolist():
             old = int(self.stratum[slot])
@@ -61,7 +61,7 @@ class StratumSlots(Stateful):
             self.stratum[slot] = stratum
 
     def members(self, stratum: int) -> Ints:
-        """Return the slots of a stratum, (counts[stratum],), in no meaningful order."""
+        """Return the slots of a stratum, (counts[stratum],), in arbitrary order."""
         return self._members[stratum][: self.counts[stratum]]
 
     @property
@@ -104,15 +104,15 @@ class StratumSlots(Stateful):
 
 
 class Reserve(Stateful):
-    """Hands out the slots of a ring of `capacity` rows.
+    """Allocates the slots of a ring of `capacity` rows.
 
     Args:
-        strata: which slots belong to which condition; kept by the ring.
-        conditions: their names.
-        reserved: rows of a condition that others' rows do not overwrite, by its name.
+        strata: the slots of each condition; the ring updates it.
+        conditions: names of the conditions.
+        reserved: condition -> number of its rows that rows of other conditions do not overwrite.
 
     Raises:
-        MixtureError: rows reserved for no condition, or more than the ring holds.
+        MixtureError: rows reserved for an unknown condition, or more than the ring holds.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("rows",)
@@ -134,11 +134,11 @@ class Reserve(Stateful):
             )
         self.capacity, self._strata = capacity, strata
         self.appended = 0  # rows ever appended
-        self._serial: Ints = np.full(capacity, -1, np.int64)  # of the row in each slot, by age
-        self._victims: Ints = np.empty(0, np.int64)  # slots that are overwritten next
+        self._serial: Ints = np.full(capacity, -1, np.int64)  # when each slot's row was appended
+        self._victims: Ints = np.empty(0, np.int64)  # slots to overwrite next
 
     def take(self, count: int) -> Ints:
-        """Return slots (count,) for new rows; their old rows lose their conditions."""
+        """Return slots (count,) for new rows, and clear the conditions of their old rows."""
         beyond = max(self.appended + count - self.capacity, 0)
         if beyond and self.rows.any():
             beyond = min(beyond, count)
@@ -157,8 +157,8 @@ class Reserve(Stateful):
     def _choose(self, at_least: int) -> None:
         """Choose the slots to overwrite next: the oldest of conditions above their reserve.
 
-        If those do not suffice, for example before the first episode ends, add the oldest
-        unlabelled ones. If all that the ring holds is reserved, add the oldest of all.
+        If these are too few, for example before the first episode ends, add the oldest unlabelled
+        slots. If all rows in the ring are reserved, add the oldest of all.
         """
         surplus = np.maximum(self._strata.counts - self.rows, 0)
         oldest = [np.empty(0, np.int64)]
@@ -176,7 +176,7 @@ class Reserve(Stateful):
         self._victims = candidates[np.argsort(self._serial[candidates])[:some]]
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Return the error for a saved state that reserved other rows."""
+        """Return the error for a saved state with other reserved rows."""
         saved = None if value is None else np.asarray(value).tolist()
         return MixtureError(
             f"the saved ring reserved {saved} rows of its conditions, not {self.rows.tolist()}",
@@ -185,16 +185,16 @@ class Reserve(Stateful):
 
 
 UNLABELLED = NONE
-_OF_SLOTS = ("rows", "stratum", "draws")  # arrays with a value a slot, besides META
+_OF_SLOTS = ("rows", "stratum", "draws")  # arrays with one entry per slot, besides META
 
-# Metadata of a row, one array (capacity,) each: name -> type.
+# Metadata of rows: name -> type of an array (capacity,).
 META: dict[str, type[np.generic]] = {
     "env_step": np.int64,  # environment steps of the run when the row's first step was taken
-    "gradient_step": np.int64,  # gradient steps of the run at that moment
+    "gradient_step": np.int64,  # gradient steps of the run at that time
     "policy_version": np.int64,  # the caller's number for the policy that acted
     "behaviour_policy": np.int16,  # code into `behaviour_policies`
     "action_probability": np.float32,  # of the action under that policy; NaN if unknown
-    "teacher_action": np.int16,  # what a teacher would have done; -1: not asked, or no opinion
+    "teacher_action": np.int16,  # the teacher's action; -1: not queried, or it has none
     "episode": np.int64,  # the episode's key
     "episode_step": np.int32,  # of the row's first step in its episode, from 0
     "horizon": np.int16,  # steps the row's return spans, 1..n_step
@@ -202,14 +202,14 @@ META: dict[str, type[np.generic]] = {
 
 
 class PendingSteps(Stateful):
-    """Up to n steps of each environment, the oldest at its `_first`, round and round.
+    """A circular buffer of up to n steps per environment, with the oldest at `_first`.
 
     Args:
         num_envs: N.
         observation_size: D.
         discount: gamma of one step.
         n_step: steps of a return.
-        meta: what is known of a step besides: name -> type.
+        meta: a step's metadata: name -> type.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -259,10 +259,10 @@ class PendingSteps(Stateful):
     def pack(
         self, envs: Ints, next_observation: NDArray[Any], terminated: NDArray[Any]
     ) -> tuple[F32, dict[str, NDArray[Any]]]:
-        """Pack the oldest step of each of these environments (n,), packed, and forgotten.
+        """Pack and remove the oldest step of each of these environments (n,).
 
         `next_observation` (N, D) and `terminated` (N,) are of the step added last. Returns rows
-        (n, W) and their metadata (n,) each.
+        (n, W) and their metadata, arrays (n,).
         """
         horizon, first = self.waiting[envs], self._first[envs]  # (n,)
         inside = self._ahead < horizon[:, None]
@@ -284,10 +284,10 @@ class PendingSteps(Stateful):
 
 
 class FreshRing(Stateful):
-    """N environments' steps as packed n-step rows, oldest overwritten first.
+    """A ring buffer of packed n-step rows from N environments; the oldest is overwritten first.
 
     Args:
-        capacity: rows held.
+        capacity: largest number of rows.
         num_envs: N, parallel environments.
         observation_size: D.
         discount: gamma of one step.
@@ -295,12 +295,13 @@ class FreshRing(Stateful):
         conditions: names that labels index, e.g. `["nominal", "wheel_slip"]`.
         strata: names of the strata that rows are drawn by; default: the conditions.
         behaviour_policies: names that behaviour codes index.
-        reserved: rows of a condition that others' rows do not overwrite, by its name; together at
-            most `capacity`. Without, the oldest row is overwritten whatever its condition. With
-            them `sample` draws reserved rows as often as others, so more often than they occur.
+        reserved: condition -> number of its rows that rows of other conditions do not overwrite;
+            together at most `capacity`. Without it, the oldest row of any condition is
+            overwritten. With it, reserved conditions stay longer, so `sample` draws them more
+            often than they occur.
 
-    `rows` (capacity, W) float32 is packed as `replay.sampling.packed_rows` says; `meta` holds the
-    arrays of META; the first `len(ring)` slots are filled.
+    `rows` (capacity, W) float32 has the layout of `replay.sampling.packed_rows`. `meta` holds the
+    arrays of META. The first `len(ring)` slots are filled.
     """
 
     SAME: ClassVar[tuple[str, ...]] = (
@@ -344,31 +345,29 @@ class FreshRing(Stateful):
         self.strata = self.conditions if strata is None else tuple(strata)
         self.by_condition = StratumSlots(capacity, len(self.conditions))
         self._reserve = Reserve(capacity, self.by_condition, self.conditions, reserved or {})
-        # The stratum of each row, -1 without one; rows of each that `draw` may still give; and how
-        # often it gave each row.
-        self.stratum: NDArray[np.int16] = np.full(capacity, NONE, np.int16)
-        self.by_stratum = StratumSlots(capacity, len(self.strata))
-        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)
+        self.stratum: NDArray[np.int16] = np.full(capacity, NONE, np.int16)  # -1: in no stratum
+        self.by_stratum = StratumSlots(capacity, len(self.strata))  # rows that `draw` may return
+        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)  # counted by `draw`
         self._pending = PendingSteps(
             num_envs, observation_size, discount=discount, n_step=n_step, meta=META
         )
-        # Slots written since a mirror of the rows last took them away; None: there is no mirror.
+        # Slots written since a mirror of the rows last cleared this list; None: there is no mirror.
         self.written: list[Ints] | None = None
-        self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # of the episode under way
+        self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # of the current episodes
         self._episode_step: Ints = np.zeros(num_envs, np.int64)
         self._next_key = num_envs
-        # The slot of each step of the episodes under way, (N, longest so far), and of ended ones.
+        # The slot of each step of the current episodes, (N, T) with room for the longest.
         self._env_slots: Ints = np.full((num_envs, 256), NONE, np.int64)
         self._awaiting_labels: dict[int, Ints] = {}  # episode key -> slots of its steps
 
     @property
     def appended(self) -> int:
-        """Return the rows ever appended. If none are reserved, the next slot is that % capacity."""
+        """Return the rows ever appended. If none are reserved, modulo capacity is the next slot."""
         return self._reserve.appended
 
     @appended.setter
     def appended(self, rows: int) -> None:
-        """Set the count after `rows` was filled from outside."""
+        """Set the count after `rows` was filled directly."""
         self._reserve.appended = rows
 
     def __len__(self) -> int:
@@ -390,13 +389,13 @@ class FreshRing(Stateful):
         action_probability: NDArray[Any] | float = float("nan"),
         teacher_action: NDArray[Any] | int = -1,
     ) -> Ints:
-        """Take one step of every environment.
+        """Append one step of every environment.
 
         `observation`, `next_observation` (N, D); `action`, `reward`, `terminated`, `truncated`
-        (N,). Where an episode ended, `next_observation` must be its last one (`info["final_obs"]`
-        under SAME_STEP autoreset), never the first of the next episode.
+        (N,). If an episode ended, `next_observation` must be its last observation
+        (`info["final_obs"]` under SAME_STEP autoreset), not the first of the next episode.
 
-        Returns the key of the episode each of these steps belongs to, (N,), for `set_labels`.
+        Returns the key of each step's episode, (N,), for `set_labels`.
         """
         now: dict[str, Any] = {
             "env_step": env_step,
@@ -426,9 +425,9 @@ class FreshRing(Stateful):
         return keys
 
     def begin_episodes(self) -> Ints:
-        """Begin a new episode in every environment, and forget steps without a whole return.
+        """Begin a new episode in every environment, and drop steps without a complete return.
 
-        Returns the keys of the episodes that this ended, (N,): no labels will come for them.
+        Returns the keys of the episodes cut off, (N,); they get no labels.
         """
         keys = self.episode_key
         self._pending.waiting = np.zeros_like(self._pending.waiting)
@@ -438,7 +437,7 @@ class FreshRing(Stateful):
         return keys
 
     def _emit(self, envs: Ints, next_observation: NDArray[Any], terminated: NDArray[Any]) -> None:
-        """Pack the oldest pending step of each of these environments into slots of its own."""
+        """Pack the oldest pending step of each of these environments into a new slot."""
         if not len(envs):
             return
         rows, meta = self._pending.pack(envs, next_observation, terminated)
@@ -459,12 +458,12 @@ class FreshRing(Stateful):
     def set_labels(
         self, episode_key: int, conditions: NDArray[Any], strata: NDArray[Any] | None = None
     ) -> int:
-        """Label the rows of an ended episode: `conditions[t]` (T,) codes its step t.
+        """Label the rows of an ended episode: `conditions[t]` (T,) is the code of its step t.
 
-        `strata` (T,) codes its strata, -1 where a step is in none; None: as the conditions.
+        `strata` (T,) are the codes of its strata, -1 for no stratum; None: equal to `conditions`.
 
-        Returns how many of its rows were still in the ring. Raises MixtureError for a code that
-        names no condition or a row beyond the labels given.
+        Returns how many of its rows were still in the ring. Raises MixtureError for an invalid
+        condition code, or a row without a label.
         """
         codes = np.asarray(conditions, np.int64)
         of_strata = codes if strata is None else np.asarray(strata, np.int64)
@@ -475,7 +474,7 @@ class FreshRing(Stateful):
             )
         slots = self._awaiting_labels.pop(int(episode_key), np.empty(0, np.int64))
         steps = np.arange(len(slots))
-        # The others were overwritten, by other episodes' rows or later ones of the same.
+        # Other slots were overwritten by rows of other episodes, or by later rows of this one.
         still = slots >= 0
         still &= self.meta["episode"][slots] == episode_key
         still &= self.meta["episode_step"][slots] == steps
@@ -492,13 +491,13 @@ class FreshRing(Stateful):
         return len(slots)
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
-        """Return the condition code of each slot (n,); -1 where it has no label yet."""
+        """Return the condition code of each slot (n,); -1 if it has no label yet."""
         codes: NDArray[np.int16] = self.by_condition.stratum[slots]
         return codes
 
     @property
     def stratum_rows(self) -> Ints:
-        """Return how many rows of each stratum it holds, (S,)."""
+        """Return the number of rows of each stratum in the ring, (S,)."""
         in_one = self.stratum[: len(self)]
         return np.bincount(in_one[in_one >= 0], minlength=len(self.strata))
 
@@ -509,13 +508,13 @@ class FreshRing(Stateful):
         limit: int | None = None,
         since: int | None = None,
     ) -> Ints:
-        """Draw slots (n,) by each stratum's number of rows (S,), uniformly within it.
+        """Draw `counts` (S,) slots of each stratum, uniformly with replacement; return them, (n,).
 
         Args:
-            limit: a row that was drawn so often is not drawn again.
-            since: the environment step of the oldest row that may be drawn.
+            limit: largest number of draws of one row, checked after each call.
+            since: earliest environment step of a row that may be drawn.
 
-        A stratum without such rows gives none.
+        A stratum without rows that may be drawn is left out.
         """
         each = counts.tolist()
         at, begin = rng.random(sum(each)), 0
@@ -547,7 +546,7 @@ class FreshRing(Stateful):
 
     @property
     def _filled(self) -> dict[str, NDArray[Any]]:
-        """Return what the filled slots hold: rows (n, W), and _OF_SLOTS and META (n,)."""
+        """Return the arrays of filled slots: `rows` (n, W), and the rest of _OF_SLOTS and META."""
         filled = len(self)
         meta = {name: values[:filled] for name, values in self.meta.items()}
         own = {name: getattr(self, name)[:filled] for name in _OF_SLOTS}
@@ -568,13 +567,13 @@ class FreshRing(Stateful):
         )
 
     def restored(self) -> None:
-        """Find the steps of episodes that are not labelled yet."""
+        """Rebuild the slots of unlabelled episodes after a checkpoint was loaded."""
         self._awaiting_labels = {}
         if self.conditions:
             self._find_slots()
 
     def _find_slots(self) -> None:
-        """Find the steps of episodes that are not labelled yet, from the rows themselves."""
+        """Find the slots of unlabelled episodes from the rows' metadata."""
         slots = np.flatnonzero(self.by_condition.stratum[: len(self)] == UNLABELLED)
         keys, steps = self.meta["episode"][slots], self.meta["episode_step"][slots]
         longest = max(256, 2 * int(steps.max(initial=0)), 2 * int(self._episode_step.max()))

@@ -1,14 +1,13 @@
-"""The rules by which rows are drawn within a stratum, and the table of them.
+"""The rules by which rows are drawn within a stratum, and the table `RULES` of them.
 
-`within` of a mixture names a row of `RULES`. The check of a mixture, the samplers, the buffers of
-other libraries, `restock mix` and the report use this table; a rule of your own is one file with a
-subclass of `StratumDraws`, and a row here. Rules work with places, 0 to n - 1 within their stratum;
-the sampler knows which row of the panel each is.
+`within` of a mixture is a key of `RULES`. The check of a mixture, the samplers, the buffers of
+other libraries, `restock mix` and the report use this table. To add a rule, write a file with a
+subclass of `StratumDraws` and add an entry here. Rules work with places, 0 to n - 1 within their
+stratum; the sampler maps places to rows of the panel.
 
-`Per` is proportional PER (Schaul et al. 2016, arXiv:1511.05952). A sum tree is exact and slow in
-Python. Here the sums are taken once for a block of batches, in one pass, and the whole block is
-drawn from them: the distribution drawn from is the one at the start of the block, and the weights
-are those of that distribution.
+`Per` is proportional PER (Schaul et al. 2016, arXiv:1511.05952). A sum tree is exact, but slow in
+Python. Here the priorities are summed once, and a whole block of batches is drawn from these sums:
+draws and weights follow the priorities at the start of the block.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ from restock.toml import Checked
 
 @dataclass(frozen=True)
 class StratumRows:
-    """The rows of one stratum, as a rule gets them.
+    """The rows of one stratum, as passed to a rule.
 
-    `column(NAME)` gives a column of `Panel.meta` for these rows, (n,): `logged_ns`, `zone`, ….
+    `column(NAME)` returns a column of `Panel.meta` for these rows, (n,): `logged_ns`, `zone`, ….
     """
 
-    numbers: Ints  # (n,) of the panel
-    rng: np.random.Generator  # the sampler's own: for what a rule shuffles before the first draw
+    numbers: Ints  # (n,) row numbers in the panel
+    rng: np.random.Generator  # the sampler's, for shuffling before the first draw
     prioritised: Prioritised  # the mixture's [prioritised]
     panel_column: Callable[[str], NDArray[Any]]
 
@@ -49,24 +48,24 @@ class StratumRows:
 
 
 class StratumDraws(Stateful):
-    """Draws from the rows of one stratum; a rule is a subclass.
+    """Draws from the rows of one stratum; each rule is a subclass.
 
-    `STATE` names the attributes that decide the draws to come: a checkpoint keeps them.
+    `STATE` names the attributes that later draws depend on; a checkpoint keeps them.
     """
 
     def draw(self, count: int, rng: np.random.Generator, batches: int) -> tuple[Ints, F32 | None]:
-        """Return the places (count,) of the next rows and their importance weights; None: ones.
+        """Return the places (count,) of the next rows and their importance weights (None: all 1).
 
-        All that a stratum gives to several batches is drawn at once; `batches` is how many were
+        One call draws the stratum's rows of several batches. `batches` is the number of batches
         handed out before.
         """
         raise NotImplementedError
 
     def give_back(self, places: Ints) -> None:
-        """Take back rows (n,) that were drawn ahead and not handed out, as the shares changed."""
+        """Take back rows (n,) that were drawn ahead but not used because the shares changed."""
 
     def update(self, places: Ints, td_abs: F32) -> None:
-        """Take the |TD error| (n,) of rows (n,) that were just learnt from."""
+        """Take the |TD error| (n,) of rows (n,) that were just used in an update."""
 
 
 class Uniform(StratumDraws):
@@ -80,7 +79,7 @@ class Uniform(StratumDraws):
 
 
 def uniform_places(at: F64, size: int) -> Ints:
-    """Return the places (n,) among `size` rows that numbers (n,) in [0, 1) fall on."""
+    """Map numbers (n,) in [0, 1) to places (n,) among `size` rows."""
     return (at * size).astype(np.int64)
 
 
@@ -93,13 +92,13 @@ class InTurns(StratumDraws):
         self._order: Ints = np.arange(len(rows))
         rows.rng.shuffle(self._order)
         self._cursor = 0
-        self._returned: Ints = np.empty(0, np.int64)  # drawn ahead and given back: next ones
+        self._returned: Ints = np.empty(0, np.int64)  # rows given back; drawn first
 
     def draw(self, count: int, rng: np.random.Generator, batches: int) -> tuple[Ints, F32 | None]:
         parts, self._returned = [self._returned[:count]], self._returned[count:]
         count -= len(parts[0])
         while count:
-            if self._cursor == len(self._order):  # all have had their turn
+            if self._cursor == len(self._order):  # all rows have been drawn
                 rng.shuffle(self._order)
                 self._cursor = 0
             some = min(count, len(self._order) - self._cursor)
@@ -112,34 +111,34 @@ class InTurns(StratumDraws):
         self._returned = np.concatenate([places, self._returned])
 
 
-CHUNK = 16  # rows whose priorities are summed first: a chunk is found, then the row in it
+CHUNK = 16  # rows per sum of priorities: the search finds a chunk, then the row in it
 BETA_BATCHES = 100_000  # batches after which the exponent of the weights is 1
-EPSILON = 1e-3  # added to |TD|
-MEAN_OF = 32_768  # priorities, at least, that give the mean weight of a stratum
+EPSILON = 1e-3  # added to |TD error|
+MEAN_OF = 32_768  # the mean weight of a larger stratum is estimated from at least so many rows
 
 _Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Prioritised(Checked, frozen=True):
-    """Numbers of `within = "per"` (arXiv:1511.05952)."""
+    """Parameters of `within = "per"` (arXiv:1511.05952)."""
 
     per_alpha: _Fraction = 0.6  # exponent of |TD|
     per_beta: _Fraction = 0.4  # exponent of the importance weights at the start; grows to 1
 
     def beta_after(self, batches: int) -> float:
-        """Return the exponent of the weights after so many batches: it grows linearly to 1."""
+        """Return the exponent of the weights after `batches`; it grows linearly to 1."""
         return min(1.0, self.per_beta + (1.0 - self.per_beta) * batches / BETA_BATCHES)
 
 
 class Per(StratumDraws):
     """Draws rows by priority (|TD| + epsilon) ** alpha, with weights (n P) ** -beta of mean 1.
 
-    Schaul et al. divide weights by the largest. Here they have mean 1 over what a stratum draws, so
-    that the quotas stay the shares of the gradient, and one row of a tiny priority cannot shrink
-    every other's step.
+    Schaul et al. divide weights by the largest. Here weights have mean 1 over a stratum's draws.
+    Then a stratum's share of the gradient is its quota, and a single row with a tiny priority
+    cannot shrink the steps of all other rows.
 
-    A row that was not drawn yet has the largest priority that its stratum has had, so that every
-    row is seen. The rows are filled up to a multiple of CHUNK with priorities of 0, which are never
+    A row that has not been drawn yet has the largest priority so far in its stratum, so that every
+    row gets drawn. The priorities are padded to a multiple of CHUNK with zeros, which are never
     drawn.
     """
 
@@ -153,7 +152,7 @@ class Per(StratumDraws):
         self._priority[: self.size] = self._largest
         self._new: Bools = np.ones(self.size, np.bool_)  # not drawn yet
         self._any_new = True
-        self._stale_new = False  # the largest priority grew since rows not drawn yet were given it
+        self._stale_new = False  # new rows still have an earlier, smaller largest priority
 
     @property
     def priority(self) -> F32:
@@ -175,16 +174,17 @@ class Per(StratumDraws):
             self._largest, self._stale_new = largest, True
 
     def draw(self, count: int, rng: np.random.Generator, batches: int) -> tuple[Ints, F32 | None]:
-        """Draw in proportion to the priorities as they are now.
+        """Draw in proportion to the current priorities.
 
-        The range of sums is cut into `count` equal parts with one draw in each (Schaul et al.,
-        appendix B.2.1), dealt in random order: a row's expected draws are exactly in proportion.
+        The sum of priorities is divided into `count` equal parts with one draw in each (Schaul et
+        al., appendix B.2.1). The draws are then shuffled. A row's expected number of draws is
+        exactly proportional to its priority.
         """
         self._any_new = self._any_new and bool(self._new.any())
         if self._stale_new and self._any_new:
             np.copyto(self.priority, np.float32(self._largest), where=self._new)
         self._stale_new = False
-        # einsum adds in the same order whatever the number of threads; BLAS may not.
+        # einsum adds in the same order for any number of threads; BLAS may not.
         sums: F32 = np.einsum("ij->i", self._priority.reshape(-1, CHUNK))
         places = self._search(sums, rng.random(count))
         places = places[rng.permutation(count)]
@@ -195,7 +195,7 @@ class Per(StratumDraws):
         return places, _weights(self._priority[places], self.priority, total, beta)
 
     def _search(self, sums: F32, within: F64) -> Ints:
-        """Find the place that each of `within` (n,), in [0, 1) of its part, falls on."""
+        """Return the place drawn in each of n equal parts, at offsets `within` (n,) in [0, 1)."""
         ends = np.cumsum(sums, dtype=np.float64)
         at = (np.arange(len(within)) + within) * (ends[-1] / len(within))  # ascending
         places: Ints = np.empty(len(at), np.int64)
@@ -212,16 +212,16 @@ def find_places(priority: F32, sums: F32, ends: F64, at: F64, out: Ints) -> None
     # Not by a product with ones: BLAS would wake its threads, which costs more than the sums.
     for before, here in itertools.pairwise(upto):
         here += before
-    # As many of the chunk's members are passed as sums up to them are at or below the rest.
+    # The place in the chunk is the number of cumulative sums that are at most `rest`.
     np.add.reduce(upto[:-1] <= rest, axis=0, dtype=np.int8, out=out)
     out += chunk * CHUNK
 
 
 def _weights(drawn: F32, priority: F32, total: float, beta: float) -> F32:
-    """Return (n P) ** -beta over its mean under P, of rows of priority `drawn` (n,).
+    """Return (n P) ** -beta over its mean under P, for rows with priorities `drawn` (n,).
 
-    Of many rows the mean is that of some, evenly spaced: a power of each would cost as much as all
-    else together.
+    In a large stratum, the mean is estimated from evenly spaced rows: a power for every row would
+    cost as much as everything else together.
     """
     some = np.ascontiguousarray(priority[:: max(len(priority) // MEAN_OF, 1)])
     mean = 1.0 if beta == 1.0 else float((some ** np.float32(1.0 - beta)).mean(dtype=np.float64))
@@ -231,12 +231,12 @@ def _weights(drawn: F32, priority: F32, total: float, beta: float) -> F32:
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of the table: what draws by it, and what others need to know of it."""
+    """An entry of RULES: the class that draws, and properties that its users need."""
 
     draws: Callable[[StratumRows], StratumDraws]
     doc: str  # how rows are drawn, for reports
-    follows_td: bool = False  # draws depend on the TD errors of what was learnt
-    has_weights: bool = False  # rows come with importance weights
+    follows_td: bool = False  # draws depend on TD errors passed to `update`
+    has_weights: bool = False  # draws come with importance weights
 
 
 RULES: dict[str, Rule] = {
@@ -247,5 +247,5 @@ RULES: dict[str, Rule] = {
 
 
 def follow_td(names: Iterable[str]) -> bool:
-    """Return whether draws by any of these rules follow TD errors."""
+    """Return whether any of these rules draws by TD errors."""
     return any(RULES[name].follows_td for name in names)

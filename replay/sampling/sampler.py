@@ -1,7 +1,8 @@
-"""Which rows make a batch: exact quotas per stratum, by one vectorised draw.
+"""Draw batches with exact quotas per stratum, vectorised.
 
-A multinomial draw gives a stratum of quota 12 between 2 and 27 rows of a batch; here it gets 12 of
-12, and a share of 0.003 of a batch is met over time, because the rounding error is carried over.
+A multinomial draw gives a stratum with quota 12 between 2 and 27 rows of a batch. Here it gets
+exactly 12. A fractional quota is met over several batches, because the rounding error is carried
+over.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from restock.replay.sampling.rules import RULES, Prioritised, StratumRows, follo
 from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time
-# Of batches drawn ahead by rules that follow TD errors: a sixteenth of the rows, so that few come
-# again before what was learnt of them counts; many rows cost more to sum.
+# Limits of the block if a rule draws by TD errors. A block is then a sixteenth of the rows, so that
+# few rows repeat before their new errors count; a larger panel costs more to sum per block.
 MIN_BLOCK, MAX_BLOCK = 8, 128
 
 
 def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
-    """Take |TD error| (n,) of rows (n,), which a priority or a share can follow.
+    """Check |TD error| (n,) of rows (n,), and return it as float32.
 
     Raises:
-        MixtureError: one that is negative or not finite, or not one a row.
+        MixtureError: an error is negative or not finite, or there is not one per row.
     """
     errors = np.asarray(td_abs, np.float32)
     if errors.shape != np.shape(rows):
@@ -52,15 +53,16 @@ def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
 
 
 class Quotas(Stateful):
-    """Shares to whole rows per batch by largest remainder, the rounding carried to the next.
+    """Turns shares into whole rows per batch by largest remainder, carrying the rounding error.
 
     Shares and batch size may change between batches; the carried rounding error is kept.
 
     Args:
-        sizes: rows of each stratum (S,), where a share on an empty one is to be refused.
+        sizes: rows of each stratum (S,), to refuse a share for an empty stratum; None: no check.
 
     Raises:
-        MixtureError: shares that are no distribution or on an empty stratum, or a batch of no rows.
+        MixtureError: shares do not form a distribution, an empty stratum has a share, or the batch
+            size is below 1.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("shares", "batch_size", "_carry")
@@ -87,7 +89,7 @@ class Quotas(Stateful):
         self._carry = np.asarray(owed, np.float64).tolist()
 
     def checked(self, shares: Sequence[float] | F64) -> F64:
-        """Return shares (S,) as `set_shares` would take them, summing to 1."""
+        """Check shares (S,), and return them scaled to sum to exactly 1."""
         given = np.asarray(shares, np.float64)
         if given.ndim != 1 or not len(given) or not np.isfinite(given).all() or (given < 0).any():
             raise MixtureError(f"shares must be finite and not negative, got {shares!r}")
@@ -101,11 +103,11 @@ class Quotas(Stateful):
                 remedy="give it share 0, or let `restock mix` redistribute it",
             )
         total = given.sum()
-        # Shares that were made to sum to 1 before stay the same to the last bit.
+        # Shares that were scaled before stay the same to the last bit.
         return given if abs(total - 1.0) < 1e-12 else np.asarray(given / total)
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Set the shares (S,) from the next batch on; a stratum of share 0 is owed nothing."""
+        """Set the shares (S,) from the next batch on; a stratum of share 0 loses its carry."""
         self.shares = self.checked(shares)
         self._mean = (self.shares * self.batch_size).tolist()
         drawn = self.shares > 0
@@ -113,14 +115,14 @@ class Quotas(Stateful):
         self._carry = (carry - np.where(drawn, carry.sum() / drawn.sum(), 0.0)).tolist()
 
     def set_batch_size(self, batch_size: int) -> None:
-        """Set the size of batches from the next one on."""
+        """Set the batch size from the next batch on."""
         if not isinstance(batch_size, int | np.integer) or batch_size < 1:
             raise MixtureError(f"batch_size must be an integer of at least 1, got {batch_size!r}")
         self.batch_size = int(batch_size)
         self._mean = (self.shares * batch_size).tolist()
 
     def restored(self) -> None:
-        """Compute again what depends on shares and batch size."""
+        """Recompute the mean rows per batch from shares and batch size."""
         self._mean = (self.shares * self.batch_size).tolist()
 
     def next(self) -> Ints:
@@ -132,7 +134,7 @@ class Quotas(Stateful):
         """Return the rows per stratum of the next batches, (n, S); each sums to the batch size."""
         if len(self.shares) == 1:
             return np.full((batches, 1), self.batch_size, np.int64)
-        # Plain lists: for a handful of strata numpy's calls cost more than the work.
+        # Plain lists: with a handful of strata, the overhead of NumPy calls dominates.
         mean, size, carry = self._mean, self.batch_size, self._carry
         strata = range(len(mean))
         quotas = []
@@ -145,7 +147,7 @@ class Quotas(Stateful):
                 for index in sorted(strata, key=rest.__getitem__, reverse=True)[:short]:
                     quota[index] += 1
                     rest[index] -= 1.0
-            for _ in range(-short):  # strata in debt can leave the others owed a row too many
+            for _ in range(-short):  # negative carries can leave the others a row too many
                 index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
                 quota[index] -= 1
                 rest[index] += 1.0
@@ -155,32 +157,33 @@ class Quotas(Stateful):
         return np.array(quotas, np.int64)
 
     def give_back(self, quotas: Ints) -> None:
-        """Take back batches that were not handed out, (n, S): their strata are owed them again."""
+        """Undo `take` for batches that were not handed out, (n, S)."""
         back = self.carry + quotas.sum(axis=0) - len(quotas) * np.array(self._mean)
         self._carry = back.tolist()
 
 
 class QuotaSampler(Stateful):
-    """Exact quotas per batch over strata, the rows of each by a rule of RULES.
+    """Draws batches with exact quotas per stratum, and rows within a stratum by a rule of RULES.
 
-    Batches are drawn a block at a time and handed out one by one, which takes the cost of a draw
-    from about that of the gather to a tenth of it; what is drawn ahead is part of `state_dict`.
+    A block of batches is drawn at a time, and handed out one by one. This reduces the cost of a
+    draw from about the cost of the gather to a tenth of it. Batches drawn ahead are part of
+    `state_dict`.
 
     Args:
         stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty if
             their share is 0.
-        shares: of each stratum, (S,), summing to 1.
-        batch_size: rows per draw.
+        shares: shares of the strata, (S,), summing to 1.
+        batch_size: rows per batch.
         rng: the generator of the draws; its state is part of `state_dict`.
-        within: the rule of all strata or of each, (S,).
-        prioritised: numbers of the rule "per".
-        column: gives a column of the panel's `meta`, for rules that ask for one.
-        block: batches drawn at a time; None: 64, or if a rule follows TD errors as many as a
-            sixteenth of the rows make, at least 8 and at most 128. 1 draws every batch from
-            priorities as they are.
+        within: the rule of all strata, or one rule per stratum, (S,).
+        prioritised: parameters of the rule "per".
+        column: returns a column of the panel's `meta`, for rules that use one.
+        block: batches drawn at a time. None: 64, or if a rule draws by TD errors, a sixteenth of
+            the rows, at least 8 and at most 128 batches. 1 draws every batch from the current
+            priorities.
 
     Raises:
-        MixtureError: shares that are no distribution, or a share on an empty stratum.
+        MixtureError: shares do not form a distribution, or an empty stratum has a share.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("sizes", "within")
@@ -216,11 +219,11 @@ class QuotaSampler(Stateful):
             RULES[name].draws(StratumRows(rows, rng, numbers, column))
             for name, rows in zip(self.within, self._rows, strict=True)
         ]
-        self._batches = 0  # handed out
-        self._next = 0  # of those drawn ahead
+        self._batches = 0  # batches handed out
+        self._next = 0  # index of the next batch in the block
         none: Ints = np.zeros((0, self.batch_size), np.int64)
         self._ahead_rows, self._ahead_strata = none, none
-        self._ahead_places = none  # within their strata
+        self._ahead_places = none  # of the rows within their strata
         self._ahead_weights: F32 | None = None
         self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
         if self.follows_td:
@@ -236,11 +239,11 @@ class QuotaSampler(Stateful):
 
     @property
     def drawn_weights(self) -> F32 | None:
-        """Importance weights (B,) that the batch last drawn needs; None for ones."""
+        """Return the importance weights (B,) of the batch last drawn; None: all 1."""
         return None if self._ahead_weights is None else self._ahead_weights[self._next - 1]
 
     def draw(self) -> tuple[Ints, Ints]:
-        """Return row numbers (B,) and the stratum of each (B,), strata in order."""
+        """Return row numbers (B,) and the stratum of each row (B,), in order of strata."""
         if self._next == len(self._ahead_rows):
             self._draw_block()
         self._next += 1
@@ -248,20 +251,20 @@ class QuotaSampler(Stateful):
         return self._ahead_rows[self._next - 1], self._ahead_strata[self._next - 1]
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """Take the |TD error| (n,) of rows (n,) just learnt from: they count from the next block.
+        """Take the |TD error| (n,) of rows (n,) just used in an update; used from the next block.
 
         Raises:
-            MixtureError: a rule follows them, and one is negative or not finite, or they are not
-                one a row.
+            MixtureError: a rule draws by TD errors, and an error is negative or not finite, or
+                there is not one per row.
         """
         if self.follows_td:
             self._learnt.append((np.array(rows), checked_errors(td_abs, rows).copy()))
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Set other shares (S,) from the next batch on; what was drawn ahead goes back.
+        """Set the shares (S,) from the next batch on; batches drawn ahead are undone.
 
         Raises:
-            MixtureError: shares that are no distribution, or a share on an empty stratum.
+            MixtureError: shares do not form a distribution, or an empty stratum has a share.
         """
         given = self.quotas.checked(shares)
         if not np.array_equal(given, self.quotas.shares):
@@ -269,7 +272,7 @@ class QuotaSampler(Stateful):
             self.quotas.set_shares(given)
 
     def set_batch_size(self, batch_size: int) -> None:
-        """Set another size from the next batch on; what was drawn ahead goes back."""
+        """Set the batch size from the next batch on; batches drawn ahead are undone."""
         if batch_size != self.batch_size:
             self._hand_back()
             self.quotas.set_batch_size(batch_size)
@@ -280,7 +283,7 @@ class QuotaSampler(Stateful):
         self._pass_on_errors()
         quota = self.quotas.take(self.block)  # (block, S)
         strata = np.tile(np.arange(len(self.sizes)), self.block)
-        # All that a stratum gives to the block is taken at once, and dealt out in order.
+        # Each stratum's rows of the whole block are drawn at once, then distributed to batches.
         rows, places, weights = self._take_all(quota.sum(axis=0))
         order = _by_stratum(quota)
         self._ahead_rows = _dealt(rows, order).reshape(self.block, -1)
@@ -292,7 +295,7 @@ class QuotaSampler(Stateful):
         self._next = 0
 
     def _take_all(self, counts: Ints) -> tuple[Ints, Ints, F32 | None]:
-        """Take `counts` (S,) rows of the strata in turn: row numbers, places and weights."""
+        """Draw `counts` (S,) rows, stratum by stratum; return row numbers, places and weights."""
         rows, places, weights = [], [], []
         for stratum, count in enumerate(counts.tolist()):
             if not count:
@@ -309,7 +312,7 @@ class QuotaSampler(Stateful):
         return np.concatenate(rows), np.concatenate(places), joined
 
     def _hand_back(self) -> None:
-        """Forget what is drawn ahead: quotas are owed again, rules get their rows back."""
+        """Undo batches drawn ahead: restore the quotas' carry, and give rows back to the rules."""
         places, strata = self._ahead_places[self._next :], self._ahead_strata[self._next :]
         quota = np.stack([(strata == s).sum(axis=1) for s in range(len(self.sizes))], axis=1)
         self.quotas.give_back(quota)
@@ -322,7 +325,7 @@ class QuotaSampler(Stateful):
         self._next = 0
 
     def _place_rows(self) -> None:
-        """Note the stratum of each row number and its place there, for `update`."""
+        """Index the stratum and the place of each row number, for `update`."""
         last = max((int(rows.max(initial=-1)) for rows in self._rows), default=-1)
         self._stratum = np.zeros(last + 1, np.int16)
         self._place = np.zeros(last + 1, np.int32)
@@ -331,17 +334,17 @@ class QuotaSampler(Stateful):
             self._place[rows] = np.arange(len(rows))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that decides the draws to come: arrays and JSON values."""
+        """Return all state that later draws depend on, as arrays and JSON values."""
         self._pass_on_errors()
         return super().state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the draws to come where `state_dict` found them."""
+        """Restore the state, so that later draws are the same as after `state_dict`."""
         self._learnt.clear()
         super().load_state_dict(state)
 
     def _pass_on_errors(self) -> None:
-        """Give the rules the errors of a block at once: a call per batch and stratum costs more."""
+        """Pass the errors of a block to the rules at once: a call per batch would cost more."""
         if not self._learnt:
             return
         rows, errors = map(np.concatenate, zip(*self._learnt, strict=True))
@@ -367,11 +370,11 @@ def _dealt(values: NDArray[Any], order: Ints) -> NDArray[Any]:
 
 
 def _by_stratum(quota: Ints) -> Ints:
-    """Return where each of a block's rows goes, (rows,).
+    """Return the position of each drawn row in the block, (rows,).
 
-    Rows are drawn stratum by stratum; a block lies batch by batch, stratum by stratum.
+    Rows are drawn stratum by stratum. A block is in order of batches, then strata.
     """
-    begins = np.cumsum(quota).reshape(quota.shape) - quota  # of a batch's rows of a stratum
+    begins = np.cumsum(quota).reshape(quota.shape) - quota  # (batches, S) where rows begin
     counts = quota.T.ravel()
     return np.repeat(begins.T.ravel() - np.cumsum(counts) + counts, counts) + np.arange(
         counts.sum()
