@@ -1,1 +1,1 @@
-"""Plans: from a mixture and a store to the rows of a panel, each in a stratum, with a weight."""
+"""Plan a panel from a mixture and a store: which rows, in which stratum, with which weight."""

@@ -1,8 +1,8 @@
-"""The rows a mixture may choose from: what DuckDB says of each transition, as columns, in order.
+"""Read the transitions that a mixture may choose from, with its predicates evaluated by DuckDB.
 
-DuckDB would sort whole rows, text and all. Batches of a store come as the threads that read them
-finish, and are put in order here, a column at a time. Numbers are kept as they come, text as codes
-in as few bytes as its dictionary needs.
+DuckDB would sort whole rows including their text, which takes more memory. Instead, batches arrive
+in the order in which reading threads finish, and the rows are sorted here, one column at a time.
+Text is kept as dictionary codes of the smallest type that fits.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ from restock.replay.store.definitions import install_novelty
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import hint
 
-STRETCH = 1 << 18  # of values in memory at a time
+STRETCH = 1 << 18  # rows in memory at a time
 
 
 def stretches(rows: int) -> Iterator[tuple[int, int]]:
-    """Begin and end of stretches of so many rows."""
+    """Yield begin and end of successive ranges of at most STRETCH rows."""
     for begin in range(0, rows, STRETCH):
         yield begin, min(begin + STRETCH, rows)
 
 
 class Places:
-    """Finds ids (N,) in their order."""
+    """An index from ids (N,) to their positions."""
 
     def __init__(self, ids: Ints) -> None:
-        self._order = np.argsort(ids, kind="stable")  # fast: they rise within each recording
+        self._order = np.argsort(ids, kind="stable")  # fast: ids ascend within each recording
         self._ids = ids[self._order]
 
     @property
     def twice(self) -> int:
-        """Count the ids that occurred before."""
+        """Count the ids that repeat an earlier one."""
         return int((self._ids[1:] == self._ids[:-1]).sum())
 
     def of(self, ids: Ints) -> Ints:
-        """Return the place of each of these ids (n,); -1 of one that is not there."""
+        """Return the position of each of these ids (n,); -1 if it is missing."""
         place = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
         return np.where(self._ids[place] == ids, self._order[place], -1)
 
 
-KEYS = ("episode_index", "step_index", "transition_id")  # the id where all others are the same
-COLUMNS_AT_A_TIME = 2  # put in order: each holds memory
-_LOOKED_AT = 1 << 20  # codes at a time
+KEYS = ("episode_index", "step_index", "transition_id")  # sort keys after the recording
+COLUMNS_AT_A_TIME = 2  # sorted in parallel; a limit on memory
+_LOOKED_AT = 1 << 20  # codes per block when searching first appearances
 
 
 def rows_in_order(
@@ -68,11 +68,10 @@ def rows_in_order(
     text: Collection[str],
     dropped: Collection[str] = (),
 ) -> pa.Table:
-    """Return the rows of batches by recording and KEYS.
+    """Return the rows of all batches, sorted by recording and KEYS.
 
-    The schema has `recording_id` and KEYS. Columns named in `text` become dictionaries, whose codes
-    are in the order of the first rows that have them; those in `dropped` are no columns of the
-    table.
+    The schema has `recording_id` and KEYS. Columns in `text` are dictionary-encoded, with codes in
+    order of first appearance. Columns in `dropped` are left out of the result.
     """
     parts: dict[str, list[pa.Array]] = {name: [] for name in schema.names}
     texts: dict[str, dict[str, int]] = {name: {} for name in schema.names if name in text}
@@ -80,7 +79,7 @@ def rows_in_order(
         for name, values in zip(batch.schema.names, batch.columns, strict=True):
             if (known := texts.get(name)) is not None:
                 parts[name].append(_encoded(values, known))
-            else:  # a copy: any column of DuckDB's batch holds all of it, text too
+            else:  # a copy: one column of DuckDB's batch would keep the whole batch in memory
                 parts[name].append(pa.concat_arrays([values, values[:0]]))
 
     def whole(name: str) -> pa.Array:
@@ -107,12 +106,12 @@ def rows_in_order(
 
 
 def _code_type(size: int) -> pa.DataType:
-    """Return the smallest type that has the codes of so many texts."""
+    """Return the smallest integer type for the codes of `size` texts."""
     return pa.int8() if size <= 1 << 7 else pa.int16() if size <= 1 << 15 else pa.int32()
 
 
 def _encoded(column: pa.Array, known: dict[str, int]) -> pa.Array:
-    """Text as codes of `known`, which gets what it has not yet."""
+    """Dictionary-encode text with `known`, adding new values to it."""
     local = column.cast(pa.string()).dictionary_encode()
     codes = pa.array(
         [known.setdefault(text, len(known)) for text in local.dictionary.to_pylist()],
@@ -122,19 +121,19 @@ def _encoded(column: pa.Array, known: dict[str, int]) -> pa.Array:
 
 
 def _by_appearance(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
-    """Dictionary-encode names, numbered in the order in which they first appear.
+    """Renumber codes of `names` in order of first appearance.
 
-    So the result does not depend on which thread read which rows first.
+    The result then does not depend on which thread read its rows first.
     """
     wide = codes.cast(pa.int32()).fill_null(len(names)) if codes.null_count else codes
     code = wide.to_numpy()
-    first = np.full(len(names) + 1, len(code), np.int64)  # the last is of null
+    first = np.full(len(names) + 1, len(code), np.int64)  # the last entry is for null
     for begin in reversed(range(0, len(code), _LOOKED_AT)):
         some = code[begin : begin + _LOOKED_AT]
         first[some[::-1]] = np.arange(begin + len(some) - 1, begin - 1, -1)
     order = np.argsort(first[: len(names)], kind="stable")
     dictionary = pa.array(names, pa.string()).take(pa.array(order))
-    if (np.diff(order) == 1).all():  # as they are
+    if (np.diff(order) == 1).all():  # already in this order
         return pa.DictionaryArray.from_arrays(codes, dictionary)
     new = np.empty(len(order), np.int64)
     new[order] = np.arange(len(order))
@@ -146,7 +145,7 @@ META_COLUMNS = (
     *("condition", "zone", "behaviour_policy", "behaviour_version", "action_probability"),
     *("action", "reward", "terminated", "truncated", "perturbation", "robot", "site"),
 )
-# Of which rows from before they were kept have none, and tables that are no store's view.
+# Columns that older stores, and tables outside a store, may lack.
 LATER = ("perturbation", "robot", "site")
 _TEXT = (
     *("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version"),
@@ -154,13 +153,12 @@ _TEXT = (
 )
 _CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(uncertain, []), held))"
 _VIEWS = "SELECT table_name FROM information_schema.tables"
-BATCH_ROWS = 65_536  # read at a time
-# Of a view of several stores, which one a row is from (`replay.plan.plan`).
-STORE_COLUMN = "mixture_store"
+BATCH_ROWS = 65_536  # rows read at a time
+STORE_COLUMN = "mixture_store"  # a row's store, in a view of several (`replay.plan.plan`)
 
 
 def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
-    """Return META_COLUMNS of the connection's `transitions`, for a SELECT."""
+    """Return a SELECT list of META_COLUMNS over the connection's `transitions`."""
     has = connection.sql("FROM transitions LIMIT 0").columns
     named = dict.fromkeys((name for name in LATER if name not in has), "NULL::VARCHAR")
     named["condition"] = "primary_condition"
@@ -174,16 +172,17 @@ def read_candidates(
     *,
     several_stores: bool = False,
 ) -> pa.Table:
-    """Read every row of the connection's `transitions`, by recording, episode and step.
+    """Read every row of the connection's `transitions`, sorted by recording, episode and step.
 
-    META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is uncertain), and one
-    boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0` …, and `state_0` …
-    where the row's state alone has one of its own; text columns come as dictionaries, in order of
-    appearance; `store` (int) says which store a row is from. Predicates see `conditions` as the
-    mixture's `uncertain` has them, and the columns of `novelty`.
+    The columns are META_COLUMNS, `task_hash`, `labelled`, `uncertain` (the row has an uncertain
+    condition), `store` (int, the row's store), and one boolean for each predicate of the mixture:
+    `admitted`, `unsafe`, `stratum_0` …, and `state_0` … for strata with a predicate of the state
+    alone. Text columns are dictionary-encoded in order of appearance. If the mixture's `uncertain`
+    is "nominal", predicates see `conditions` without the uncertain ones. They may also use the
+    columns of `novelty`.
 
     Raises:
-        ConfigError: a predicate that does not run, or could choose other rows another time.
+        ConfigError: a predicate that does not run, or might choose other rows when run again.
         StoreError: transitions that cannot be read.
     """
     predicates = {"admitted": ("`where`", mixture.where or "true")}
@@ -237,14 +236,14 @@ def read_candidates(
 
 
 def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
-    """Return the cheapest table that has the rows of `transitions`, maybe among others."""
+    """Return the cheapest table or view that contains the rows of `transitions`."""
     views = connection.sql(_VIEWS).fetchall()
     return "stored_transitions" if ("stored_transitions",) in views else "transitions"
 
 
 @contextmanager
 def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """Let rows come in the order in which threads finish, while the block runs."""
+    """Allow DuckDB to return rows in any order while the block runs, which is faster."""
     connection.execute("SET preserve_insertion_order = false")
     try:
         yield
@@ -255,7 +254,7 @@ def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
 def _blame(
     connection: duckdb.DuckDBPyConnection, source: str, predicates: dict[str, tuple[str, str]]
 ) -> None:
-    """Run each predicate by itself, over every row, to name the one that fails."""
+    """Run each predicate by itself over all rows, and raise ConfigError for one that fails."""
     for place, sql in predicates.values():
         test = f"SELECT transition_id, ({sql}\n)::BOOLEAN AS holds FROM {source}"
         try:
@@ -271,15 +270,15 @@ def _blame(
 def without_measured_actions(
     connection: duckdb.DuckDBPyConnection, table: pa.Table
 ) -> tuple[pa.Table, int]:
-    """Drop rows whose action is odometry instead of a command; return the rest and their number.
+    """Drop rows whose action is odometry instead of a command.
 
-    The number is that of the rows dropped.
+    Returns the other rows, and the number of rows dropped.
 
     Raises:
-        MixtureError: none was commanded.
+        MixtureError: no row has a commanded action.
     """
     views = connection.sql(_VIEWS).fetchall()
-    if ("recordings",) not in views:  # rows without recordings: nothing says otherwise
+    if ("recordings",) not in views:  # assume that actions are commands
         return table, 0
     measured = connection.sql(
         "SELECT DISTINCT recording_id FROM recordings"
@@ -298,9 +297,9 @@ def without_measured_actions(
 
 
 def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
-    """Return the conditions and exposures that no recording's rows tell, and why not."""
+    """Return the conditions and exposures that are unknown in every recording -> the reason."""
     if "recordings" not in {name for (name,) in connection.sql(_VIEWS).fetchall()}:
-        return {}  # rows without recordings: nothing says otherwise
+        return {}  # assume that all conditions are known
     rows: list[tuple[str, str]] = connection.sql(
         "SELECT unknown.condition, any_value(unknown.because)"
         " FROM (SELECT recording_id, unnest(unknown_conditions) AS unknown FROM recordings)"
@@ -313,7 +312,7 @@ def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
 def uncertain_labels(
     connection: duckdb.DuckDBPyConnection, names: Sequence[str]
 ) -> tuple[str, ...]:
-    """Say which of these conditions and exposures have labels that rest on a guess, if any."""
+    """Return a warning if labels of any of these conditions and exposures are uncertain."""
     if "recordings" not in {name for (name,) in connection.sql(_VIEWS).fetchall()}:
         return ()
     guessed = "list_intersect(uncertain_conditions, $names::VARCHAR[])"
@@ -328,9 +327,10 @@ def uncertain_labels(
 def episodes_met(
     connection: duckdb.DuckDBPyConnection, mixture: Mixture, conditions: Sequence[Condition]
 ) -> dict[str, list[tuple[int, int]]]:
-    """Count episodes that met each condition or exposure, of those that could tell, by store.
+    """Count the episodes that met each condition or exposure, by store.
 
-    Over a view of several stores, and the rows that the mixture's `where` admits.
+    Returns name -> (episodes that met it, episodes in which it is known) for each store. The
+    connection has a view of several stores; only rows that the mixture's `where` admits count.
     """
     held = "conditions" if mixture.uncertain == "keep" else _CERTAIN
     rows = (
@@ -369,10 +369,10 @@ def episodes_met(
 
 
 def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
-    """Return a list column (n lists of `size` floats) as (n, size).
+    """Convert a list column (n lists of `size` floats) to an array (n, size).
 
     Raises:
-        PanelError: a list of another size.
+        PanelError: a list has another size.
     """
     flat = column.flatten().to_numpy(zero_copy_only=False)
     if flat.size != len(column) * size:
@@ -382,11 +382,11 @@ def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
 
 
 def one_task(table: pa.Table) -> str:
-    """Return the task of all rows that the mixture admits.
+    """Return the one task hash of all rows that the mixture admits.
 
     Raises:
-        MixtureError: it admits none.
-        StoreError: they are of several tasks.
+        MixtureError: the mixture admits no row.
+        StoreError: the rows belong to several tasks.
     """
     hashes = sorted(table["task_hash"].filter(table["admitted"]).unique().to_pylist())
     if not hashes:

@@ -1,4 +1,4 @@
-"""Which rows are no part of a panel, and why: every one is counted under its reason."""
+"""Leave rows out of a panel, and count them by reason."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.store.definitions import install_repeated_rows
 
 DAY_NS = 86_400 * 10**9
-# What an evaluation split is by, where that is not an episode: column and name.
+# `by` of an evaluation split -> column and name of its groups; otherwise the groups are episodes.
 _GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
-# Times the share that is asked for: where a whole episode is more, the end of one is held out.
+# If one whole episode is more than this multiple of the share, the end of an episode is held out.
 _WHOLE_AT_MOST = 2.0
-GAP_S = 2.0  # left out before the held end of an episode
-_GAP_AT_MOST = 0.25  # of an episode, for its end to be held out
-_LEFT_AT_LEAST = 0.2  # of an episode, to learn from
-EPISODE_REPEATS = 3  # rows that an episode shares with the evaluation split, to be left out whole
+GAP_S = 2.0  # seconds left out before the held-out end of an episode
+_GAP_AT_MOST = 0.25  # largest fraction of an episode that the gap may take
+_LEFT_AT_LEAST = 0.2  # fraction of an episode's rows that must remain for learning
+EPISODE_REPEATS = 3  # rows that repeat the evaluation split before a whole episode is left out
 
 
 @dataclass
 class LeftOut:
-    """Rows (N,) that are left out, each under the first reason that applied to it."""
+    """Rows (N,) that are left out, each counted under the first reason that applied to it."""
 
     gone: Bools
-    admitted: Bools  # those that the mixture's limits admit, whatever is then held out of them
+    admitted: Bools  # rows within the mixture's limits, including those held out for evaluation
     reasons: dict[str, int] = field(default_factory=dict)
 
     def add(self, reason: str, rows: Bools) -> None:
@@ -48,13 +48,12 @@ class LeftOut:
 
 
 def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns: int) -> LeftOut:
-    """Find the rows that no stratum gets.
+    """Return the rows to leave out before strata are assigned.
 
     `table` comes from `read_candidates`; ages are as of `as_of_ns`.
 
     Raises:
-        MixtureError: every row is too old; rows without a label, where the mixture does not say
-            what to do with them.
+        MixtureError: every row is too old, or some have no label and the mixture refuses that.
     """
     none = np.zeros(len(table), np.bool_)
     out = LeftOut(none, ~none)
@@ -95,9 +94,9 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
 
 @contextmanager
 def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -> Iterator[None]:
-    """Prepare what `repeats_of` needs while the block runs, which must not use the connection.
+    """Prepare what `repeats_of` needs in a thread while the block runs.
 
-    Raises StoreError where manifests cannot be read.
+    The block must not use the connection. Raises StoreError if manifests cannot be read.
     """
     if mixture.evaluation_split.is_empty:
         yield
@@ -113,12 +112,12 @@ def repeats_of(
 ) -> Bools:
     """Find rows (N,) outside the evaluation split that repeat its steps under other ids.
 
-    A recording and a part of it, or a drive that was recorded again, may both be in the store.
-    Where `EPISODE_REPEATS` rows or more of an episode are in the split, all of the episode counts.
-    The connection has `repeats_installed`.
+    This happens if a recording and a part of it, or two recordings of one drive, are in the store.
+    If `EPISODE_REPEATS` or more rows of an episode repeat the split's steps, all of its rows count.
+    Requires `repeats_installed` on the connection.
 
     Raises:
-        MixtureError: nothing else is left.
+        MixtureError: all rows outside the split repeat its steps.
     """
     repeated = np.zeros(len(table), np.bool_)
     if not evaluation_split.any():
@@ -129,7 +128,7 @@ def repeats_of(
     copy, original = (found[name].to_numpy() for name in found.column_names)
 
     def held(ids: Ints) -> Bools:
-        place = places.of(ids)  # of a row that is not among the candidates: -1
+        place = places.of(ids)  # -1 if the row is not a candidate
         return np.asarray((place >= 0) & evaluation_split[place], np.bool_)
 
     shown = np.union1d(original[held(copy)], original[held(original)])
@@ -155,12 +154,12 @@ def leave_out_of_strata(
     stratum: NDArray[np.int16],
     out: LeftOut,
 ) -> Bools:
-    """Exclude rows without a stratum, and those beyond the cap per episode or recording.
+    """Leave out rows without a stratum, and rows beyond the cap per episode or recording.
 
-    Returns the latter, (N,): they still count for natural shares.
+    Returns the rows beyond a cap, (N,): they still count for natural shares.
 
     Raises:
-        MixtureError: rows of no stratum, where the mixture refuses them.
+        MixtureError: rows without a stratum, if the mixture refuses them.
     """
     unlisted = (stratum == NO_STRATUM) & ~out.gone
     if unlisted.any() and mixture.unlisted == "refuse":
@@ -197,8 +196,8 @@ def beyond_cap(
 ) -> Bools:
     """Find rows (N,) beyond the cap of their stratum and episode (or recording).
 
-    Which stay depends on their ids and the seed alone, as `row_number() OVER (PARTITION BY stratum,
-    episode ORDER BY hash(transition_id, seed))` would choose.
+    Which rows stay depends only on their ids and the seed, as with `row_number() OVER (PARTITION BY
+    stratum, episode ORDER BY hash(transition_id, seed))`.
     """
     rows = np.flatnonzero(~gone & (stratum != NO_STRATUM))
     order_of = scramble(table["transition_id"].to_numpy()[rows], seed)
@@ -214,13 +213,13 @@ def beyond_cap(
 
 @dataclass(frozen=True)
 class EvaluationRows:
-    """What is kept to evaluate on, of N rows."""
+    """The rows held out for evaluation, of N rows."""
 
     held: Bools  # (N,)
-    gap: Bools  # (N,) before the held end of an episode: neither learnt from nor evaluated on
-    by: str  # as `EvaluationSplit.by`: what was done, where that is not what was asked for
-    note: str = ""  # why not, for people
-    warning: str = ""  # of far more than was asked for
+    gap: Bools  # (N,) before the held-out end of an episode: neither learned from nor evaluated on
+    by: str  # what was done, as in `EvaluationSplit.by`; may differ from what was requested
+    note: str = ""  # what was held out instead, or why nothing was
+    warning: str = ""  # if far more was held out than requested
 
     @classmethod
     def none(cls, rows: int, note: str = "") -> EvaluationRows:
@@ -232,14 +231,14 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     """Choose the rows held out for evaluation.
 
     These are whole episodes, recordings, robots or sites, the latest episodes, or the end of each
-    episode. The end is also held out if there is a single episode. With few episodes, a whole one
-    may be all there is of a condition. If it is more than twice the requested share, the end of the
-    longest is held out instead, and the others stay whole, with how they ended. Episodes of which
-    the mixture's `where` admits no row are left out.
+    episode. If there is a single episode, its end is held out. With few episodes, one whole episode
+    may contain all rows of a condition. If the one chosen is more than twice the requested share,
+    the end of the longest episode is held out instead; the other episodes then stay whole,
+    including their ends. Episodes without a row that the mixture's `where` admits are ignored.
 
     Raises:
-        MixtureError: the rule would take everything, there is only one group to split, a robot that
-            it names is not there, or rows that the mixture admits are of an unknown robot or site.
+        MixtureError: the rule would hold out everything, there is only one group, the mixture
+            admits no row of a named robot, or it admits rows of an unknown robot or site.
     """
     episode = codes(table, "episode_id")
     admitted = np.isin(episode, np.unique(episode[bools(table, "admitted")]))
@@ -252,7 +251,7 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
 
 
 def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
-    """Return the same of rows that all count."""
+    """Choose rows as `split_for_evaluation` does, for a table without episodes to ignore."""
     rule, seed = mixture.evaluation_split, mixture.seed
     if rule.is_empty:
         return EvaluationRows.none(len(table))
@@ -282,9 +281,9 @@ def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
 def _ends_of_episodes(
     table: pa.Table, rule: EvaluationSplit, n_step: int, only: int | None = None
 ) -> EvaluationRows:
-    """Hold out the last `share` of each episode, with a gap before it that no n-step return spans.
+    """Hold out the last `share` of each episode, after a gap that no n-step return spans.
 
-    With `only`, hold out the end of that episode alone, about `share` of all rows.
+    With `only`, hold out the end of that one episode, about `share` of all rows.
     """
     episode, stamp_ns = codes(table, "episode_id"), table["stamp_ns"].to_numpy()
     step = table["step_index"].to_numpy()
@@ -295,7 +294,7 @@ def _ends_of_episodes(
     np.minimum.at(first_ns, episode, stamp_ns)
     np.maximum.at(last_ns, episode, stamp_ns)
     long_s = (last_ns - first_ns) * 1e-9
-    # Of a shorter one little would be left.
+    # The gap would take too much of a shorter episode.
     split = (long_s * _GAP_AT_MOST >= GAP_S)[episode]
     if only is not None:
         split &= episode == only
@@ -321,7 +320,7 @@ def _ends_of_episodes(
 
 
 def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
-    """Return the rows (N,) of the groups that are kept whole."""
+    """Return the rows (N,) of the whole groups that are held out."""
     column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
     code = codes(table, column)
     untold = (code < 0) & bools(table, "admitted")
@@ -374,5 +373,5 @@ def _hash(name: str, seed: int) -> int:
 
 
 def scramble(ids: Ints, seed: int) -> NDArray[np.uint64]:
-    """Return a fixed mixing of ids: the same on every machine, whatever the order."""
+    """Return hashes of ids: the same on every machine and in any order of rows."""
     return splitmix64(ids.astype(np.uint64) + np.uint64((seed * GOLDEN + 1) % 2**64))

@@ -1,8 +1,8 @@
-"""From a mixture and a store to the rows of a panel: which, in which stratum, with which weight.
+"""Plan a panel from a mixture and a store: which rows, in which stratum, with which weight.
 
-DuckDB says what each row is; everything that must come out the same on every machine and version
-(the draws, the evaluation split) is done here on transition ids, with hashes of our own. The rows
-of a mixture's other stores stand beside those of the first, in one view (`all_stores`).
+DuckDB evaluates the predicates of each row. Everything that must be the same on every machine and
+version (caps, evaluation split) is computed here from transition ids, with hash functions of our
+own. The rows of a mixture's other stores are in the same view as those of the first (`all_stores`).
 """
 
 from __future__ import annotations
@@ -71,17 +71,17 @@ from restock.replay.store.store import Store
 
 
 class PinnedStore(msgspec.Struct, frozen=True):
-    """Another store of a panel, at the version that was taken."""
+    """Another store of a panel, at a pinned version."""
 
     name: str
-    path: str  # as it was found
+    path: str  # as resolved
     version: int
-    repeated_rows: int  # of recordings that a store before it has too: taken from that one
+    repeated_rows: int  # rows of recordings that an earlier store has too, and are taken from there
 
 
 @dataclass(frozen=True)
 class AllStores:
-    """One connection over all the stores of a mixture; its view `transitions` holds their rows."""
+    """A connection over all stores of a mixture; its view `transitions` contains their rows."""
 
     connection: duckdb.DuckDBPyConnection
     others: tuple[PinnedStore, ...]
@@ -89,14 +89,14 @@ class AllStores:
 
 @contextmanager
 def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> Iterator[AllStores]:
-    """Yield the first store with the mixture's others beside it, each at its pinned version.
+    """Open the mixture's other stores, and yield one view over them and the first store.
 
-    A relative path is looked up in `folder` (that of the mixture's file), else where one stands.
-    The first store's own views stay as they are.
+    A relative path is resolved against `folder` (that of the mixture's file), or against the
+    working directory if `folder` is None. The first store's own views do not change.
 
     Raises:
-        StoreError: one of them cannot be opened, has no such version, or no rows.
-        MixtureError: the stores before one of them have all of its rows too.
+        StoreError: a store cannot be opened, lacks the requested version, or has no rows.
+        MixtureError: earlier stores contain all rows of a store.
     """
     if not mixture.sources.stores:
         yield AllStores(first.connection, ())
@@ -136,7 +136,7 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
 def _attach(
     connection: duckdb.DuckDBPyConnection, first: Store, others: Sequence[tuple[OtherStore, Store]]
 ) -> list[int]:
-    """Make the view; returns how many rows of each other store are in one before it."""
+    """Create the views; return how many rows of each other store are also in an earlier store."""
     tables: dict[str, list[str]] = {"stored_transitions": [], "stored_recordings": []}
     repeated = []
     for number, store in enumerate([first, *(store for _, store in others)]):
@@ -177,34 +177,34 @@ def _all_repeated(name: str, rows: int, number: int) -> MixtureError:
     )
 
 
-LOGS = "logs"  # the name of the first store's part
+LOGS = "logs"  # the name of the first store as a source
 
 
 @dataclass(frozen=True)
 class PanelPlan:
-    """A mixture worked out against a store. Row arrays are over the store's rows, in order."""
+    """The plan of a panel. Arrays (N,) are over all rows of the store, (n,) over the panel's."""
 
     mixture: Mixture
-    rows: pa.Table  # META_COLUMNS of every row of the store, by recording, episode, step
+    rows: pa.Table  # META_COLUMNS of all N rows, sorted by recording, episode, step
     task_hash: str
-    stratum: NDArray[np.int16]  # (N,) of each row; -1 where it is not in the panel
-    weight: F32  # (n,) of the panel's rows
-    beside: dict[str, NDArray[Any]]  # (n,) each: what new shares need for new weights
+    stratum: NDArray[np.int16]  # (N,) -1: not in the panel
+    weight: F32  # (n,) importance weights
+    beside: dict[str, NDArray[Any]]  # (n,) columns from which weights follow when shares change
     evaluation_split: Bools  # (N,)
-    split_by: str  # what it is of: as `EvaluationSplit.by`, or what was done instead
-    split_note: str  # for people, where that is not whole episodes
+    split_by: str  # what was done, as in `EvaluationSplit.by`; may differ from what was requested
+    split_note: str  # what was held out instead of whole groups, or why nothing was
     strata: tuple[Stratum, ...]
-    found: dict[str, F64]  # of each that lacks rows: its rows in each episode of the dictionary
-    logs_share: float  # of a batch, all stores together; the mean over a schedule
-    logs_share_wanted: float  # the same, had all strata rows enough
-    left_out: dict[str, int]  # rows not in the panel, by reason
-    effective_rows: float  # rows drawn equally often that the weighted draw is worth
+    found: dict[str, F64]  # stratum that lacks rows -> its rows in each episode of the dictionary
+    logs_share: float  # share of logged rows in a batch, over all stores
+    logs_share_wanted: float  # the same if all strata had enough rows
+    left_out: dict[str, int]  # reason -> number of rows not in the panel
+    effective_rows: float  # effective sample size of the weighted draws
     newest_ns: int  # when the newest row was logged
-    as_of_ns: int | None  # what max_age_days counted to, where there is one
-    others: tuple[PinnedStore, ...] = ()  # besides the first store
-    uncertain_rows: int = 0  # with an uncertain condition, of those admitted
-    ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
-    warnings: tuple[str, ...] = ()  # of a source that may be an archive, or of the split
+    as_of_ns: int | None  # date for ages; None without max_age_days
+    others: tuple[PinnedStore, ...] = ()  # stores besides the first
+    uncertain_rows: int = 0  # admitted rows with an uncertain condition
+    ratios: tuple[RatioFit, ...] = ()  # fits of corrections by density ratio
+    warnings: tuple[str, ...] = ()
 
     @property
     def panel_rows(self) -> Ints:
@@ -220,12 +220,12 @@ def plan_panel(
 ) -> PanelPlan:
     """Plan a mixture over the connection's `transitions`.
 
-    `others` are the mixture's other stores, where the view holds their rows too (`all_stores`).
+    `others` are the mixture's other stores, whose rows the view contains too (`all_stores`).
 
     Raises:
-        ConfigError: a predicate that does not run.
-        MixtureError: too few rows, or weights that take a stratum below its natural share, where
-            the mixture refuses that; rows outside every stratum.
+        ConfigError: a predicate does not run.
+        MixtureError: the mixture refuses something it finds: too few rows, weights that take a
+            stratum below its natural share, rows outside all strata.
         StoreError: no rows, rows of several tasks, or ids that are not unique.
     """
     wanted = [store.name for store in mixture.sources.stores]
@@ -242,7 +242,7 @@ def plan_panel(
     if not mixture.odometry_as_command:
         table, measured = without_measured_actions(connection, table)
     task_hash = one_task(table)
-    with repeats_installed(connection, mixture):  # beside what follows: it reads manifests
+    with repeats_installed(connection, mixture):  # reads manifests in a thread meanwhile
         places = Places(table["transition_id"].to_numpy())
         if twice := places.twice:
             raise StoreError(
@@ -260,7 +260,7 @@ def plan_panel(
         del state
         split = split_for_evaluation(table, mixture)
     as_of_ns = (
-        time.time_ns() // 10**9 * 10**9  # which `as_of` can say again
+        time.time_ns() // 10**9 * 10**9  # whole seconds, so that `as_of` can repeat it
         if mixture.as_of is None
         else nanoseconds(mixture.as_of)
     )
@@ -313,9 +313,9 @@ def plan_panel(
 def _members(
     table: pa.Table, strata: Sequence[ResolvedStratum], *, of_state: bool = False
 ) -> Bools:
-    """Return the rows that each stratum's predicate admits, (N, S).
+    """Return the rows that may be in each stratum, (N, S), by its predicate and unit.
 
-    `of_state` are those by predicates of the state alone.
+    With `of_state`, use predicates of the state alone where strata have one.
     """
     member = np.empty((len(table), len(strata)), np.bool_, order="F")
     episode = codes(table, "episode_id")
@@ -337,7 +337,7 @@ def _dealt(
     state_code: NDArray[np.int16],
     counted: Bools,
 ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Return strata (N,) and those of the state alone, each episode at its rarest, by store."""
+    """Deal the episodes of each store; return strata (N,), and strata by state alone (N,)."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     stratum, state_code = stratum.copy(), state_code.copy()
     numbers = pc.unique(table["store"]).to_pylist()
@@ -358,9 +358,10 @@ def _sources(
     logged: Bools,
     size: int,
 ) -> list[SourceRows]:
-    """Return what each store may give, with its share of a batch as a run begins; `size` strata.
+    """Return the rows of each store that may be drawn, and its share of a batch.
 
-    A recording of which the mixture admits none of the rows (`logged`) is no logging of its kind.
+    `logged` (N,) are rows that the mixture admits. Recordings without any do not count as logging.
+    `size` is the number of strata.
     """
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     recording = codes(table, "recording_id")
@@ -437,7 +438,7 @@ def _joined(
             )
             for line in plan.lines
         ]
-    # Rows of a stratum that is never drawn are no part of the panel.
+    # Rows of a stratum that is never drawn are not in the panel.
     left_out = out.reasons | ({"in a stratum of share 0": never} if never else {})
     chosen = np.flatnonzero(code != NO_STRATUM)
     rows = np.array([line.rows for line in lines])
@@ -469,12 +470,12 @@ def _joined(
 
 
 def _prefix(source: SourceRows) -> str:
-    """Return what stands before the names of a source's strata."""
+    """Return the prefix of the names of a source's strata."""
     return "" if source.name == LOGS else f"{source.name}/"
 
 
 def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:
-    """Return `effective_count` of each row's share of the draws times its weight, (n,)."""
+    """Return `effective_count` of share of the draws times weight over rows (n,), by blocks."""
     total = squares = 0.0
     for begin, end in stretches(len(code)):
         sizes = drawn[code[begin:end]] * weight[begin:end]
@@ -483,5 +484,5 @@ def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:
 
 
 def outcome_column(stratum: str) -> str:
-    """Return the column of a panel's metadata with P(stratum | state, action)."""
+    """Return the name of the column of a panel's metadata with P(stratum | state, action)."""
     return f"probability_of_{stratum}"

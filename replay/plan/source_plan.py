@@ -1,7 +1,7 @@
 """The plan of one source of a panel: shares, importance weights, and missing rows.
 
-Strata with a wanted share and no rows are named, with what to change. Most often that is nominal:
-with `unit = "episode"` it has the episodes that met nothing.
+Strata with a wanted share and no rows are reported, with what to change. Most often this is
+nominal: with `unit = "episode"` it has only the episodes that met no condition.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from restock.replay.plan.weights import (
 
 
 def no_rows(rule: StratumRule) -> str:
-    """Return what to change where a stratum has no row."""
+    """Return the text for a stratum without rows: what is wrong, and what to change."""
     if rule.name == NOMINAL and rule.where is None and rule.unit == "episode":
         return (
             "has no episode: each met the condition of another stratum; give the most frequent one"
@@ -48,41 +48,40 @@ def no_rows(rule: StratumRule) -> str:
     return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
 
 
-# A share of the gradient this much below the natural one is no rounding.
-TOLERANCE = 0.01
+TOLERANCE = 0.01  # relative: a share of the gradient this close to the natural one counts as equal
 
 
 @dataclass(frozen=True)
 class SourceRows:
-    """The rows of one source that may be drawn, (n,) each."""
+    """The rows of one source that may be drawn; arrays are (n,) unless noted."""
 
     name: str
-    part: float  # of a batch that this source is to fill
-    candidates: pa.Table  # all of them
-    at: Ints  # the places of these rows
+    part: float  # share of a batch that this source should fill
+    candidates: pa.Table  # the rows of all sources, including those left out
+    at: Ints  # positions of this source's rows in `candidates`
     code: NDArray[np.int16]  # stratum
-    state_code: NDArray[np.int16]  # the one their state alone would put them in
+    state_code: NDArray[np.int16]  # stratum that the row's state alone would give; -1: none
     episode: Codes
-    logged: Bools  # (E,) whether each episode is of this source's logging
-    admitted: Ints  # (S,) rows of each stratum, those beyond a cap too
+    logged: Bools  # (E,) episodes of this source's recordings with admitted rows
+    admitted: Ints  # (S,) rows of each stratum, including those beyond a cap
 
 
 @dataclass(frozen=True)
 class SourcePlan:
-    """A source worked out. Shares in `lines` are of the source's own part of a batch."""
+    """The plan of one source. Shares in `lines` are shares of the source's rows in a batch."""
 
     shares: SharePlan
-    kept: Bools  # (n,) rows of strata that are drawn at all
-    weight: F32  # of the kept rows
-    outcome: F32 | None  # (kept, S) P(stratum | state, action), where one is estimated
+    kept: Bools  # (n,) rows of strata with a share above 0
+    weight: F32  # importance weights of the kept rows
+    outcome: F32 | None  # (kept, S) P(stratum | state, action); None if not estimated
     fit: RatioFit | None
     lines: list[Stratum]
-    warnings: tuple[str, ...]  # of strata without the rows for any of their share
-    found: dict[str, F64]  # of strata that lack rows: their rows in each episode (E,), or NaN
+    warnings: tuple[str, ...]  # of strata with a wanted share but no rows
+    found: dict[str, F64]  # stratum that lacks rows -> its rows by episode (E,); NaN: not `logged`
 
     @property
     def drawn(self) -> float:
-        """Return how much of its part the source can fill."""
+        """Return the fraction of its part of a batch that the source can fill."""
         return self.shares.scale
 
 
@@ -96,12 +95,12 @@ def plan_source(
 ) -> SourcePlan:
     """Plan the shares, weights and report lines of one source.
 
-    `natural` (S,) are the shares that its rows stand for, where that is not their own; `unknown`
-    the conditions that none of them tells, and why.
+    `natural` (S,) are the shares that its rows represent; None: their own. `unknown` maps
+    conditions that are unknown in all its rows to the reason.
 
     Raises:
-        MixtureError: too few rows, or weights that take a
-            stratum below its natural share, where the mixture refuses that.
+        MixtureError: too few rows, or weights that take a stratum below its natural share, if the
+            mixture refuses that.
     """
     size = len(strata)
     rows = np.bincount(source.code, minlength=size).astype(np.int64)
@@ -139,7 +138,7 @@ def plan_source(
     )
     after = effective_shares(code, weight, shares.got)
     missing = missing_rows(mixture, rows, shares.wanted, draws)
-    missing[[rule.name in untold for rule in rules]] = 0  # no drive of such robots brings any
+    missing[[rule.name in untold for rule in rules]] = 0  # more drives would not add any
     occurs = rows / max(rows.sum(), 1) if natural is None else natural
     found: dict[str, F64] = {}
     for i in np.flatnonzero(missing).tolist():
@@ -175,8 +174,9 @@ def plan_source(
 def below_natural(line: Stratum) -> bool:
     """Return whether weights took a stratum's share of the gradient below its share of the rows.
 
-    If its quota or a lack of rows already puts it below that, only what its own correction takes
-    from the drawn share counts. `line` has shares of its source's part.
+    If its drawn share is already below its natural share, by quota or for lack of rows, the
+    gradient's share is compared with the drawn share, and only if the stratum has a correction.
+    `line` has shares of its source's rows.
     """
     least = (1.0 - TOLERANCE) * min(line.natural_share, line.share)
     weighted = line.correction != "none" or line.share >= (1.0 - TOLERANCE) * line.natural_share
@@ -214,7 +214,10 @@ def _outcomes(
     kept: Bools,
     natural: F64 | None,
 ) -> tuple[F32 | None, RatioFit | None]:
-    """Return P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None."""
+    """Estimate P(k | s, a) of strata corrected by density ratio, (kept, S); None if there are none.
+
+    Also returns the quality of the fit.
+    """
     code = source.code[kept]
     by_ratio = [s.correction == "density_ratio" and s.timing == "post" for s in strata]
     estimated = np.flatnonzero(by_ratio & (np.bincount(code, minlength=len(strata)) > 0))

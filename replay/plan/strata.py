@@ -1,4 +1,4 @@
-"""Strata: each row of the store to at most one, by priority, or an episode to its rarest one."""
+"""Assign each row to at most one stratum: by priority, or with its episode to the rarest one."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from restock.replay.mixture.mixture import (
 
 NO_STRATUM = -1
 NOMINAL_PRIORITY = 1000
-NOVEL = "novel"  # a stratum of this name needs no `where`: the column of `novelty`
-NOVEL_PRIORITY = 999  # what no condition names, before nominal
+NOVEL = "novel"  # the stratum of rows with `novel` true in `novelty`; it needs no `where`
+NOVEL_PRIORITY = 999  # after all conditions, before nominal
 WHERE_PRIORITY = 50
 
 
@@ -39,25 +39,25 @@ class Stratum(msgspec.Struct, frozen=True):
     within: Within
     rows: int
     episodes: int
-    natural_share: float  # of its source's rows
-    wanted_share: float  # of the logs' part of a batch, as the other shares
-    share: float  # those of a panel sum to 1
-    replays_per_row: float  # expected over the mixture's planned updates
+    natural_share: float  # share of its source's rows
+    wanted_share: float  # share of a batch's logged rows, like `share` and `effective_share`
+    share: float  # actual share; a panel's shares sum to 1
+    replays_per_row: float  # expected over the mixture's planned draws
     effective_episodes: float  # (sum n)^2 / sum n^2 over the rows per episode
-    effective_rows: float  # rows drawn equally often that its weighted draw is worth
+    effective_rows: float  # effective sample size of its rows under their weights
     largest_weight: float
-    effective_share: float  # after weights
+    effective_share: float  # share of the gradient, after weights
     note: str
-    missing_rows: int = 0  # more of them, and its rows would bear the wanted share
+    missing_rows: int = 0  # more rows that the wanted share needs
 
 
 @dataclass(frozen=True)
 class ResolvedStratum:
-    """A stratum as resolved against a store's conditions."""
+    """A stratum with its predicate and defaults resolved against a store's conditions."""
 
     rule: StratumRule
-    predicate: str  # SQL over `transitions`: whether it holds in a row
-    # The same of the state alone; None where that is the predicate, or the outcome decides.
+    predicate: str  # SQL over `transitions`: whether a row may be in the stratum
+    # SQL that uses only the row's state, if it differs from `predicate`; else None.
     state_predicate: str | None
     priority: int
     timing: Literal["pre", "post"]
@@ -70,27 +70,28 @@ class ResolvedStratum:
 
     @property
     def left_over(self) -> bool:
-        """Return whether it gets the episodes that no other stratum of episodes is for."""
+        """Return whether this is nominal by episode: all episodes that no other stratum takes."""
         return self.rule.unit == "episode" and self.name == NOMINAL and self.rule.where is None
 
     @property
     def steps_of_episode(self) -> bool:
-        """Return whether it is of the episodes in which its predicate holds in `min_steps` rows."""
+        """Return whether it takes whole episodes, if the predicate holds in `min_steps` rows."""
         return self.rule.unit == "episode" and not self.left_over
 
     @property
     def dealt(self) -> bool:
-        """Return whether `deal_episodes` gives it episodes: not if it has its own `priority`."""
+        """Return whether `deal_episodes` assigns its episodes: not if `priority` is set."""
         return self.steps_of_episode and self.rule.priority is None
 
 
 def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
-    """Resolve the mixture's strata, then those of `each_condition`, in table order.
+    """Resolve the mixture's strata in their order, then those of `each_condition` by priority.
 
-    `conditions` are the store's, of both kinds.
+    `conditions` are the store's conditions and exposures.
 
     Raises:
-        ConfigError: a stratum that is neither a condition of the store nor has a `where`.
+        ConfigError: a stratum is no condition or exposure of the store, and has no `where`; or
+            each_condition is for exposures, and the store has none.
     """
     known = {condition.name: condition for condition in conditions}
     rules = list(mixture.strata)
@@ -109,7 +110,7 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Re
 
 
 def rules_of(mixture: Mixture, names: Sequence[str]) -> list[StratumRule]:
-    """Return the rules of strata by their names, listed ones and those of `each_condition`."""
+    """Return the rules of strata by name: those listed in the mixture, else `each_condition`."""
     listed = {rule.name: rule for rule in mixture.strata}
     each = mixture.each_condition or EachCondition()
     return [listed.get(name) or _rule_for(name, each) for name in names]
@@ -127,7 +128,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         predicate, priority, timing = rule.where, WHERE_PRIORITY, "post"
     elif rule.name == NOMINAL:
         predicate, priority, timing = "len(conditions) = 0", NOMINAL_PRIORITY, "pre"
-        # A slip that nothing announced happened in a nominal state.
+        # An outcome such as a slip without any condition before it happened in a nominal state.
         states = (c for c in of_kind(known.values(), "outcome") if c.timing == "pre")
         before = ", ".join(f"'{c.name}'" for c in states)
         state_predicate = f"NOT list_has_any(conditions, [{before}]::VARCHAR[])"
@@ -147,7 +148,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
             " `where`; or add it to the profile and run `restock store label`",
         )
     if rule.unit == "episode":
-        # Chosen by what the whole episode met, not by what came of this step.
+        # Selected by what the whole episode met, not by the outcome of this step.
         state_predicate, timing = None, "pre"
         rest = rule.name == NOMINAL and rule.where is None
         predicate = "true" if rest else predicate
@@ -165,10 +166,11 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
 
 
 def least_steps(rule: StratumRule, steps: Ints) -> int:
-    """Return in how many rows an episode must meet a condition; `steps` (E,) are those it has.
+    """Return the number of rows in which an episode must meet the condition.
 
-    `min_steps`, or the most that an episode has where none has so many: a condition that is there
-    has rows of its own.
+    `steps` (E,) is the number of rows in which each episode met it. The result is `min_steps`, or
+    the largest number in `steps` if no episode has so many: a condition that occurs at all then
+    gets rows.
     """
     return max(min(rule.min_steps, int(steps.max(initial=0))), 1)
 
@@ -176,16 +178,16 @@ def least_steps(rule: StratumRule, steps: Ints) -> int:
 def assign(
     member: Bools, strata: Sequence[ResolvedStratum], *, only_pre: bool = False
 ) -> NDArray[np.int16]:
-    """Return the stratum of each row (N,), from membership (N, S); -1 where it belongs to none.
+    """Return the stratum of each row (N,) from its memberships (N, S); -1 if it has none.
 
-    `only_pre` leaves out strata chosen on the outcome: where the row's state alone would put it,
-    if `member` is of the state alone.
+    `only_pre` ignores strata selected by outcome. If `member` is by state alone, the result is
+    then the stratum that a row's state alone would give.
     """
     order = sorted(range(len(strata)), key=lambda index: (strata[index].priority, index))
     if only_pre:
         order = [index for index in order if strata[index].timing == "pre"]
     code = np.full(len(member), NO_STRATUM, np.int16)
-    for index in reversed(order):  # the first in priority is written last
+    for index in reversed(order):  # the stratum with the lowest priority number is written last
         code[member[:, index]] = index
     return code
 
@@ -197,17 +199,17 @@ def deal_episodes(
     strata: Sequence[ResolvedStratum],
     counted: Bools,
 ) -> NDArray[np.int16]:
-    """Return the rarest stratum of each episode (E,); -1 where it is not dealt to one.
+    """Return the rarest stratum of each episode (E,); -1 if no stratum gets the episode.
 
-    The stratum with the fewest rows so far takes one of its episodes, and so on until none is left;
-    first those that could go nowhere else. So a condition that is met in few episodes has all of
-    them, and one that always comes with another (a recovery follows each near collision) has some.
+    In turn, the stratum with the fewest rows so far takes one of its episodes, beginning with those
+    that fit the fewest strata. So a condition that few episodes met gets all of them, and a
+    condition that always accompanies another (a recovery follows each near collision) gets some.
 
     Args:
-        code: (N,) by priority alone, as `assign` gives it: rows of other strata are not dealt.
-        member: (N, S) which strata a row may be in; the same for all rows of an episode.
-        episode: (N,) its code in 0..E - 1, in order of appearance.
-        counted: (N,) rows that may be drawn: the others add nothing to a stratum's rows.
+        code: (N,) the stratum by `assign`; only rows with a dealt stratum take part.
+        member: (N, S) strata that a row may be in; the same for all rows of an episode.
+        episode: (N,) code of its episode in 0..E - 1, in order of appearance.
+        counted: (N,) rows that may be drawn; other rows do not count for a stratum's size.
     """
     given = np.full(int(episode.max(initial=-1)) + 1, NO_STRATUM, np.int16)
     dealt = np.array([index for index, stratum in enumerate(strata) if stratum.dealt], np.int64)
@@ -221,7 +223,7 @@ def deal_episodes(
     first, place = first_of[names], (np.cumsum(first_of >= 0) - 1)[here]
     may = member[rows[first]][:, dealt]  # (n episodes, K)
     size = np.bincount(place, weights=counted[rows]).astype(np.int64)
-    # Of strata with as many rows, the one that could get least goes first, then by priority.
+    # Ties go to the stratum that could get the fewest rows, then by priority.
     could = (may * size[:, None]).sum(axis=0)
     filled = [(0, int(could[k]), strata[dealt[k]].priority, k) for k in range(len(dealt))]
     heapq.heapify(filled)
@@ -248,7 +250,7 @@ def as_dealt(
     episode: Codes,
     strata: Sequence[ResolvedStratum],
 ) -> NDArray[np.int16]:
-    """Return strata (N,) by priority, with those of `deal_episodes` in place of the dealt ones."""
+    """Return strata (N,) by priority, with dealt strata replaced by those of `deal_episodes`."""
     dealt = [index for index, stratum in enumerate(strata) if stratum.dealt]
     of_episode = given[episode]
     return np.where(np.isin(code, dealt) & (of_episode != NO_STRATUM), of_episode, code)

@@ -1,25 +1,25 @@
-"""Importance weights against the boost of strata, and what they leave of a sample.
+"""Importance weights that offset the boost of strata, and the effective sizes that result.
 
-A stratum that gets a share s of the draws and holds n of N rows is drawn s N / n times as often as
-it occurs. A row chosen on its outcome is weighted back to the density of the rows of the same state
-whose outcome was another, which keeps P(s'|s, a) what it was; a row chosen on its state, where that
-is asked for, to its natural density. So a weight depends on two strata of a row alone: its own, and
-the one its state would put it in. A density ratio adds a factor of the state and action.
+A stratum that gets a share s of the draws and has n of N rows is drawn s N / n times as often as it
+occurs. A row selected by outcome is weighted back to the density of rows of the same state with
+other outcomes, which preserves P(s'|s, a). A row selected by state is weighted back to its natural
+density, if the mixture corrects it. So a weight depends on only two strata of a row: its own, and
+the one that its state alone would give. A density ratio adds a factor of state and action.
 
-A stratum chosen on the outcome (slip) is boosted b times. Full correction removes the boost, also
-of the states in which the outcome is likely. But states and actions may be drawn as often as one
-likes; only the distribution of their outcomes must not change. So its rows, whatever their outcome,
-are weighted to
+Suppose that a stratum selected by outcome (slip) is boosted b times. Full correction removes the
+boost, also that of states in which the outcome is likely. But states and actions may be drawn as
+often as desired; only the distribution of their outcomes must not change. With a density ratio,
+rows of any outcome are therefore weighted to their natural density times
 
     r(s, a) = q(s, a) / p(s, a) = sum over outcomes k of P(k | s, a) b_k
 
-times their natural density: the ratio of the density at which the quotas draw the state and action
-to the one at which they occur. P(k | s, a) is estimated by logistic regression, which is how a
-density ratio is estimated by classification (Bickel, Brückner and Scheffer, JMLR 10, 2009;
-Sugiyama, Suzuki and Kanamori, Density Ratio Estimation in Machine Learning, 2012, chapter 4). r is
-clipped from above and weights are normalised over what is drawn (self-normalised importance
-sampling). As r is a function of the state and action alone, a poor fit changes which states are
-boosted, and not the outcomes that the critic sees in each.
+This is the ratio of the density at which the quotas draw the state and action to the density at
+which they occur. P(k | s, a) is estimated by logistic regression: density ratio estimation by
+classification (Bickel, Brückner and Scheffer, JMLR 10, 2009; Sugiyama, Suzuki and Kanamori, Density
+Ratio Estimation in Machine Learning, 2012, chapter 4). r is clipped from above, and weights are
+normalised over the draws (self-normalised importance sampling). As r depends only on state and
+action, a poor fit changes which states are boosted, but not the outcomes that the critic sees in
+each.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
 from restock.replay.plan.candidates import any_order, as_stored, matrix
 
-BATCH_ROWS = 4_096  # of observations in memory at a time
-COLUMNS = 16  # of features in memory at a time
-FIT_ROWS = 20_000  # of each outcome, chosen by id
+BATCH_ROWS = 4_096  # observations in memory at a time
+COLUMNS = 16  # features in memory at a time
+FIT_ROWS = 20_000  # largest number of rows of each outcome to fit, chosen by id
 PENALTY = 1e-3  # L2, on standardised features
 
 
 class Corrected(Protocol):
-    """What weights must know of a stratum."""
+    """A stratum's timing and correction."""
 
     @property
     def timing(self) -> str: ...
@@ -54,16 +54,17 @@ class Corrected(Protocol):
 
 
 class RowWeights:
-    """Weights of the rows of one source, of mean 1 over what the shares draw.
+    """Weights of the rows of one source, with mean 1 over the draws.
 
     Args:
         code: (N,) each row's stratum, never -1.
-        state_code: (N,) the one its state alone gives, -1 for none.
-        strata: (S,) whose timing and correction decide.
+        state_code: (N,) the stratum that its state alone would give, -1 for none.
+        strata: (S,) timing and correction of each stratum.
+        rule: the mixture's `clip`.
         outcome: (N, S) the probability of each "density_ratio" stratum given a row's state and
             action (0 for the other strata), or None.
-        natural: (S,) how often each stratum occurs, where the rows were chosen (an archive, a cap);
-            None: as often as it has rows.
+        natural: (S,) natural share of each stratum, if the rows are a selection (an archive, a
+            cap); None: in proportion to its rows.
     """
 
     def __init__(
@@ -79,12 +80,12 @@ class RowWeights:
         self.strata, self.rule, self.outcome = list(strata), rule, outcome
         self.rows = np.bincount(code, minlength=size)
         self._occurs = self.rows if natural is None else np.where(self.rows > 0, natural, 0.0)
-        # State -1 is the last column.
+        # State code -1 becomes the last column.
         self._cell = code.astype(np.int32) * (size + 1) + state_code % (size + 1)
         self._in_cell = np.bincount(self._cell, minlength=size * (size + 1)).reshape(size, size + 1)
 
     def boost(self, shares: F64) -> F64:
-        """Return how much more often each stratum is drawn than it occurs, (S,); 1 if empty."""
+        """Return drawn share over natural share of each stratum, (S,); 1 if it is empty."""
         ones = np.ones(len(shares))
         drawn = shares * self._occurs.sum()
         return np.asarray(np.divide(drawn, self._occurs, out=ones, where=self._occurs > 0))
@@ -105,9 +106,12 @@ class RowWeights:
         return np.asarray(weight / max(float(total), 1e-12), np.float32)
 
     def _table(self, boost: F64) -> tuple[F64, F64]:
-        """Return weights by stratum and state's stratum (S, S + 1) and state densities (S + 1,)."""
+        """Return weights by stratum and state's stratum (S, S + 1), and target densities (S + 1,).
+
+        Target densities are of states, as multiples of their natural density.
+        """
         corrected = np.array([stratum.correction != "none" for stratum in self.strata])
-        # The density at which rows of a state are to be drawn: boosted, or as they occur.
+        # Target density of a state: boosted if its stratum has no correction, else natural.
         aim = np.where(corrected | (boost == 0), 1.0, boost)
         state_aim = np.append(aim, 1.0)
         table = np.ones((len(self.strata), len(self.strata) + 1))
@@ -132,12 +136,12 @@ def importance_weights(
     outcome: F32 | None = None,
     natural: F64 | None = None,
 ) -> F32:
-    """Return weights (N,) of the rows of one source, see `RowWeights`."""
+    """Return weights (N,) of the rows of one source; see `RowWeights`."""
     return RowWeights(code, state_code, strata, rule, outcome, natural).under(shares)
 
 
 def stands_for(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
-    """Return how many rows each row (N,) stands for; 1 in a natural sample."""
+    """Return how many rows of a natural sample each row represents, (N,), with mean 1."""
     if natural is None:
         return np.ones(len(code))
     rows = np.bincount(code, minlength=size)
@@ -154,21 +158,22 @@ def effective_shares(code: NDArray[np.int16], weights: F32, shares: F64) -> F64:
 
 
 def effective_count(sizes: NDArray[Any]) -> float:
-    """Return (sum n)^2 / sum n^2: how many equal groups these would be worth."""
+    """Return the effective number of groups of these sizes, (sum n)^2 / sum n^2; 0 if empty."""
     total = float((np.asarray(sizes, np.float64) ** 2).sum())
     return float(np.asarray(sizes).sum()) ** 2 / total if total > 0 else 0.0
 
 
 class WeightsInForce:
-    """The weights of a panel's rows while its shares move: `of(rows)` under the last `set_shares`.
+    """The weights of a panel's rows under shares that change during a run.
 
     Args:
-        code: (n,) the stratum of each row, over all sources: those of source k are k * S and on.
-        state_code: (n,) the stratum its state gives, within its source.
-        strata: (K * S,) timing and correction of each.
-        sources: K, stores that the panel is from.
-        outcome: (n, S) as `RowWeights` has it, or None.
-        natural: of each source (S,) as `RowWeights` has it, or None; () for all None.
+        code: (n,) the stratum of each row over all sources; those of source k begin at k * S.
+        state_code: (n,) the stratum that its state alone would give, within its source.
+        strata: (K * S,) timing and correction of each stratum.
+        sources: K, the number of stores of the panel.
+        rule: the mixture's `clip`.
+        outcome: (n, S) as in `RowWeights`, or None.
+        natural: for each source (S,) as in `RowWeights`, or None; (): None for all.
     """
 
     def __init__(
@@ -194,34 +199,35 @@ class WeightsInForce:
         self._weight: F32 = np.ones(len(code), np.float32)
 
     def set_shares(self, shares: F64) -> None:
-        """Set the shares (K * S,) that weights are under, with mean 1 in each source."""
+        """Compute the weights for shares (K * S,), with mean 1 over the draws of each source."""
         for at, span, weights in self._parts:
             total = shares[span].sum()
             if len(at) and total > 0:
                 self._weight[at] = weights.under(shares[span] / total)
 
     def of(self, rows: NDArray[Any]) -> F32:
-        """Return the weights (n,) of rows (n,)."""
+        """Return the weights (n,) of rows (n,) under the last `set_shares`."""
         weight: F32 = self._weight[rows]
         return weight
 
 
 @dataclass(frozen=True)
 class RatioFit:
-    """How well states and actions predict outcomes. Losses are of rows kept from the fit."""
+    """How well states and actions predict outcomes. Losses are of rows held out from the fit."""
 
     source: str
     strata: tuple[str, ...]
-    rows: int  # fitted on
-    log_loss: float  # nats a row
-    base_log_loss: float  # of the outcomes' plain frequencies: what knowing nothing costs
+    rows: int  # rows fitted
+    log_loss: float  # nats per row
+    base_log_loss: float  # of a prediction by the frequencies of outcomes alone
 
 
 def density_ratio(outcome: F32, boost: F64, state_aim: F64, clip: float) -> F64:
-    """Return r(s, a) of each row (N,), in units of its state's own density, at most `clip`.
+    """Return r(s, a) of each row (N,), relative to its state's target density, at most `clip`.
 
-    `outcome` (N, S) is P(k | s, a) of the strata it is estimated for, `boost` (S,) how much more
-    often a stratum is drawn than it occurs, `state_aim` (N,) the same for rows of other outcomes.
+    `outcome` (N, S) is P(k | s, a) of the estimated strata, and 0 for others. `boost` (S,) is the
+    drawn share over the natural share of each stratum. `state_aim` (N,) is the target density of
+    each row's state, at which rows of other outcomes are drawn.
     """
     drawn = outcome @ boost + (1.0 - outcome.sum(axis=1)) * state_aim
     ratio = np.divide(drawn, state_aim, out=np.ones(len(drawn)), where=state_aim > 0)
@@ -229,18 +235,19 @@ def density_ratio(outcome: F32, boost: F64, state_aim: F64, clip: float) -> F64:
 
 
 class OutcomeModel:
-    """Multinomial logistic regression of an outcome (0: none of them) on standardised features.
+    """Multinomial logistic regression of an outcome (0: any other) on standardised features.
 
     Args:
         features: (n, D).
         outcome: (n,) in 0..outcomes - 1.
-        weight: (n,) how many rows each stands for.
+        outcomes: the number of outcomes.
+        weight: (n,) how many rows each row represents; None: all 1.
     """
 
     def __init__(
         self, features: NDArray[Any], outcome: Ints, outcomes: int, weight: F64 | None = None
     ) -> None:
-        from scipy.optimize import minimize  # here: no query needs it, and it is slow to import
+        from scipy.optimize import minimize  # imported here because it is slow and rarely needed
         from scipy.special import log_softmax
 
         weight = np.ones(len(features)) if weight is None else weight / weight.mean()
@@ -256,7 +263,7 @@ class OutcomeModel:
             value = -(weight * log_p[np.arange(len(x)), outcome]).mean()
             gradient = x.T @ (weight[:, None] * (np.exp(log_p) - chosen)) / len(x)
             penalised = theta.copy()
-            penalised[0] = 0.0  # the intercepts are free
+            penalised[0] = 0.0  # no penalty on intercepts
             value += 0.5 * PENALTY * float((penalised**2).sum())
             return float(value), (gradient + PENALTY * penalised).ravel()
 
@@ -269,7 +276,7 @@ class OutcomeModel:
         self.theta: F64 = fitted.x.reshape(x.shape[1], outcomes)
 
     def probability(self, features: NDArray[Any]) -> F64:
-        """Return P(outcome) of each row, (n, outcomes)."""
+        """Return the probability of each outcome in each row, (n, outcomes)."""
         from scipy.special import softmax
 
         return np.asarray(softmax(self._design(features) @ self.theta, axis=1), np.float64)
@@ -279,16 +286,16 @@ class OutcomeModel:
         scaled = design[:, 1:]
         np.subtract(features, self.mean, out=scaled)
         scaled /= self.scale
-        # Clipped: an observation unlike any seen is no reason for certainty.
+        # Clipped so that observations unlike those fitted do not give certain predictions.
         np.clip(scaled, -5.0, 5.0, out=scaled)
         return design
 
 
 def _moments(features: NDArray[Any], weight: F64) -> tuple[F64, F64]:
-    """Compute the weighted mean and standard deviation of each column (D,).
+    """Compute the weighted mean and standard deviation of each column, (D,) each.
 
-    It takes some columns at a time: a copy of all would need more memory than anything else in a
-    panel.
+    It works on a few columns at a time: a float64 copy of all would need more memory than anything
+    else in a panel.
     """
     mean, spread = np.zeros(features.shape[1]), np.zeros(features.shape[1])
     for begin in range(0, len(mean), COLUMNS):
@@ -301,14 +308,14 @@ def _moments(features: NDArray[Any], weight: F64) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class RatioRows:
-    """The rows of one source that a ratio is estimated over, (n,) each."""
+    """The rows of one source over which a density ratio is estimated, (n,) each."""
 
     transition_id: Ints
     action: Ints
-    state_code: NDArray[np.int16]  # of the strata, -1 for none
-    code: NDArray[np.int16]  # the stratum of each row
-    order: NDArray[np.uint64]  # a fixed shuffle of ids: which rows are fitted on
-    stands_for: F64  # how many rows each is worth, of as many that came as they occur
+    state_code: NDArray[np.int16]  # stratum that the state alone would give, -1 for none
+    code: NDArray[np.int16]  # stratum
+    order: NDArray[np.uint64]  # hashes of ids, by which rows for the fit are chosen
+    stands_for: F64  # how many rows of a natural sample each row represents
 
 
 def estimate_outcomes(
@@ -318,9 +325,9 @@ def estimate_outcomes(
     names: tuple[str, ...],
     source: str,
 ) -> tuple[F32, RatioFit]:
-    """Estimate P(k | s, a) (n, K) of the strata `estimated` (K,), and how good that is.
+    """Estimate P(k | s, a) (n, K) for the strata `estimated` (K,); also return the fit's quality.
 
-    The features are the observation, the action and the state's own stratum.
+    The features are the observation, the action, and the stratum that the state alone would give.
     """
     label = np.zeros(len(rows.code), np.int64)
     for place, stratum in enumerate(estimated.tolist(), start=1):
@@ -342,7 +349,7 @@ def estimate_outcomes(
     held_out = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to validate the fit
     if held_out.all() or not held_out.any():
         held_out = np.zeros(len(chosen), np.bool_)
-    last = np.argsort(held_out, kind="stable")  # those held out: both parts are views of x
+    last = np.argsort(held_out, kind="stable")  # rows held out last, so that both parts are views
     chosen, weight = chosen[last], weight[last]
     split = len(chosen) - int(held_out.sum())
     x, y = np.empty((len(chosen), 0), np.float32), label[chosen]
@@ -350,7 +357,7 @@ def estimate_outcomes(
     for observation, at in _observations(connection, rows.transition_id, chosen):
         made = features(observation, at)
         if not x.shape[1]:
-            x = np.zeros((len(chosen), made.shape[1]), np.float32)  # exact: as rows are stored
+            x = np.zeros((len(chosen), made.shape[1]), np.float32)  # exact: stored as float32
         x[[place_of[int(row)] for row in at]] = made
     model = OutcomeModel(x[:split], y[:split], len(estimated) + 1, weight[:split])
     validation = slice(split if split < len(x) else 0, None)
@@ -378,12 +385,12 @@ def _log_loss(probability: F64, outcome: Ints, weight: F64) -> float:
 def _observations(
     connection: duckdb.DuckDBPyConnection, ids: Ints, at: Ints
 ) -> Iterator[tuple[NDArray[np.float32], Ints]]:
-    """Yield batches of observations (m, D) of the rows `at`, with their rows."""
+    """Yield batches of observations (m, D) of the rows `at`, with their row numbers (m,)."""
     order = np.argsort(ids[at])
     wanted = ids[at][order]
     query = f"SELECT transition_id, observation FROM {as_stored(connection)}"
     with any_order(connection):
-        # Found here and not by a join, which would hold what it waits for.
+        # Matched here instead of in a join, which would keep rows in memory.
         for batch in connection.sql(query).to_arrow_reader(BATCH_ROWS):
             these = batch.column("transition_id").to_numpy()
             place = np.minimum(np.searchsorted(wanted, these), len(wanted) - 1)
@@ -391,6 +398,6 @@ def _observations(
             if not len(found):
                 continue
             column = batch.column("observation")
-            if len(found) < len(column):  # the others may be of another task, and another size
+            if len(found) < len(column):  # other rows may belong to a task with another size
                 column = column.take(pa.array(found))
             yield matrix(column, len(column[0])), at[order[place[found]]]
