@@ -58,7 +58,7 @@ def software_version() -> str:
 
 
 def definitions(profile: Profile) -> dict[str, str]:
-    """Return the versions of all that rows depend on, besides the recording itself."""
+    """Return hashes and versions of the definitions that rows depend on."""
     return {
         "profile_hash": profile.hash,
         "task_hash": profile.task.hash,
@@ -222,7 +222,7 @@ class Correction:
 
     condition: str
     value: bool  # whether it holds there
-    episode_index: int  # when it was given; tells times apart that a clock set back repeats
+    episode_index: int  # when it was given; needed if a clock was set back, so that times repeat
     first_ns: int  # log time of its first step
     last_ns: int  # log time of its last step
     given_at: dt.datetime
@@ -245,7 +245,7 @@ class Moments:
         return cls(rows["episode_index"].to_numpy(), logged)
 
     def covered(self, correction: Correction) -> Bools:
-        """Return rows (N,) in a correction's interval: those of its episode, or if none, of any."""
+        """Return which rows (N,) are in a correction's interval and episode, else its interval."""
         inside = (self.logged_ns >= correction.first_ns) & (self.logged_ns <= correction.last_ns)
         same = inside & (self.episode_index == correction.episode_index)
         return np.asarray(same if same.any() else inside, np.bool_)

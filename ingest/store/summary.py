@@ -54,7 +54,7 @@ def _rows_of(**columns: pa.DataType) -> pa.DataType:
 
 
 _TEXT, _TEXTS, _COUNT, _NUMBER = pa.string(), pa.list_(pa.string()), pa.int64(), pa.float64()
-TABLES = {  # column of a manifest -> its type: tables of summary.sql and BY_EPISODE, and hashes
+TABLES = {  # column of a manifest that holds a table (of summary.sql or BY_EPISODE) -> its type
     "episode_rows": _rows_of(
         episode_id=_TEXT,
         episode_index=pa.int32(),

@@ -33,7 +33,7 @@ FORMAT = "restock-store/2"
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
 LOG = "_delta_log"  # folder of a table's log
 _LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
-_SHORT = 1024  # bytes; commits below this may be cut: a commitInfo of rows alone takes a third
+_SHORT = 1024  # bytes; only smaller commits are checked: cut after commitInfo, one has a third
 _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
 
@@ -88,7 +88,7 @@ def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
 
 
 def expect_whole(log: Path, version: int, *, where: str) -> None:
-    """Check that all commits are complete that a version is read from.
+    """Check that all commits that a version is read from are complete.
 
     Delta's library silently accepts an empty or truncated commit: rows would be missing.
 
@@ -268,7 +268,7 @@ def _features(
 ) -> Iterator[tuple[str, str]]:
     """Yield what a table's protocol requires: the features in use, each with a phrase for errors.
 
-    A `version` above `newest` (the newest known, which lists features) yields "" and its phrase.
+    If `version` is above `newest`, the newest one that Restock knows, also yield "" for it.
     """
     if version > newest:
         yield "", f"version {version} of the protocol ({key})"

@@ -160,7 +160,8 @@ HELD = (
 )
 FEW_ROWS = 100_000  # of about 1 kB
 FEW_SUMMARISED_ROWS = 2_000_000  # of about 50 bytes
-_INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.sql
+# Text of rows.sql; a store's own views use stored_ingests instead, without a scan of rows.
+_INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"
 # A query with one of these words lists views, so that all of them must exist.
 LISTS = {
     "columns",

@@ -19,8 +19,8 @@ FROM stored_recordings
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
 -- Stamps may be a simulator's, which begin at zero: logged_ns is the same moment in log time. The Parquet
--- column `condition` has only the condition of highest priority, so a filter on it would miss rows that also
--- hold one of higher priority. The view therefore calls it `primary_condition`.
+-- column `condition` has only the condition of highest priority: a filter on it misses rows that hold the
+-- condition together with one of higher priority. The view therefore calls it `primary_condition`.
 CREATE OR REPLACE VIEW transitions AS
 SELECT
     stored.* EXCLUDE (logged_ns)

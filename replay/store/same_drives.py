@@ -141,7 +141,7 @@ def _split(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
 
 N = TypeVar("N", bound=np.generic)
 MIN_ROWS = 2
-MIN_SHARE = 0.1  # share of the smaller recording's distinctive rows that a reported pair has
+MIN_SHARE = 0.1  # share of the smaller recording's distinctive rows that both must have
 WITHIN_NS = 100_000_000  # largest distance from a pair's shift
 FEW = 5  # up to so many recordings with one content, all their pairs are compared
 _BATCH_ROWS = 100_000
