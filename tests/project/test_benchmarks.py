@@ -11,7 +11,7 @@ PEERS = ("cpprb", "mcap_ros2", "rerun", "stable_baselines3", "tianshou", "torchr
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["ingest", "peers", "replay", "slips", "train", "train_loop"])
-def test_a_benchmark_starts_without_its_peers(name: str) -> None:
+def test_benchmark_starts_without_its_peers(name: str) -> None:
     script = str(ROOT / "benchmarks" / f"{name}.py")
     code = f"""
 import runpy, sys

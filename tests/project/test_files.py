@@ -9,7 +9,7 @@ import pytest
 from restock.files import write_bytes, write_text
 
 
-def test_a_file_is_replaced_and_its_folder_made(tmp_path: Path) -> None:
+def test_write_replaces_file_and_makes_folder(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "file.txt"
     write_text(path, "première")
     write_text(path, "second")
@@ -17,7 +17,7 @@ def test_a_file_is_replaced_and_its_folder_made(tmp_path: Path) -> None:
     assert [item.name for item in path.parent.iterdir()] == ["file.txt"]
 
 
-def test_an_exclusive_file_is_never_replaced(tmp_path: Path) -> None:
+def test_exclusive_write_never_replaces(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_bytes(path, b"first", exclusive=True)
     with pytest.raises(FileExistsError):
@@ -26,7 +26,7 @@ def test_an_exclusive_file_is_never_replaced(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_pipe_is_written_into_and_not_replaced(tmp_path: Path) -> None:
+def test_pipe_is_written_not_replaced(tmp_path: Path) -> None:
     """Nor /dev/null, by whoever may replace it."""
     pipe, heard = tmp_path / "pipe", list[str]()
     os.mkfifo(pipe)

@@ -1,4 +1,4 @@
-"""What fuzzing found stays fixed, and the fuzz target itself works (see fuzz/readers.py)."""
+"""Earlier fuzzing findings stay fixed, and the fuzz target itself works (see fuzz/readers.py)."""
 
 import importlib.util
 import random
@@ -29,23 +29,23 @@ SEEDS: list[bytes] = list(READERS.seeds())
 
 
 @pytest.mark.parametrize("path", FINDINGS, ids=lambda path: path.name)
-def test_what_was_found_stays_fixed(path: Path) -> None:
+def test_earlier_fuzz_findings_stay_fixed(path: Path) -> None:
     READERS.examine(path.read_bytes())
 
 
-def test_the_seeds_are_sound() -> None:
+def test_fuzz_seeds_are_valid_recordings() -> None:
     assert {seed[0] for seed in SEEDS} == set(range(len(READERS.TARGETS)))
     for seed in SEEDS:
         READERS.examine(seed)
 
 
-def test_a_few_hundred_mutations() -> None:
+def test_hundreds_of_mutations_find_nothing() -> None:
     rng = random.Random(0)
     for _ in range(300):
         READERS.examine(READERS.mutated(rng, SEEDS))
 
 
-def test_findings_are_kept_once_each(tmp_path: Path) -> None:
+def test_each_fuzz_finding_is_kept_once(tmp_path: Path) -> None:
     findings = READERS.Findings(tmp_path)
     for data in (b"a", b"b"):
         try:
@@ -56,7 +56,7 @@ def test_findings_are_kept_once_each(tmp_path: Path) -> None:
     assert [item.read_bytes() for item in tmp_path.iterdir() if not item.suffix] == [b"a"]
 
 
-def test_one_input_from_the_shell(tmp_path: Path) -> None:
+def test_fuzz_one_input_from_the_shell(tmp_path: Path) -> None:
     (tmp_path / "seed").write_bytes(SEEDS[-1])
     command = [sys.executable, str(FUZZ / "readers.py"), "--again", str(tmp_path / "seed")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -200,14 +200,14 @@ def allowed(folder: str) -> set[str]:
 
 
 @pytest.mark.parametrize("folder", sorted(FOLDERS))
-def test_a_folder_imports_only_what_the_table_allows(folder: str) -> None:
+def test_imports_follow_the_layer_table(folder: str) -> None:
     found = edges(folder)
     assert not [found[other] for other in found.keys() - allowed(folder)]
     assert not allowed(folder) - found.keys(), "the table allows what is not used"
 
 
 @pytest.mark.parametrize("folder", sorted(FOLDERS))
-def test_a_folder_has_one_purpose_and_room_for_it(folder: str) -> None:
+def test_folders_have_a_purpose_and_few_modules(folder: str) -> None:
     modules = [path for path in FOLDERS[folder] if path.name != "__init__.py"]
     assert len(modules) <= MAX_MODULES
     text = (home(folder) / folder / "__init__.py").read_text("utf-8")
@@ -217,23 +217,23 @@ def test_a_folder_has_one_purpose_and_room_for_it(folder: str) -> None:
 
 
 @pytest.mark.parametrize("room", ["ingest", "replay", "train", "train/twin"])
-def test_the_map_for_contributors_names_every_folder(room: str) -> None:
+def test_contributors_map_names_every_folder(room: str) -> None:
     reported = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     folders = [path.parent.name for path in (ROOT / room).glob("*/__init__.py")]
     assert [folder for folder in folders if f" {folder}/" not in reported] == []
 
 
-def test_there_are_no_cycles() -> None:
+def test_no_import_cycles() -> None:
     TopologicalSorter({folder: allowed(folder) for folder in MAY_IMPORT}).prepare()
 
 
-def test_imports_run_from_later_rooms_to_earlier_ones() -> None:
+def test_rooms_import_only_earlier_rooms() -> None:
     for folder in MAY_IMPORT:
         for other in allowed(folder):
             assert ROOMS.index(other.split("/")[0]) <= ROOMS.index(folder.split("/")[0])
 
 
-def test_the_front_door_is_small_and_nothing_behind_it_uses_it() -> None:
+def test_command_line_is_small_and_not_imported() -> None:
     front = {path.stem for path in (ROOT / "src" / "restock").glob("*.py")}
     assert front == SHARED | {name for name in FRONT_DOOR if "/" not in name}
     assert len(front) <= MAX_MODULES
@@ -243,19 +243,19 @@ def test_the_front_door_is_small_and_nothing_behind_it_uses_it() -> None:
             assert not faces & imports(path) or path.name == "__init__.py", path
 
 
-def test_the_twin_knows_no_learner() -> None:
+def test_twin_imports_no_learner() -> None:
     for folder in (f for f in MAY_IMPORT if f.startswith("train/twin")):
         assert all(o.startswith(("ingest", "replay", "train/twin")) for o in allowed(folder))
 
 
 @pytest.mark.parametrize("name", sorted(SHARED))
-def test_what_all_share_imports_no_room(name: str) -> None:
+def test_shared_modules_import_no_room(name: str) -> None:
     compiled = {"_native"} if name == "native" else set()
     assert imports(ROOT / "src" / "restock" / f"{name}.py") <= SHARED | compiled
 
 
 @pytest.mark.parametrize("room", ["ingest", "replay", "train"])
-def test_the_front_door_reaches_each_room_by_a_committed_symlink(room: str) -> None:
+def test_package_links_to_each_room(room: str) -> None:
     link = ROOT / "src" / "restock" / room
     assert link.is_symlink()
     assert link.resolve() == ROOT / room

@@ -30,14 +30,14 @@ def python(code: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_importing_the_rooms_loads_none_of_the_heavy_libraries() -> None:
+def test_importing_rooms_loads_no_heavy_library() -> None:
     heavy = "{'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair', 'msgspec', 'tyro', 'gymnasium'}"
     names = ", ".join(["restock", *ROOMS])
     assert python(f"import sys, {names}; print({heavy} & set(sys.modules))") == "set()"
 
 
 @pytest.mark.parametrize("face", [*ROOMS, "restock.report"])
-def test_whatever_takes_a_path_takes_its_text(face: str) -> None:
+def test_functions_take_paths_as_text(face: str) -> None:
     """A notebook has its paths as text: one function that takes no text is one to remember."""
     module, only_paths = importlib.import_module(face), []
     for name in module.__all__:
@@ -53,7 +53,7 @@ def test_whatever_takes_a_path_takes_its_text(face: str) -> None:
 
 
 @pytest.mark.parametrize("face", ROOMS)
-def test_a_name_is_what_type_checkers_see(face: str) -> None:
+def test_lazy_names_equal_what_type_checkers_see(face: str) -> None:
     if face == "restock.train":  # which has names for its learners
         pytest.importorskip("stable_baselines3")
     module = importlib.import_module(face)
@@ -100,7 +100,7 @@ def blocks(path: Path, text: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("path", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
-def test_files_that_docs_name_exist(path: Path) -> None:
+def test_files_named_in_docs_exist(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     folders = "benchmarks|docs|fuzz|ingest|replay|sample_logs|src|tests|train"
     for name in re.findall(
@@ -111,7 +111,7 @@ def test_files_that_docs_name_exist(path: Path) -> None:
         assert (path.parent / name).is_file(), name
 
 
-def test_every_page_is_linked_from_another() -> None:
+def test_every_page_is_linked() -> None:
     linked = {
         name.rsplit("/", 1)[-1]
         for path in PAGES

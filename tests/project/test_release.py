@@ -27,7 +27,7 @@ def steps(document: dict[str, Any]) -> list[dict[str, Any]]:
     return [step for job in document["jobs"].values() for step in job["steps"]]
 
 
-def test_the_version_is_the_same_wherever_it_is_told() -> None:
+def test_version_is_the_same_everywhere() -> None:
     version = PROJECT["version"]
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.search(r"^version: (.*)$", citation, re.MULTILINE)[1] == version  # type: ignore[index]
@@ -38,7 +38,7 @@ def test_the_version_is_the_same_wherever_it_is_told() -> None:
         assert set(named) == {version}, path
 
 
-def test_a_release_is_checked_on_each_python_that_is_promised() -> None:
+def test_release_checks_each_supported_python() -> None:
     promised = [
         line.rsplit(" ", 1)[1] for line in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", line)
     ]
@@ -51,7 +51,7 @@ def test_a_release_is_checked_on_each_python_that_is_promised() -> None:
     assert "upload dist" not in built
 
 
-def test_the_workflow_to_copy_gives_what_must_be_given() -> None:
+def test_example_workflow_sets_required_options() -> None:
     inputs = workflow("restock-check")["on"]["workflow_call"]["inputs"]
     required = {name for name, of in inputs.items() if of.get("required")}
     assert required == {"restock", "store"}  # there is no index that has a `restock` to install
@@ -63,7 +63,7 @@ def test_the_workflow_to_copy_gives_what_must_be_given() -> None:
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_every_command_of_a_workflow_exists(path: Any) -> None:
+def test_commands_in_workflows_exist(path: Any) -> None:
     document = workflow(path.stem)
     assert document["permissions"] == {"contents": "read"}
     commands = 0
@@ -94,14 +94,14 @@ def check_command(line: str) -> int:
     return 1
 
 
-def test_inputs_reach_the_shell_by_the_environment_only() -> None:
+def test_workflow_inputs_go_through_environment() -> None:
     """A text of the caller in `run:` would be a command of the caller's."""
     for path in WORKFLOWS:
         for step in steps(workflow(path.stem)):
             assert "${{" not in step.get("run", ""), step
 
 
-def test_the_container_file_runs_the_demo() -> None:
+def test_container_file_runs_the_demo() -> None:
     lines = (ROOT / "Containerfile").read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
     reported = dict(line.split(" ", 1) for line in lines if line and not line.startswith("#"))
     minor = re.search(r"python:3\.(\d+)", reported["FROM"])

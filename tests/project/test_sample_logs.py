@@ -1,4 +1,4 @@
-"""The sample logs are what their manifest says, small, varied, readable, and can be made again."""
+"""The sample logs match their manifest, are small, varied and readable, and can be made again."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ def manifest() -> dict[str, Any]:
     return json.loads((SAMPLES / "manifest.json").read_text(encoding="utf-8"))
 
 
-def test_the_files_are_those_of_the_manifest(manifest: dict[str, Any]) -> None:
+def test_sample_logs_match_their_manifest(manifest: dict[str, Any]) -> None:
     for name, entry in manifest["files"].items():
         assert hashlib.sha256((SAMPLES / name).read_bytes()).hexdigest() == entry["sha256"], name
     assert sum(entry["bytes"] for entry in manifest["files"].values()) <= 12_000_000
@@ -35,7 +35,7 @@ def test_the_files_are_those_of_the_manifest(manifest: dict[str, Any]) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_every_topic_is_there_and_every_message_decodes(name: str) -> None:
+def test_sample_logs_have_all_topics_and_decode(name: str) -> None:
     with AnyReader([SAMPLES / name]) as reader:
         assert {connection.topic for connection in reader.connections} == ALL
         decoded = {
@@ -47,7 +47,7 @@ def test_every_topic_is_there_and_every_message_decodes(name: str) -> None:
 
 
 @pytest.mark.long
-def test_mcap_finds_its_chunks_whole() -> None:
+def test_mcap_library_finds_chunks_undamaged() -> None:
     with (SAMPLES / "amr_monday.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -58,7 +58,7 @@ def test_mcap_finds_its_chunks_whole() -> None:
         assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
 
 
-def test_another_decoder_reads_every_topic() -> None:
+def test_rosbags_reads_every_topic() -> None:
     with (SAMPLES / "amr_monday.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         seen = {
@@ -69,7 +69,7 @@ def test_another_decoder_reads_every_topic() -> None:
     assert len(seen["/scan"].ranges) == 72
 
 
-def test_conditions_are_rare_and_all_there(manifest: dict[str, Any]) -> None:
+def test_sample_logs_have_every_condition_rarely(manifest: dict[str, Any]) -> None:
     monday = manifest["recorded"]["amr_monday.mcap"]
     assert min(monday["missions"].values()) >= 8
     assert 0.7 < monday["missions"]["nominal"] / sum(monday["missions"].values()) < 0.9
@@ -82,14 +82,14 @@ def test_conditions_are_rare_and_all_there(manifest: dict[str, Any]) -> None:
     assert sum(sum(m["missions"].values()) for m in manifest["recorded"].values()) > 60
 
 
-def test_the_readme_says_that_they_are_simulated() -> None:
+def test_sample_logs_readme_says_simulated() -> None:
     text = (SAMPLES / "README.md").read_text(encoding="utf-8")
     assert "These recordings are simulated." in text
     assert all(name in text for name in RECORDINGS)
 
 
 @pytest.mark.long  # test_recorder has a shorter recording
-def test_making_them_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_recording_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     """Two missions of each; all of them: see the slow test."""
     made = []
     for folder in ("once", "again"):
@@ -102,7 +102,7 @@ def test_making_them_twice_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_make_sample_logs_reproduces_them_byte_for_byte(tmp_path, manifest):
+def test_make_sample_logs_reproduces_the_bytes(tmp_path, manifest):
     command = [sys.executable, str(MAKE), "--out", str(tmp_path), "--check"]
     done = subprocess.run(command, capture_output=True, text=True)
     made = json.loads((tmp_path / "manifest.json").read_text(encoding="utf-8"))

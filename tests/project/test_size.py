@@ -82,7 +82,7 @@ def count_all() -> dict[str, int]:
     }
 
 
-def test_every_count_is_within_its_limit() -> None:
+def test_counts_are_within_limits() -> None:
     counts = count_all()
     assert counts.keys() == LIMITS.keys()
     assert not {name: count for name, count in counts.items() if count > LIMITS[name]}

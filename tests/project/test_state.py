@@ -55,7 +55,7 @@ class Outer(Stateful):
         self.total = self.inner.count + len(self.points)
 
 
-def test_what_is_saved_is_what_is_restored() -> None:
+def test_saved_state_is_restored() -> None:
     first, second = Outer(), Outer()
     first._values["a"][:] = 1.5, 2.5
     first.inner.count = 3
@@ -97,14 +97,14 @@ json_values = st.recursive(
 
 
 @given(json_values)
-def test_a_plain_value_comes_back_equal_and_of_its_kind(value: Any) -> None:
+def test_plain_values_keep_value_and_type(value: Any) -> None:
     again = restored(value, json.loads(json.dumps(saved(value))))
     assert again == value
     assert type(again) is type(value)
 
 
 @given(hnp.arrays(hnp.scalar_dtypes(), hnp.array_shapes(min_dims=0, min_side=0)))
-def test_an_array_comes_back_with_its_type_and_shape(array: np.ndarray[Any, Any]) -> None:
+def test_arrays_keep_dtype_and_shape(array: np.ndarray[Any, Any]) -> None:
     state = saved(array)
     assert not np.shares_memory(state, array)
     again = restored(np.empty(0, array.dtype), state)
@@ -113,12 +113,12 @@ def test_an_array_comes_back_with_its_type_and_shape(array: np.ndarray[Any, Any]
     assert not np.shares_memory(again, state)
 
 
-def test_a_state_of_another_network_is_refused_with_what_differs() -> None:
+def test_state_of_another_network_names_difference() -> None:
     with pytest.raises(RunError, match=r"of another network: size mismatch for weight.*\n.*give"):
         restored(torch.nn.Linear(3, 1), saved(torch.nn.Linear(2, 1)))
 
 
-def test_a_state_that_lacks_a_name_is_refused() -> None:
+def test_state_without_an_attribute_is_refused() -> None:
     state = Outer().state_dict()
     del state["inner"]
     with pytest.raises(RunError, match="of Outer has no inner: another version") as caught:
@@ -126,7 +126,7 @@ def test_a_state_that_lacks_a_name_is_refused() -> None:
     assert "start another run" in str(caught.value.remedy)
 
 
-def test_objects_in_lists_and_mappings_are_restored_in_place() -> None:
+def test_nested_objects_are_restored_in_place() -> None:
     class Many(Stateful):
         STATE = ("by_name", "in_turn")
 
@@ -142,7 +142,7 @@ def test_objects_in_lists_and_mappings_are_restored_in_place() -> None:
     assert (second.by_name["a"], *second.in_turn) == kept
 
 
-def test_a_state_of_another_shape_is_refused() -> None:
+def test_state_of_another_shape_is_refused() -> None:
     class Shaped(Stateful):
         SAME = ("shape", "sizes")
         STATE = ("values",)
@@ -166,7 +166,7 @@ def test_a_state_of_another_shape_is_refused() -> None:
         other.load_state_dict({"values": None})
 
 
-def test_tensors_and_their_generators_go_on() -> None:
+def test_tensors_and_generators_resume() -> None:
     tensor, generator = torch.arange(3), torch.Generator().manual_seed(1)
     state = saved(tensor), saved(generator)
     expected = torch.rand(2, generator=generator)

@@ -21,7 +21,7 @@ from restock.stats import (
 )
 
 
-def test_wilson_against_the_published_values() -> None:
+def test_wilson_equals_published_values() -> None:
     # Newcombe 1998 (Statist. Med. 17), table I, method 3, without continuity correction.
     assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
     assert wilson(15, 148) == pytest.approx((0.0624, 0.1605), abs=5e-5)
@@ -30,7 +30,7 @@ def test_wilson_against_the_published_values() -> None:
 
 
 @given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_wilson_holds_the_share_and_stays_in_range(case: tuple[int, int]) -> None:
+def test_wilson_contains_share_and_stays_in_range(case: tuple[int, int]) -> None:
     successes, trials = case
     low, high = wilson(successes, trials)
     assert 0 <= low <= successes / trials <= high <= 1
@@ -47,7 +47,7 @@ def test_bootstrap_is_seeded_and_covers_the_mean() -> None:
     assert high - low < 0.4
 
 
-def test_the_interval_of_an_improvement_holds_seeds_and_episodes() -> None:
+def test_improvement_interval_covers_seeds_and_episodes() -> None:
     """Arms that are alike: the interval holds one half about as often as it says."""
     rng, held = np.random.default_rng(1), 0
     for _ in range(60):
@@ -74,7 +74,7 @@ def test_quantiles_count_clusters_not_rows() -> None:
     assert together.high - together.low > 2 * (apart.high - apart.low)
 
 
-def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
+def test_intervals_have_nominal_coverage() -> None:
     rng = np.random.default_rng(3)
     hits = 0
     for _ in range(200):
@@ -87,7 +87,7 @@ def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
     assert 0.88 <= hits / 200 <= 0.99
 
 
-def test_paired_t_against_a_published_value() -> None:
+def test_paired_t_equals_published_value() -> None:
     # Student 1908 (Biometrika 6), hours of sleep gained by ten patients under two drugs.
     gained = np.array([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
     interval, p = paired_t(gained)
@@ -98,14 +98,14 @@ def test_paired_t_against_a_published_value() -> None:
 @pytest.mark.parametrize(
     "ahead", [[0.3], [0.3, 0.3], [-0.1, 0.7], [0.0, 0.0, 0.0], [0.1 + 0.2, 0.3, 0.6 - 0.3]]
 )
-def test_two_pairs_or_equal_ones_have_no_interval(ahead: list[float]) -> None:
+def test_two_or_equal_pairs_have_no_interval(ahead: list[float]) -> None:
     """Two seeds that came to the same difference were significant, with p < .001."""
     found, p = paired_t(np.array(ahead))
     assert found.value == pytest.approx(np.mean(ahead))
     assert np.isnan([found.low, found.high, p]).all()
 
 
-def test_an_interval_is_cut_at_the_range_of_its_quantity() -> None:
+def test_interval_is_clipped_to_range() -> None:
     assert ConfidenceInterval(0.5, -5.85, 6.85).within(0, 1) == ConfidenceInterval(0.5, 0.0, 1.0)
     assert ConfidenceInterval(2.0, 1.0, 3.0).within(0) == ConfidenceInterval(2.0, 1.0, 3.0)
     unknown = ConfidenceInterval(0.5, float("nan"), float("nan")).within(0, 1)
@@ -113,7 +113,7 @@ def test_an_interval_is_cut_at_the_range_of_its_quantity() -> None:
 
 
 @pytest.mark.parametrize(("runs", "episodes"), [(3, 40), (5, 60)])
-def test_a_difference_of_arms_covers_seeds_and_episodes(runs: int, episodes: int) -> None:
+def test_arm_difference_covers_seeds_and_episodes(runs: int, episodes: int) -> None:
     rng = np.random.default_rng(1)
     hits = 0
     for _ in range(250):
@@ -132,7 +132,7 @@ def test_a_difference_of_arms_covers_seeds_and_episodes(runs: int, episodes: int
 
 
 @pytest.mark.parametrize("clusters", [5, 8])
-def test_few_clusters_get_intervals_that_cover_what_they_say(clusters: int) -> None:
+def test_few_clusters_have_nominal_coverage(clusters: int) -> None:
     rng, covered = np.random.default_rng(clusters), {"percentile": 0, "widened": 0}
     repeats = 1000
     for values in rng.normal(0.0, 1.0, (repeats, clusters)):
@@ -146,13 +146,13 @@ def test_few_clusters_get_intervals_that_cover_what_they_say(clusters: int) -> N
     assert 0.93 * repeats < covered["widened"] < 0.97 * repeats
 
 
-def test_holm_against_a_worked_example() -> None:
+def test_holm_equals_worked_example() -> None:
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([]) == []
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
-def test_holm_keeps_the_order_and_lowers_nothing(p_values: list[float]) -> None:
+def test_holm_keeps_order_and_never_lowers(p_values: list[float]) -> None:
     adjusted = holm(p_values)
     assert all(p <= q <= 1 for p, q in zip(p_values, adjusted, strict=True))
     ranked = [adjusted[place] for place in np.argsort(p_values)]

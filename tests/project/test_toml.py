@@ -34,7 +34,7 @@ plain = st.recursive(
 
 
 @given(plain)
-def test_a_value_reads_back_equal(value: Any) -> None:
+def test_toml_value_round_trips(value: Any) -> None:
     assert tomllib.loads(f"key = {toml_value(value)}")["key"] == value
 
 
@@ -102,7 +102,7 @@ IN_FILES: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("values", "message"), REFUSED, ids=lambda value: str(value)[:40])
-def test_a_file_and_python_refuse_a_value_in_the_same_words(values, message):
+def test_file_and_python_refuse_with_same_message(values, message):
     with pytest.raises(ValueError) as in_python:  # noqa: PT011
         Config(**values)
     assert str(in_python.value) == message
@@ -112,7 +112,7 @@ def test_a_file_and_python_refuse_a_value_in_the_same_words(values, message):
 
 
 @pytest.mark.parametrize(("values", "message"), IN_FILES, ids=lambda value: str(value)[:40])
-def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: str) -> None:
+def test_error_names_the_dotted_key(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         typed(values, Config, where="config.toml", remedy="see the docs")
     what, remedy = str(refused.value).split("\n  ")
@@ -132,14 +132,14 @@ def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: s
         ({"strata": [{"name": "a", "wher": "true"}]}, Mixture, "strata[0].where"),
     ],
 )
-def test_an_unknown_key_names_the_one_that_was_likely_meant(values, kind, meant):
+def test_unknown_key_suggests_nearest(values, kind, meant):
     for remedy, rest in (("see the docs", " see the docs"), (None, "")):
         with pytest.raises(ConfigError, match="unknown key") as refused:
             typed(values, kind, where="config.toml", remedy=remedy)
         assert refused.value.remedy == f"did you mean `{meant}`?{rest}"
 
 
-def test_an_unknown_reward_lists_those_there_are() -> None:
+def test_unknown_reward_lists_known_ones() -> None:
     with pytest.raises(ConfigError, match="there are action_change, bump, goal, ") as refused:
         typed({"energy": -1.0}, Rewards, where="p.toml", prefix="task.rewards")
     assert refused.value.what == "unknown key `task.rewards.energy`"
@@ -168,7 +168,7 @@ def misspelt(kind: inspect.Type) -> Iterator[tuple[Any, set[str]]]:
 
 
 @pytest.mark.parametrize("kind", [TrainConfig, Mixture, Profile, Study])
-def test_each_setting_with_names_to_choose_from_lists_them(kind: type) -> None:
+def test_settings_with_choices_list_them(kind: type) -> None:
     wrong = list(misspelt(inspect.type_info(kind)))
     assert wrong
     for values, names in wrong:
@@ -178,7 +178,7 @@ def test_each_setting_with_names_to_choose_from_lists_them(kind: type) -> None:
         assert set(re.findall(r'"(.+?)"', listed)) == names, refused.value.what
 
 
-def test_a_renamed_key_is_refused_with_its_new_name() -> None:
+def test_renamed_key_is_refused_with_new_name() -> None:
     renamed = {"portion": "use share", "inner.portion": "use inner.share"}
     for values, old, new in (
         ({"portion": 0.1}, "portion", "share"),
@@ -193,7 +193,7 @@ def test_a_renamed_key_is_refused_with_its_new_name() -> None:
 
 
 @given(st.floats(allow_nan=False), st.integers(-3, 3))
-def test_what_a_file_accepts_python_accepts(share: float, count: int) -> None:
+def test_python_accepts_what_a_file_accepts(share: float, count: int) -> None:
     def made(how: Any) -> Config | None:
         try:
             config: Config = how()
@@ -210,7 +210,7 @@ def test_what_a_file_accepts_python_accepts(share: float, count: int) -> None:
         assert typed(msgspec.to_builtins(in_a_file), Config, where="again") == in_a_file
 
 
-def test_a_file_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+def test_unreadable_file_error_gives_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read: No such file(.|\n)*check the path"):
         read_toml(tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text("a = [1", encoding="utf-8")

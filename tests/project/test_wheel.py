@@ -1,4 +1,4 @@
-"""The wheel holds every file of every room and names the packages that it needs."""
+"""The wheel contains every file of every room and declares the packages that it needs."""
 
 import ast
 import platform
@@ -43,7 +43,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 
 @pytest.mark.long
-def test_every_file_is_in_the_wheel_under_one_name(wheel: zipfile.ZipFile) -> None:
+def test_wheel_has_every_file_once(wheel: zipfile.ZipFile) -> None:
     files = {
         f"restock/{path.relative_to(home).as_posix()}"
         for home, folder in [*((ROOT, ROOT / room) for room in ROOMS), (FRONT, FRONT)]
@@ -60,13 +60,13 @@ def test_every_file_is_in_the_wheel_under_one_name(wheel: zipfile.ZipFile) -> No
 @pytest.mark.skipif(
     platform.machine() != "x86_64" or not shutil.which("cc"), reason="nothing to compile it with"
 )
-def test_the_wheel_has_the_compiled_update_for_every_python(wheel: zipfile.ZipFile) -> None:
+def test_wheel_has_compiled_module_for_every_python(wheel: zipfile.ZipFile) -> None:
     assert "restock/_native.abi3.so" in wheel.namelist()
     (reported,) = (name for name in wheel.namelist() if name.endswith(".dist-info/WHEEL"))
     assert b"Tag: cp311-abi3-" in wheel.read(reported)
 
 
-def test_every_file_that_is_compiled_is_declared() -> None:
+def test_compiled_sources_are_declared() -> None:
     """What is not is missing from the source distribution."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     (built,) = project["tool"]["setuptools"]["ext-modules"]
@@ -75,7 +75,7 @@ def test_every_file_that_is_compiled_is_declared() -> None:
     assert built["optional"]
 
 
-def test_every_package_that_is_imported_is_declared() -> None:
+def test_imported_packages_are_declared() -> None:
     """As a dependency, or in an extra that a user may add."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
@@ -136,8 +136,8 @@ for words in (["sql", sys.argv[1], "FROM recordings"], ["trace", sys.argv[1], st
 """
 
 
-def test_a_store_is_read_with_what_an_installation_brings(store_path: Path) -> None:
-    """Without what the tests' own environment has besides: DuckDB, say, imports by itself."""
+def test_wheel_reads_a_store_without_extras(store_path: Path) -> None:
+    """Block the packages that only the tests' environment has: some imports are optional."""
     there = installed_with("restock")
     absent = [
         package

@@ -93,7 +93,7 @@ def test_a_run_that_cannot_be_opened_leaves_no_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_renamed_key_is_refused_with_its_new_name(tmp_path: Path) -> None:
+def test_renamed_key_is_refused_with_new_name(tmp_path: Path) -> None:
     old = tmp_path / "old.toml"
     old.write_text("[network]\nensemble = 3\n")
     for path, overrides in ((old, []), (None, ["network.ensemble=3"])):
