@@ -1,7 +1,7 @@
-"""Self-contained pages: about a run, what it was fed and what it learnt; about a store, and others.
+"""Self-contained HTML pages about runs, stores, studies, gates and the twin.
 
 `build_report(run)` writes `run/report.html`, which opens without a network. The verbs write the
-other pages: `write_page` takes what `coverage_page`, `study_page` and the others return.
+other pages, by passing `write_page` the content that `coverage_page` and others return.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ else:
 
 
 def build_report(run: Path | str, out: Path | str | None = None) -> Path:
-    """Write the report of a run directory; returns its path.
+    """Write the report of a run directory and return its path.
 
     Raises:
-        RunError: no run there, or one with nothing to report on yet.
+        RunError: there is no run in the directory, or it has logged no update yet.
     """
     from restock.report.look.write import write_page
     from restock.report.run.facts import gather
@@ -39,4 +39,4 @@ def build_report(run: Path | str, out: Path | str | None = None) -> Path:
     return write_page(content, out if out is not None else Path(run) / "report.html")
 
 
-__all__ = ["build_report"]  # the others serve the verbs
+__all__ = ["build_report"]  # the other names are for the verbs

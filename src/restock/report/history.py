@@ -1,4 +1,4 @@
-"""The page of a folder: its runs in the order they began, what changed, and its stores by week."""
+"""The page about a folder: its runs in order of start, what changed, and its stores by week."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from restock.train.run.kept_evaluations import summary_rows
 from restock.train.run.replay_audit import fed_shares
 from restock.train.run.run import Run
 
-DEPTH = 3  # folders below the one that was named in which runs and stores are looked for
-MAX_SETTINGS = 6  # settings that are named in a line
-CLEAN = ("none", "nominal")  # names of driving without a perturbation
-_SOFTWARE = ("free", "software")  # kinds of settings that change no result by intent
+DEPTH = 3  # levels of subfolders that are searched for runs and stores
+MAX_SETTINGS = 6  # settings named in one line
+CLEAN = ("none", "nominal")  # both mean "without a perturbation"
+_SOFTWARE = ("free", "software")  # kinds of settings that are not meant to change a result
 T = TypeVar("T")
 
 
 class _Seen(NamedTuple):
-    """What the page shows of a run."""
+    """What the page shows about a run."""
 
     run: Run
     env_steps: int
-    by: str  # who drove it: `restock eval`, training, or nobody yet
-    success: Rows  # a row a condition
-    fed: Rows  # a row a stratum
+    by: str  # where `success` comes from: `restock eval`, training, or nowhere yet
+    success: Rows  # one row per condition
+    fed: Rows  # one row per stratum
 
 
 def history_page(folder: Path) -> dict[str, Any]:
-    """Return everything that the page's template needs.
+    """Return the content of the page, for `write_page`.
 
-    Runs and stores that cannot be read are named on the page. Without a store in the folder, those
-    that the runs' panels were mixed from are shown.
+    Runs and stores that cannot be read are named on the page. If the folder has no store, the page
+    shows the stores that the runs' panels were mixed from.
 
     Raises:
         RunError: there is neither a run nor a store in the folder.
@@ -101,7 +101,7 @@ def _places(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _read(read: Callable[[Path], T | None], places: Iterable[Path], missing: Rows) -> Iterator[T]:
-    """Yield what is read at each place; add those that cannot be read to `missing`."""
+    """Yield the result of `read` for each place; add places that cannot be read to `missing`."""
     for place in places:
         try:
             if (found := read(place)) is not None:
@@ -115,14 +115,14 @@ def _began(run: Run) -> int:
 
 
 def _names(runs: Sequence[_Seen]) -> list[str]:
-    """Name runs by their folders, and by more of their paths where those are alike."""
+    """Name each run by its folder, and by the parent folder too if runs share the name."""
     paths = [one.run.path for one in runs]
     names = Counter(path.name for path in paths)
     return [path.name if names[path.name] == 1 else "/".join(path.parts[-2:]) for path in paths]
 
 
 def _seen(path: Path) -> _Seen:
-    """Read a run. Success is of the last `restock eval`, else of training's last evaluation."""
+    """Read a run. Success is from `restock eval`, or else from training's last evaluation."""
     run = Run.open(path)
     progress, by = run.table("progress"), "restock eval"
     steps = progress["env_steps"][-1].as_py() if progress.num_rows else 0
@@ -148,7 +148,7 @@ def _change(before: Run, run: Run) -> dict[str, Any]:
 
 
 def _outcome(change: dict[str, Any]) -> str:
-    """Name the conditions whose success differs, by the interval of the paired episodes."""
+    """Name the conditions in which success differs: their paired interval excludes zero."""
     if "why" in change:
         return f"not compared: {change['why']}"
     shown = [
@@ -199,7 +199,7 @@ def _runs(runs: Sequence[_Seen]) -> Section | None:
 
 
 def _even(rows: Rows) -> Table:
-    """Return a table of rows of which not all have the same columns."""
+    """Return a table from rows with different columns; cells that a row lacks are empty."""
     columns = dict.fromkeys(column for row in rows for column in row)
     return Table([dict.fromkeys(columns, "") | row for row in rows])
 
@@ -229,7 +229,7 @@ def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
 
 
 def _settings(differences: Rows) -> str:
-    """Name the settings that differ, with both values; those of the panel are in another column."""
+    """Name the settings that differ, with both values; the panel has a column of its own."""
     shown = [
         f"{row['setting'].removeprefix('config.')} {row['first']} → {row['second']}"
         for row in differences
@@ -249,7 +249,7 @@ def _logs(panels: dict[str, Any] | None) -> str:
 
 
 def _weeks(place: Path) -> Section | None:
-    """Return the section of a store's weeks, drawn and as a table."""
+    """Return a section with a chart and a table of a store's weeks; None if there are no rows."""
     if not is_store(place):
         return None
     with Store(place) as store:

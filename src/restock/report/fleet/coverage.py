@@ -33,9 +33,9 @@ MAX_DOTS = 1500
 MAX_CELLS_ACROSS = 90  # cells of the map along an axis
 SHARE_COLOURS = {"held": "#0f766e", "by priority": "#94a3b8"}
 MAX_ROBOTS = 12  # in a chart
-MAX_PERIODS = 26  # the newest
+MAX_PERIODS = 26  # a chart shows the newest
 MAX_FINDINGS = 8  # findings with a chart of their own
-_BESIDE = ("driving", "conditions")  # parts about the use, not about the hardware
+_BESIDE = ("driving", "conditions")  # parts that describe use, not hardware
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
@@ -46,11 +46,11 @@ _SCOPE = {
 
 
 def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dict[str, Any]:
-    """Return everything that the page's template needs.
+    """Return the content of the page, for `write_page`.
 
     Args:
         gaps: as `restock coverage gaps --json` prints them.
-        drift: what was measured, or why nothing was.
+        drift: the drift measured, or the reason why it could not be measured.
     """
     shelves, robots, (totals,) = (_rows(store, name) for name in ("shelves", "robots", "totals"))
     counts = {noun: totals[f"{noun}s"] for noun in ("row", "episode", "recording")}
@@ -78,7 +78,7 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
 
 
 def _rows(store: Store, name: str, **parameters: Any) -> Rows:
-    """Return the rows of a statement of coverage.sql."""
+    """Run a statement of coverage.sql and return its rows."""
     sql = statements("restock.report.fleet", "coverage.sql")[name]
     install_named(store.connection, sql)
     return ask(store.connection, sql, **parameters)
@@ -89,7 +89,7 @@ def _once(store: Store) -> str:
 
 
 def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
-    """Name the condition that is shortest of rows, and what filling all gaps takes."""
+    """Name the largest gap, the conditions never seen, and what it takes to fill all gaps."""
     if gaps["closed"]:
         return f"No gaps: the store has all that {gaps['mixture']} asks for"
     short = [gap for gap in gaps["gaps"] if gap["needed"]]
@@ -184,7 +184,7 @@ def _strangest(store: Store, place: str) -> Section | None:
 
 
 def coverage_weeks(store: Store) -> tuple[Rows, Section | None]:
-    """Return the rows of a store's weeks, and their section."""
+    """Return the rows of the statement `weeks`, and their section; None if all counts are zero."""
     every = _rows(store, "weeks")
     rows = [row for row in every if row["primary_rows"]]
     if not rows:
@@ -329,7 +329,7 @@ def _in_word(name: str, value: Any) -> str:
 
 
 def drift_headline(drift: Drift) -> str:
-    """Say in one sentence what has changed."""
+    """State in one sentence what has changed."""
     parts: dict[str, list[str]] = {}
     for row in drift.findings:
         if row["part"] not in _BESIDE:
@@ -429,13 +429,13 @@ def signal_name(row: dict[str, Any]) -> str:
 
 
 def change_text(row: dict[str, Any]) -> str:
-    """Format a ratio as `× 0.942 [0.935, 0.950]`, or a difference with its sign."""
+    """Format a change as a ratio, `× 0.942 [0.935, 0.950]`, or as a difference with its sign."""
     if row["change"] is None:
         return ""
     ratio = row["compared"] == "ratio"
     values = [row["change"], row["change_low"], row["change_high"]]
     least = 0.0 if ratio else 1e-3 * max(abs(row["change_low"]), abs(row["change_high"]))
-    value, low, high = (  # values far below the interval's width are zero
+    value, low, high = (  # show values far below the interval's ends as zero
         f"{v:.3f}" if ratio else f"{v if abs(v) >= least else 0.0:+.3g}" for v in values
     )
     unit = " sd" if row["compared"] == "spread" else ""

@@ -1,4 +1,4 @@
--- What the page of a store's coverage shows, one statement a fact.
+-- The queries of the page on a store's coverage, each named by the comment before it.
 
 -- name: shelves
 SELECT condition, rows_held, held_share, episodes_held, effective_episodes, success_share,
@@ -7,8 +7,8 @@ SELECT condition, rows_held, held_share, episodes_held, effective_episodes, succ
 FROM coverage_by_condition;
 
 -- name: weeks
--- A condition's part of a week's rows, over all robots: primary_rows has each row once, by priority.
--- Hours are the week's, of all robots, whether or not they saw the condition.
+-- Rows of each condition in each week, over all robots. primary_rows counts each row once, by
+-- priority. Hours are those of all robots in the week, whether or not they saw the condition.
 WITH driven AS (
     SELECT week, sum(hours) AS hours
     FROM (SELECT DISTINCT robot, week, hours FROM coverage_by_week)
@@ -24,7 +24,7 @@ GROUP BY seen.week, condition
 ORDER BY seen.week, condition;
 
 -- name: robots
--- Hours are the robot's, over all conditions: the same in each of its rows.
+-- Hours are the robot's over all conditions: they are the same in each of its rows.
 SELECT coalesce(robot, 'untagged') AS robot, condition, rows_held, held_share, hours
 FROM coverage_by_robot
 WHERE rows_held > 0

@@ -1,8 +1,8 @@
-"""The review page, served on this machine.
+"""The server of the review page.
 
-The server listens on loopback alone. Every request names the token of the address, and this machine
-as the host; what changes something comes from the page itself. Several browsers and several servers
-may work on one store: each answer has the verdicts that others have given since.
+It listens on loopback only. Every request must contain the token of the address and name this
+machine as its host; a POST must also have the page's origin. Several browsers and servers may work
+on one store: each answer to a POST contains the verdicts that others have given since.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from restock.report.look.blocks import dark_rules, palette
 
 
 def page_data(store: Store) -> dict[str, Any]:
-    """Return what a page knows of the events of a store, the most doubtful first."""
+    """Return the data of the page: a store's events, most doubtful first, and its conditions."""
     events, total = page_events(store)
     rows = store.connection.sql(CONDITIONS).fetchall()
     names = sorted({name for *_, own in rows for name in own})
@@ -49,7 +49,7 @@ def page_data(store: Store) -> dict[str, Any]:
 
 
 def review_html(data: dict[str, Any]) -> tuple[str, str]:
-    """Return the page, and the policy that lets it run its own script and ask its own server."""
+    """Return the page and its Content-Security-Policy: its own script and server only."""
     folder = files("restock.report.look")
     script, style, own, text = (
         (folder / name).read_text(encoding="utf-8")
@@ -61,7 +61,7 @@ def review_html(data: dict[str, Any]) -> tuple[str, str]:
         f" form-action 'none'; connect-src 'self'; script-src 'sha256-{digest}'"
     )
     document = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    # No name in it ends the element, or begins another.
+    # Escaped, so that no name in it can end the element or begin another.
     document = document.replace("&", r"\u0026").replace("<", r"\u003c").replace(">", r"\u003e")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     html = environment.from_string(text).render(
@@ -73,14 +73,14 @@ def review_html(data: dict[str, Any]) -> tuple[str, str]:
     return html, policy
 
 
-PORT = 7474  # taken if it is free, so that an SSH tunnel can be prepared
+PORT = 7474  # used if it is free, so that an SSH tunnel can be set up in advance
 HOSTS = ("127.0.0.1", "localhost")
-NOTHING = "default-src 'none'"  # a policy of what is not a page
+NOTHING = "default-src 'none'"  # the policy of an answer that is not a page
 MAX_BODY_BYTES = 256 << 10
 
 
 class Review:
-    """A review of one store: what is shown, and the verdicts that are given."""
+    """A review of one store: its events and the verdicts on them."""
 
     def __init__(self, place: Location) -> None:
         self.place = place
@@ -88,8 +88,8 @@ class Review:
         self.store = Store(place)
         self.data = page_data(self.store)
         self.moments = Moments(self.store)
-        self._now = self.store  # of the newest version, against which verdicts are checked
-        self._lock = threading.RLock()  # neither store nor journal is for several threads
+        self._now = self.store  # newest version: verdicts are checked against it
+        self._lock = threading.RLock()  # store and journal are not thread-safe
 
     def close(self) -> None:
         """Close the stores."""
@@ -112,16 +112,16 @@ class Review:
         return event
 
     def state(self) -> dict[str, Any]:
-        """Return the journal's lines."""
+        """Read the journal again and return its lines."""
         with self._lock:
             self.journal.refresh()
             return {"lines": msgspec.to_builtins(self.journal.lines)}
 
     def give(self, entries: list[Entry]) -> None:
-        """Take verdicts: they are on the disk when this returns.
+        """Append verdicts to the journal: they are on disk when this returns.
 
         Raises:
-            LabelError: one does not fit the rows of the store as it is now; nothing is taken.
+            LabelError: one does not fit the rows of the newest version; none is appended.
         """
         with self._lock:
             given = [one for one in entries if one.verdict]
@@ -131,12 +131,12 @@ class Review:
             self.journal.append([msgspec.structs.replace(one, at="") for one in entries])
 
     def write(self) -> Written:
-        """Write the verdicts that count into the store."""
+        """Write the journal's verdicts that count into the store."""
         with self._lock:
             return write_verdicts(self.journal, self.place)
 
     def _newest(self) -> Store:
-        """Return the store as it is now: opening it anew for each key takes most of a second."""
+        """Return the newest version, opened only if it changed: opening takes most of a second."""
         if self.place.open_table(TRANSITIONS).version() != self._now.version:
             if self._now is not self.store:
                 self._now.close()
@@ -145,13 +145,13 @@ class Review:
 
 
 class _Asked(msgspec.Struct):
-    """What the page sends."""
+    """The body of a POST."""
 
-    entries: list[Entry] = []  # verdicts that it gives
+    entries: list[Entry] = []  # new verdicts
 
 
 class Server(ThreadingHTTPServer):
-    """The server of a review; `address` is what a browser opens."""
+    """The server of a review. `address` is the URL to open in a browser."""
 
     daemon_threads = True
 
@@ -169,7 +169,7 @@ class Server(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_port}/{self.token}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Let a browser that went away be; say anything else."""
+        """Ignore lost connections to a browser; report any other error."""
         error = sys.exc_info()[1]
         if not isinstance(error, ConnectionError | TimeoutError):
             self.say(f"a request failed: {error!r}")
@@ -184,7 +184,7 @@ class Handler(BaseHTTPRequestHandler):
     timeout = 30
 
     def log_message(self, *_: object) -> None:
-        """Log nothing: the token is in every line."""
+        """Log nothing: every line would contain the token."""
 
     def do_GET(self) -> None:
         self._answer(self._get)
@@ -193,7 +193,7 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(self._post)
 
     def _answer(self, answer: Callable[[str], None]) -> None:
-        """Answer a request of the page itself; refuse those of others."""
+        """Answer a request from the review page; refuse any other."""
         parts = urlsplit(self.path)
         token, _, path = parts.path.removeprefix("/").partition("/")
         host = self.headers.get("Host", "")
@@ -213,7 +213,7 @@ class Handler(BaseHTTPRequestHandler):
                 self._send(409, json.dumps({"error": str(error)}))
 
     def _refuse(self, why: str) -> None:
-        self.close_connection = True  # a body is not read
+        self.close_connection = True  # the request's body was not read
         self._send(403, json.dumps({"error": why}))
 
     def _get(self, path: str) -> None:

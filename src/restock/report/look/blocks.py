@@ -1,4 +1,4 @@
-"""The building blocks of the page: sections, tables, figures, numbers for people, and colours."""
+"""The building blocks of a page: sections, tables, figures, formats of numbers, and colours."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from restock.stats import interval_text
 from restock.train.twin.missions import MISSIONS
 
 Rows = list[dict[str, Any]]
-BROAD = 4  # columns: with more, a phone shows rows as lists
+BROAD = 4  # a phone shows the rows of a table with more columns than this as lists
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A chart, drawn at each width in CSS pixels that a page may have for it.
+    """A chart drawn at several widths, in CSS pixels.
 
     The page shows the widest that fits.
     """
 
-    svg: dict[int, str]
-    spec: dict[int, dict[str, Any]] = field(default_factory=dict)  # Vega-Lite; none of a map
+    svg: dict[int, str]  # by width
+    spec: dict[int, dict[str, Any]] = field(default_factory=dict)  # Vega-Lite; empty for a map
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing and what is said of it; or, without a drawing, an animation."""
+    """A drawing or an animation, with its title and caption."""
 
     drawing: Drawing = Drawing({})
     title: str = ""
@@ -42,12 +42,12 @@ class Figure:
 
     @property
     def kind(self) -> str:
-        """Return the CSS class: half of a line, or all of it."""
+        """Return the CSS class: the figure takes half of a line, or a full line."""
         return "half" if max(self.drawing.svg, default=0) < 500 else "full"
 
     @property
     def shown(self) -> list[tuple[str, str, dict[str, Any] | None]]:
-        """Return the CSS class (`w470`), the SVG, and its specification if it has one."""
+        """Return the CSS class (such as `w470`), SVG and specification for each width."""
         drawn = sorted(self.drawing.svg.items())
         return [
             ("any" if len(drawn) == 1 else f"w{width}", svg, self.drawing.spec.get(width))
@@ -57,12 +57,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows with the same keys, which are the columns, without those that are empty everywhere."""
+    """Rows with the same keys. The keys are the columns; a column without values is not shown."""
 
     rows: Rows
     title: str = ""
     caption: str = ""
-    folded: bool = False  # shown once its title is clicked
+    folded: bool = False  # hidden until its title is clicked
 
     @property
     def columns(self) -> list[str]:
@@ -82,7 +82,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page; its figures side by side if `two`."""
+    """A section of the page. With `two`, its figures are side by side."""
 
     id: str
     title: str
@@ -110,12 +110,12 @@ def _is_number(cell: Any) -> bool:
     return not text or (bool(begins) and set(re.findall("[A-Za-z]+", text)) <= _BESIDE_NUMBERS)
 
 
-_NAMES = ("condition", "stratum", "arm")  # columns of names that people read with spaces
+_NAMES = ("condition", "stratum", "arm")  # columns whose values are shown without underscores
 _SHARES = ("agreement", "changed", "chosen_agreement")
 
 
 def shown(rows: Rows, columns: dict[str, str]) -> Rows:
-    """Return rows as a page shows them: some columns under titles, values formatted by name."""
+    """Select columns, rename them to their titles, and format values by the column's name."""
     return [{title: cell(name, row[name]) for name, title in columns.items()} for row in rows]
 
 
@@ -155,7 +155,7 @@ def named(rows: Rows) -> str:
 
 
 def better_and_worse(rows: Rows, than: str = "") -> tuple[list[str], int]:
-    """Name the conditions that differ by their intervals, and say how many they are."""
+    """Name and count the conditions that differ: those whose interval excludes zero."""
     better = [row for row in rows if row["difference_low"] > 0]
     worse = [row for row in rows if row["difference_high"] < 0]
     both = ("better", better), ("worse", worse)
@@ -164,7 +164,7 @@ def better_and_worse(rows: Rows, than: str = "") -> tuple[list[str], int]:
 
 
 def estimate(row: dict[str, Any]) -> str:
-    """Return a value with its interval, or why there is none."""
+    """Format a value with its interval, or the reason why it was refused."""
     if row["value"] is None:
         return f"refused: {row['refused']}"
     return interval_text(row["value"], row["low"], row["high"])
@@ -196,7 +196,7 @@ def pretty(document: Any) -> str:
 
 
 def statements(package: str, name: str) -> dict[str, str]:
-    """Split a file into statements, by the `-- name:` line before each."""
+    """Read the statements of an SQL file, keyed by the `-- name:` line before each."""
     text = (files(package) / name).read_text(encoding="utf-8")
     parts = text.split("-- name: ")[1:]
     return {part.split("\n", 1)[0].strip(): part.split("\n", 1)[1] for part in parts}
@@ -230,8 +230,8 @@ def palette(
 ) -> dict[str, str]:
     """Return a colour for each name, independent of their order.
 
-    A name gets its own colour, else the first free spare one. The search begins at the same place
-    in every chart.
+    A name without a colour of its own gets the first spare colour that is free. The search begins
+    at a place that depends on the name, so that it mostly gets the same colour in every chart.
     """
     found = {name: colours[name] for name in names if name in colours}
     free: list[str] = []
@@ -244,7 +244,7 @@ def palette(
     return found
 
 
-DARK = {
+DARK = {  # colour in the light theme -> in the dark theme
     # ink, rules and grounds
     "#0f172a": "#e8edf4",
     "#334155": "#cbd5e1",
@@ -279,7 +279,7 @@ DARK = {
 
 
 def dark_rules() -> str:
-    """Return the CSS rules that exchange a figure's colours in the dark theme."""
+    """Return the CSS rules that replace a figure's colours in the dark theme."""
     return "\n".join(_rules())
 
 

@@ -1,10 +1,9 @@
-"""The pages' charts: rows in, SVG out, and the specification that it was drawn from.
+"""The pages' charts: functions from rows to SVG and its Vega-Lite specification.
 
-A chart is drawn once for each width that a page may have for it, always at its own size: type is
-then equally large in every figure and on every screen. A figure is thus a `Drawing`, its SVG by
-width in CSS pixels; the page shows the widest that fits, and `live` has it answer the pointer. Each
-condition, source and policy has one colour in every chart; `blocks.DARK` has the colours for a dark
-background.
+A chart is drawn at several widths and never scaled, so that text has the same size in every figure
+and on every screen. The result is a `Drawing`: the SVG by width in CSS pixels. The page shows the
+widest that fits, and `write.live` makes it interactive. A condition, source or policy has the same
+colour in every chart; `blocks.DARK` has the colours for a dark background.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ from restock.report.look.blocks import (
 
 Row = Mapping[str, Any]
 
-HALF = (300, 470)  # widths of a figure that shares a line on a desktop
-FULL = (300, 630, 1000)  # widths of a figure with a line for itself
+HALF = (300, 470)  # widths of a figure that takes half of a line on a desktop
+FULL = (300, 630, 1000)  # widths of a figure that takes a full line
 
 POLICY_COLOURS = {
     "agent": "#0f766e",
@@ -40,21 +39,21 @@ POLICY_COLOURS = {
     "operator": "#2563eb",
     "random": "#9ca3af",
 }
-# Colours of other policies, distinct from each other and from those above in both themes.
+# Colours of other policies, distinct from each other and from POLICY_COLOURS in both themes.
 POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d", "#cc79a7", "#84643a")
 
-FEW_POINTS = 10  # a line of at most so many points shows each of them
+FEW_POINTS = 10  # a line with fewer points than this shows each of them
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
-SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; as an axis' `format`, zero is 0k
-LETTER_PX = 5.8  # width of a letter of a label, about
-WIDER_FONT = 0.15  # by so much a label may be wider in a browser than in the font it was drawn with
+SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; an axis' `format` would write 0k
+LETTER_PX = 5.8  # approximate width of a letter of a label
+WIDER_FONT = 0.15  # the reader's font may make a label wider by this share
 FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
 
 CONFIG = {
     "background": "transparent",
     "font": FONT,
     "view": {"stroke": None},
-    "mark": {"tooltip": True},  # of the fields that the chart encodes
+    "mark": {"tooltip": True},  # shows the fields that the chart encodes
     "axis": {
         "labelColor": "#475569",
         "titleColor": "#475569",
@@ -84,22 +83,22 @@ _numbers = count()
 
 
 def plot(rows: Sequence[Row]) -> Any:
-    """Make a chart over rows that travel in the page; values that are no numbers leave gaps."""
+    """Make a chart that contains its rows; NaN and infinite values leave gaps."""
     values = [{name: _shown(value) for name, value in row.items()} for row in rows]
     return alt.Chart(alt.InlineData(values=values))
 
 
 def _shown(value: Any) -> Any:
-    """Replace NaN and infinity, which JSON lacks, by null."""
+    """Replace NaN and infinity, which JSON lacks, by None."""
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value
 
 
 def draw(chart_of: Callable[[int], Any], widths: Sequence[int] = HALF) -> Drawing:
-    """Draw a chart at each width that a page may have; `chart_of` makes it for a width.
+    """Draw a chart at several widths; `chart_of` makes the chart for a width.
 
-    A chart that has no width of its own (a facet has) is fitted, with its axes and legend.
+    A chart is fitted to the width with its axes and legend. A facet sets widths of its own.
     """
     spec = {width: _fitted(chart_of(width), width) for width in widths}
     return Drawing({width: _svg(one) for width, one in spec.items()}, spec)
@@ -114,7 +113,7 @@ def _fitted(chart: Any, width: int) -> dict[str, Any]:
 
 
 def _svg(spec: dict[str, Any]) -> str:
-    """Draw a chart; no other drawing of the page has its ids."""
+    """Draw a chart as SVG, with element ids that no other drawing on the page has."""
     svg, number = str(vl_convert.vegalite_to_svg(spec)), next(_numbers)
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>d{number}-", svg)
 
@@ -122,9 +121,9 @@ def _svg(spec: dict[str, Any]) -> str:
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
     """Place a legend above the chart, in as many columns as fit beside its axis labels."""
     longest = max((len(name) for name in names), default=1) * LETTER_PX
-    apart = 10 + WIDER_FONT * longest  # of columns: a reader's font may be wider than ours
+    apart = 10 + WIDER_FONT * longest  # between columns: the reader's font may be wider than ours
     columns = max(1, min(len(names), int((width - labels_px) // (longest + 26 + apart))))
-    # Names that begin alike end apart: as much of one is shown as there is room for.
+    # Names often differ only at the end: cut a name only if the chart is too narrow for it.
     limit = max(width - labels_px - 30, 160)
     return alt.Legend(columns=columns, columnPadding=apart, symbolOpacity=1, labelLimit=limit)
 
@@ -136,7 +135,7 @@ def coloured(
     width: int,
     labels_px: int = 60,
 ) -> alt.Color:
-    """Return a colour for each name of a column, in the order of `names`, with a legend."""
+    """Encode the names in a column as colours, with a legend in the order of `names`."""
     found = palette(names, colours, POLICY_SPARES if colours is POLICY_COLOURS else SPARE_COLOURS)
     return alt.Color(
         f"{field}:N",
@@ -146,12 +145,12 @@ def coloured(
 
 
 def label_px(names: Sequence[str]) -> int:
-    """Estimate the width of an axis' labels."""
+    """Estimate the width of an axis' labels, in pixels."""
     return round(max((len(name) for name in names), default=0) * LETTER_PX) + 14
 
 
 def ordered(rows: Sequence[Row], key: str, first: Mapping[str, str]) -> list[str]:
-    """Return the values of a column: the known ones in their order, then the others by name."""
+    """Return the values of a column: those in `first` in its order, then the others by name."""
     values = {str(row[key]) for row in rows}
     return [name for name in first if name in values] + sorted(values - set(first))
 
@@ -171,7 +170,7 @@ def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, label
 
 
 def in_words(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the rows with the names of their conditions as people read them."""
+    """Return the rows with conditions as words, without underscores."""
     return [{**row, "condition": words(row["condition"])} for row in rows]
 
 
@@ -191,10 +190,10 @@ def estimates(
     tick: str | None = None,
     beside: str | None = None,
 ) -> Drawing:
-    """Draw a dot and its interval for each series in each row of the chart.
+    """Draw a dot and its interval for each series, in a line for each value of column `y`.
 
-    A dashed line marks the `neutral` value, at which nothing differs, and `tick` is a column of
-    values that are marked too. Values of the column `beside` have charts side by side.
+    A dashed line marks the `neutral` value, which means no difference. A tick marks the value of
+    the column `tick`. Each value of the column `beside` gets a chart of its own, side by side.
     """
     lines_of = list(dict.fromkeys(str(row[y]) for row in rows))
     labels_px, (low, high) = label_px(lines_of), ends
@@ -259,7 +258,7 @@ def lines(
     With `percent`, values are shares. `marker` is the step of the kept checkpoint.
     """
     names = ordered(rows, series, colours)
-    # A line of a single point would not be seen.
+    # A line with a single point would be invisible.
     points = percent or len({row[x] for row in rows}) < FEW_POINTS
     axis = alt.Axis(format=".1~%") if percent else alt.Axis(format="~g")
     y_scale = _SHARE if percent else alt.Undefined
@@ -280,7 +279,7 @@ def lines(
         layers = [line]
         if marker is not None:
             at = plot([{"at": marker, "text": "kept"}]).encode(x="at:Q")
-            early = marker < max(row[x] for row in rows) / 2  # before it, no room beside the axis
+            early = marker < max(row[x] for row in rows) / 2  # no room for the text on its left
             layers.append(at.mark_rule(strokeDash=[4, 3], color="#0f172a"))
             layers.append(
                 at.mark_text(
@@ -303,11 +302,11 @@ def x_axis(width: int, labels: str = SHORT_NUMBERS) -> alt.Axis:
 
 
 def shares(rows: Sequence[Row], y: str, colours: Mapping[str, str]) -> Drawing:
-    """Draw a bar for each kind of share, on a square-root axis so that rare ones can be seen.
+    """Draw a bar for each kind of share, on a square-root axis so that small shares can be seen.
 
     Args:
-        rows: a name in column `y`, the kind and the share.
-        colours: the kinds, and their colours.
+        rows: rows with a name in column `y`, a `kind` and a `share`.
+        colours: kind -> colour.
     """
     names = list(dict.fromkeys(row[y] for row in rows))
 
@@ -386,7 +385,7 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
 
     def chart(width: int) -> Any:
         most = 1 if width < 600 else 2 if width < 900 else 4
-        across = math.ceil(len(conditions) / math.ceil(len(conditions) / most))  # even lines
+        across = math.ceil(len(conditions) / math.ceil(len(conditions) / most))  # evened out
         base = plot(shown).encode(
             x=alt.X("env_steps:Q", title="environment steps", axis=x_axis(width // across)),
             color=coloured("arm", arms, POLICY_COLOURS, width),
@@ -412,6 +411,6 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
 
 
 def _by_condition(rows: Rows) -> Rows:
-    """Return rows in the order of their conditions on every page."""
+    """Sort rows by condition, in the order that all pages use."""
     order = ordered(rows, "condition", WORDS_COLOURS)
     return sorted(rows, key=lambda row: order.index(row["condition"]))

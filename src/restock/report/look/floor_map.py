@@ -1,4 +1,4 @@
-"""A floor from above, as SVG: where the logs have been, and where the agent failed."""
+"""A map of a floor, as SVG: where robots were logged, and where the agent failed."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from markupsafe import Markup
 from restock.report.look.blocks import CONDITION_COLOURS, Drawing, palette, words
 
 Row = Mapping[str, Any]
-SCALE = 40  # SVG units a metre
-BAR_M = 2  # the length of the bar below a map
+SCALE = 40  # SVG units per metre
+BAR_M = 2  # length of the scale bar below a map
 MAP_PX = 470
 
 
@@ -24,21 +24,21 @@ def draw(
     logged: Sequence[Row] = (),
     failures: Sequence[Row] = (),
 ) -> tuple[Drawing, Markup]:
-    """Draw where the logs have been, where rare conditions were logged and where the agent failed.
+    """Draw where robots were logged, where rare conditions were logged and where the agent failed.
 
-    The map has no text, so that it may be of any width: the bar below it is `BAR_M` long.
+    The map has no text, so that it can have any width. The scale bar below it is `BAR_M` long.
 
     Args:
         size_m: extent of the floor along x and y.
-        racks: x0, y0, x1, y1 of each.
-        cells: x_m, y_m of their south-west corners, and rows: stronger with more of them.
+        racks: x0, y0, x1, y1 of each rack, in metres.
+        cells: x_m, y_m of each cell's south-west corner, and its rows: more rows, stronger colour.
         cell_m: side of a cell.
-        logged: x_m, y_m and condition of the dots.
-        failures: end_x_m, end_y_m and condition of the crosses, which lie above the racks: a robot
-            may end right at their face.
+        logged: x_m, y_m and condition of each dot.
+        failures: end_x_m, end_y_m and condition of each cross. Crosses are drawn above the racks,
+            because a robot may end right at the face of a rack.
 
     Returns:
-        The map, and the conditions' swatches.
+        The map, and its legend of conditions.
     """
     found = {row["condition"] for row in (*logged, *failures)}
     known = [name for name in CONDITION_COLOURS if name in found]

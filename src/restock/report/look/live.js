@@ -1,7 +1,7 @@
 "use strict";
-// Shows each chart drawn by Vega in the place of its SVG, once it comes into view. Whatever fails,
-// the SVG stays. Names of the page's rows only ever become text.
-addEventListener("beforeprint", () => {  // paper cannot be clicked
+// Replaces the SVG of each chart with Vega's drawing once it comes into view. If anything fails,
+// the SVG stays. Names in the page's rows are only ever inserted as text.
+addEventListener("beforeprint", () => {  // on paper, nothing can be unfolded
   document.querySelectorAll("details.rows").forEach((folded) => { folded.open = true; });
 });
 (() => {
@@ -22,7 +22,7 @@ addEventListener("beforeprint", () => {  // paper cannot be clicked
   async function show(drawing) {
     const vegaEmbed = await (unpacked ??= unpack());
     const { rows: names, spec } = charts[drawing.dataset.chart];
-    // Vega marks the rows that it reads: each chart has its own.
+    // Vega adds marks to the rows that it reads, so each chart gets a copy.
     const datasets = structuredClone(Object.fromEntries(names.map((name) => [name, rows[name]])));
     const place = document.createElement("div");
     place.className = "live";

@@ -1,12 +1,12 @@
 "use strict";
-// The review page: one event at a time, its moment with a slider, and a person's verdict. Names of
-// robots, files and conditions only ever become text. A verdict counts once the server has answered
-// that it is on the disk.
+// The review page: shows one event at a time, with a slider over its moment, and takes a person's
+// verdict. Names of robots, files and conditions are only ever inserted as text. A verdict counts
+// once the server has confirmed that it is on disk.
 (() => {
   const page = JSON.parse(document.getElementById("page").textContent);
   const at = (id) => document.getElementById(id);
   const SVG = "http://www.w3.org/2000/svg";
-  const PLAY = 3;  // times as fast as it was
+  const PLAY = 3;  // playback speed, in multiples of real time
   const words = (name) => name.replaceAll("_", " ");
 
   function make(tag, attributes = {}, ...children) {
@@ -30,7 +30,7 @@
     }
   })();
   let lines = [];
-  const given = [];  // ids of what was given here, an action each: for undo
+  const given = [];  // ids of the verdicts given on this page, one list per action, for undo
 
   function counting() {
     const gone = new Set(lines.flatMap((line) =>
@@ -38,7 +38,7 @@
     return lines.filter((line) => line.kind === "verdict" && line.verdict && !gone.has(line.id));
   }
   const inStore = () => new Set(lines.flatMap((line) => line.kind === "applied" ? line.ids : []));
-  let latest = new Map();  // event -> its verdict
+  let latest = new Map();  // event -> the verdict that counts
   function settle() {
     latest = new Map(counting().map((entry) => [entry.event, entry]));
   }
@@ -74,7 +74,7 @@
 
   // -- the order -----------------------------------------------------------------------------
   const events = page.events;
-  const marked = [];  // stretches that no rule found
+  const marked = [];  // events that a person marked
   let queue = [], here = null, ends = [0, 0], moment = null, now = 0;
   const ORDERS = {
     doubt: ["most doubtful first", (e) => e.doubt],
@@ -99,7 +99,7 @@
     if (queue[place]) show(queue[place]);
   }
 
-  // -- precision, as one goes ------------------------------------------------------------------
+  // -- precision so far ------------------------------------------------------------------------
   function wilson(right, of, z = 1.959963984540054) {
     const share = right / of, part = 1 + z * z / of;
     const middle = (share + z * z / (2 * of)) / part;
@@ -107,7 +107,7 @@
     return [middle - half, middle + half];
   }
   function estimate() {
-    const judged = [];  // the first of the random order, up to one without a verdict
+    const judged = [];  // is the label right? events in random order, up to the first without a verdict
     for (const event of queue) {
       if (open(event)) break;
       judged.push(latest.get(event.event).verdict !== "no");
@@ -134,7 +134,7 @@
     return moments.get(key);
   }
 
-  let loading = Promise.resolve();  // a key waits for it: nothing is judged before it is shown
+  let loading = Promise.resolve();  // keys wait for it: no event is judged before it is shown
   function show(event) {
     loading = load(event).catch((error) => say(error.message, "bad"));
     return loading;
@@ -309,7 +309,7 @@
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
   let moving = {};  // parts of the map that follow the slider
 
-  function line(points) {  // x, y, x, y, …: a gap where one is unknown
+  function line(points) {  // points: x, y, x, y, …; null makes a gap
     let text = "", pen = "M";
     for (let i = 0; i < points.length; i += 2) {
       if (points[i] === null || points[i + 1] === null) { pen = "M"; continue; }
@@ -404,7 +404,7 @@
     moving.robot.setAttribute("d", line(outline.flatMap(([a, l]) => place(a, l))) + "Z");
   }
 
-  // Panels one above the other, over time; each keeps its scale, cursor and the event's band.
+  // Plots over time, one above the other, each with its scale, a cursor and the event's band.
   let cursor = [], bands = [], toX = () => 0, fromX = () => 0;
   const LEFT = 34, RIGHT = 8, TOP = 20;
 
@@ -559,7 +559,7 @@
     tick();
   }
 
-  // A finger or pointer on the plots: near an end of the event it drags that, else the moment.
+  // A pointer on the plots drags an end of the event if it is near one, or else the slider.
   let dragged = null;
   at("plots").addEventListener("pointerdown", (press) => {
     if (!moment) return;
@@ -581,7 +581,7 @@
   at("plots").addEventListener("pointermove", drag);
   for (const over of ["pointerup", "pointercancel"]) at("plots").addEventListener(over, () => { dragged = null; });
 
-  // -- what a person does ------------------------------------------------------------------------
+  // -- keys and buttons --------------------------------------------------------------------------
   const does = {
     yes: () => judge("yes"), no: () => judge("no"), next: () => move(1), previous: () => move(-1),
     other: () => here && !here.marked && pick("Which condition is it?", (name) => judge("no", name)),
@@ -594,7 +594,7 @@
   for (const name of ["yes", "no", "next", "previous", "other", "undo", "mark", "play", "first", "last", "write"]) {
     at(name).addEventListener("click", () => does[name]());
   }
-  let queued = Promise.resolve();  // keys are taken one after the other, however fast they come
+  let queued = Promise.resolve();  // keys are handled one after the other, however fast they come
   addEventListener("keydown", (key) => {
     if (key.ctrlKey || key.metaKey || key.altKey) return;
     if (at("pick").open) {
@@ -658,6 +658,6 @@
     await show(queue.find(open) ?? null);
   }
   begin().catch((error) => say(error.message, "bad"));
-  // For tests: what is on the screen, and when the last key has been dealt with.
+  // For tests: what is shown, and a promise that resolves when the last key has been handled.
   window.review = { settled: () => queued.then(() => loading), here: () => here?.event ?? null, moment: () => moment };
 })();

@@ -1,11 +1,11 @@
-"""Write a page: the template and style filled in, and live charts.
+"""Write a page from its template and style sheet, with interactive charts.
 
-Figures are drawn in the colours of the light page. The style sheet exchanges them on a screen that
-prefers dark; what is printed stays light. A chart's SVG is what is
-printed and what is shown without scripts. A script replaces it by Vega's drawing of the same
-specification, to which `live` adds interaction: the values of a mark, and one series of a legend
-alone. Specifications and rows are in the page once, as JSON. The runtime is in it, too, compressed,
-and is unpacked when the first chart is in view.
+Figures are drawn in the colours of the light theme. On a screen that prefers dark, the style sheet
+replaces the colours; prints stay light. The SVG of a chart is for prints and for browsers without
+scripts. A script replaces it with Vega's drawing of the same specification. `live` makes this
+drawing interactive: it shows the values of a mark, and one series alone. The page contains the
+specifications and rows once, as JSON, and the compressed code of Vega. The code is unpacked when
+the first chart comes into view.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from restock.report.look.charts import CONFIG
 
 
 def write_page(content: dict[str, Any], out: Path | str, *, markdown: bool = False) -> Path:
-    """Write a page; returns its path.
+    """Write a page and return its path.
 
-    With `markdown` the same words and tables are written beside it, as FILE.md.
+    With `markdown`, its text and tables are also written beside it, as FILE.md.
 
     Args:
-        content: what the template asks for: kicker, title, headline, lead, sections, a verdict
-            if there is one, and the source that the footer names. Sections may be None.
+        content: the variables of the template: kicker, title, headline, lead and sections, of
+            which some may be None; optionally a verdict, and the source that the footer names.
     """
     out, folder = Path(out), files("restock.report.look")
     environment = jinja2.Environment(
@@ -70,7 +70,7 @@ def write_page(content: dict[str, Any], out: Path | str, *, markdown: bool = Fal
 
 
 def as_markdown(content: dict[str, Any]) -> str:
-    """Return a page's words and tables as Markdown, without its figures."""
+    """Return the text and tables of a page as Markdown, without its figures."""
     lines = [f"# {_plain(content['title'])}", "", f"{_plain(content['headline'])}."]
     lines += ["", content["lead"]] if content["lead"] else []
     for section in filter(None, content["sections"]):
@@ -93,7 +93,7 @@ def _table_lines(table: Table) -> list[str]:
 
 
 def _plain(value: Any) -> str:
-    """Return text that cannot leave its cell or be markup: names come from recordings."""
+    """Escape a value for a cell of a Markdown table: names in recordings may contain markup."""
     text = "" if value is None else str(value)
     return text.replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("\n", " ")
 
@@ -105,12 +105,12 @@ def _code(text: str) -> Markup:
 
 Spec = dict[str, Any]
 
-HIDDEN_SHARE = 0.12  # share of a series' opacity while another is isolated
+HIDDEN_SHARE = 0.12  # factor on a series' opacity while another series is shown alone
 _LICENCE = "/* Vega, Vega-Lite, Vega-Embed: (c) University of Washington, BSD-3-Clause */\n"
 
 
 class Charts:
-    """The charts of one page, numbered as they are added; rows that several share stand once."""
+    """The numbered charts of one page. Rows that several charts share are stored once."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self._config = config
@@ -118,7 +118,7 @@ class Charts:
         self._charts: list[Spec] = []
 
     def add(self, spec: Spec) -> int:
-        """Add a chart and return its number; `spec` is Vega-Lite with its rows by name."""
+        """Add a chart, a Vega-Lite specification with its rows as `datasets`; return its number."""
         shown = live(spec)
         rows = shown.pop("datasets", {})
         self._rows |= rows
@@ -126,12 +126,12 @@ class Charts:
         return len(self._charts) - 1
 
     def blocks(self) -> Markup:
-        """Return the elements at the end of the page; nothing if it has no charts."""
+        """Return the scripts at the end of the page; empty if it has no charts."""
         if not self._charts:
             return Markup("")
         document = {"config": self._config, "rows": self._rows, "charts": self._charts}
         text = json.dumps(document, separators=(",", ":"), allow_nan=False)
-        # No name in it ends the element, or begins another.
+        # Escaped, so that no name in it can end the element or begin another.
         text = text.replace("&", r"\u0026").replace("<", r"\u003c").replace(">", r"\u003e")
         return Markup(
             f'<script type="application/json" id="charts">{text}</script>\n'
@@ -141,7 +141,7 @@ class Charts:
 
 
 def policy(charts: bool) -> str:
-    """Return the page's Content-Security-Policy: no fetches, no scripts but these two."""
+    """Return the page's Content-Security-Policy: no fetches, no scripts except its own two."""
     scripts = " ".join(_hash(text) for text in (_script(), _runtime())) if charts else "'none'"
     return (
         "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
@@ -150,10 +150,10 @@ def policy(charts: bool) -> str:
 
 
 def live(spec: Spec) -> Spec:
-    """Turn the specification of a still chart into one that answers the pointer.
+    """Make the specification of a chart interactive.
 
-    Vega-Lite makes the tooltips (`charts.CONFIG`). A line gets them from points that are not drawn,
-    and a click on a name of the legend shows that series alone, a second one all again.
+    Vega-Lite makes the tooltips (`charts.CONFIG`); a line gets transparent points to show them at.
+    A click on a name in the legend shows that series alone; a second click shows all series again.
     """
     found = deepcopy(spec)
     for name in ("config", "$schema"):
@@ -183,7 +183,7 @@ def _mark(unit: Spec) -> Spec:
 
 
 def _series(unit: Spec) -> str | None:
-    """Return the field whose values the legend names, if it names several."""
+    """Return the field that the legend is about; None unless the legend has several names."""
     colour = unit["encoding"].get("color", {})
     several = len(colour.get("scale", {}).get("domain", ())) > 1
     named = colour.get("type") == "nominal" and colour.get("legend", {}) is not None

@@ -1,9 +1,9 @@
-"""The replay card: one page, for people and as JSON, that says what a run's critic was fed.
+"""The replay card: one page, as Markdown and as JSON, about what a run's critic was fed.
 
-A metric without its replay is half a result. The card answers, in the order a reviewer would ask:
-which policy, capacity, sampling rule, age of the sampled rows, target rule, conditions in the
-batches, whose behaviour, which corrections, the mix after them, and the one imbalance most likely
-to make the evaluation look better than deployment.
+A metric without its replay is half a result. The card answers a reviewer's questions: which policy,
+capacity, sampling rule, age of the sampled rows, target rule, conditions in the batches, behaviour
+policies and corrections, the mix after corrections, and the one imbalance most likely to make the
+evaluation look better than deployment.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def write_card(run: Path) -> tuple[dict[str, Any], str]:
     """Write the replay card into a run directory; return it as JSON values and as Markdown.
 
     Raises:
-        RunError: no run there, or one with nothing to report on yet.
+        RunError: there is no run in the directory, or it has logged no update yet.
     """
     card = replay_card(gather(run))
     markdown = as_markdown(card)
@@ -56,7 +56,7 @@ def write_card(run: Path) -> tuple[dict[str, Any], str]:
 
 
 def replay_card(facts: Facts) -> dict[str, Any]:
-    """Return the card as JSON values, with null for what the run does not say."""
+    """Return the card as JSON values; None for a value that the run lacks."""
     settings = facts.config.get("config", {})
     teacher, panel = settings.get("teacher", {}), facts.panel
     mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None

@@ -1,4 +1,4 @@
-"""The pages about methods side by side, a study and a gate, and the tables of a comparison."""
+"""The pages of a study and of a gate, and the sections of a comparison of two methods."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from restock.report.look.blocks import (
 from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
 from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 
-MAX_SETTINGS = 4  # differing settings that are named in a line
+MAX_SETTINGS = 4  # a sentence names at most this many differing settings, or none
 FREE_KINDS = ("free", "software")
 _ALLOWED = {"incomparable": "differs: allowed", "inconclusive": "may differ: allowed"}
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
@@ -31,7 +31,7 @@ _INTERVALS = (
 
 
 def headline(found: dict[str, Any], first: str, second: str) -> str:
-    """Say where the second differs from the first, by how much and how surely."""
+    """State in which conditions the second differs from the first, with intervals."""
     if found["verdict"] != "comparable":
         return f"{second} and {first} cannot be compared: {found['why']}"
     rows = [row for row in found["outcomes"] if row["perturbation"] == "none"] or found["outcomes"]
@@ -52,7 +52,7 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
 
 
 def outcome_section(found: dict[str, Any], first: str, second: str, prefix: str = "") -> Section:
-    """Return the outcomes, or why there are none."""
+    """Return a section with the outcomes, or with the reason why there are none."""
     name, title, treatment = f"{prefix}outcomes", f"{second} against {first}", _treatment(found)
     rows = found["outcomes"]
     if found["verdict"] != "comparable" or not rows:
@@ -101,7 +101,7 @@ def outcome_section(found: dict[str, Any], first: str, second: str, prefix: str 
 
 
 def _treatment(found: dict[str, Any]) -> str:
-    """Say what was to differ, and what a comparison of methods holds fixed."""
+    """Describe the treatment and, for a comparison of methods, what was held fixed."""
     names: dict[str, list[str]] = {}  # by kind
     for row in found["differences"]:
         name = row["setting"].removeprefix("config.")
@@ -127,7 +127,7 @@ def _share(value: float | None) -> str:
 
 
 def curves_section(rows: Rows, arms: list[str]) -> Section | None:
-    """Show how they learned; None if no run was evaluated on the way."""
+    """Show success over training; None if no run was evaluated during training."""
     if not rows:
         return None
     most = max(row["runs"] for row in rows)
@@ -146,7 +146,7 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
 
 
 def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
-    """Show what differs, and the checks of what was fed."""
+    """Show the settings that differ, and the checks of what the critics were fed."""
     refused = set(found["refused"])
     differences = [
         {
@@ -196,14 +196,14 @@ def _setting(value: object) -> str:
 
 
 def _ends(low: float | None, high: float | None) -> str:
-    """Format an interval, which has no end if a share was zero in some resample."""
+    """Format an interval; an end is None if a share was zero in some resample."""
     if low is None:
         return "" if high is None else f"up to {high:.3g}"
     return f"{low:.3g} or more" if high is None else f"{low:.3g} to {high:.3g}"
 
 
 def _costs(rows: Rows) -> dict[str, str]:
-    """Say what training took for a run of each arm."""
+    """Describe the cost of training one run, for each arm."""
     return {
         row["arm"]: ", ".join(
             ([] if row["wall_s"] is None else [span(row["wall_s"])])
@@ -223,7 +223,7 @@ SAFETY = {
 
 
 def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
-    """Return everything that the template needs, from a study's findings (`study.json`)."""
+    """Return the content of the page of a study (`study.json`), for `write_page`."""
     comparisons = study["comparisons"]
     refused = [one for one in comparisons if one["verdict"] != "comparable"]
     arms = list(study["runs"])
@@ -256,7 +256,7 @@ def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
 
 
 def _study_headline(study: dict[str, Any]) -> str:
-    """Return the contrast that the study is for, else its first comparison."""
+    """State the result of the study's primary contrast, or else of its first comparison."""
     primary = next((row for row in study["contrasts"] if row["primary"]), None)
     if primary is None:
         one = study["comparisons"][0]
@@ -376,7 +376,7 @@ _COLOURS = dict(zip(_WORDS.values(), ("#0f766e", "#b58900", "#be185d"), strict=T
 
 
 def gate_page(document: dict[str, Any]) -> dict[str, Any]:
-    """Return everything that the page's template needs."""
+    """Return the content of the page of a gate, for `write_page`."""
     cells, policy = document["cells"], document["policy"]
     return {
         "kicker": "gate",

@@ -30,7 +30,7 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
 PACKAGE = "restock.report.run"
 NO_GOAL = "The task has no goal: success is not defined."
-_TABLES = (  # of a run, which run.sql reads
+_TABLES = (  # tables of a run that run.sql reads
     *("strata", "conditions", "ages", "policies", "practice"),
     *("evaluations", "probe", "progress"),
 )
@@ -38,7 +38,7 @@ _TABLES = (  # of a run, which run.sql reads
 
 @dataclass
 class Facts:
-    """The facts that a page is made of. Lists are empty if a run is not that far yet."""
+    """The facts that a run's page shows. Lists are empty if the run has not got that far yet."""
 
     run: Path
     config: dict[str, Any]
@@ -55,22 +55,22 @@ class Facts:
     failures: Rows
     clocks: dict[str, Any]  # environment steps, updates and seconds of training
     cells: Rows  # measures of `restock eval` per policy, perturbation and condition
-    evaluation: str  # which of the driven episodes are shown
-    policy: PolicyOrigin | None  # the run's policy that would drive now
+    evaluation: str  # a sentence: which of the driven episodes are shown
+    policy: PolicyOrigin | None  # the policy that the run would drive with now
     driven_step: int | None  # training step of the policy in `cells`
     clones: list[CloneQuality]  # clones of the logs' drivers
-    fed: Rows  # per stratum, of all rows fed
+    fed: Rows  # shares of all rows fed, per stratum
     off_policy: Rows  # off-policy estimates, over all conditions
-    teacher: Rows  # what its filter did in the last interval
+    teacher: Rows  # what the teacher's filter did in the last logging interval
     panel: Panel | None = None
-    floors: Sequence[Warehouse] = ()  # that the run drives on
+    floors: Sequence[Warehouse] = ()  # the floors that the run drives on
     logged: Rows = field(default_factory=list)  # share of logged episodes per condition
     gap: TwinGap | None = None  # between the twin and the logs
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
 
     @property
     def target_rule(self) -> str:
-        """Say how the target network follows the online one."""
+        """Describe how the target network follows the online one."""
         rule = self.config.get("config", {}).get("target", {})
         if rule.get("rule") == "polyak":
             return f"Polyak τ {rule['tau']:g}"
@@ -87,17 +87,17 @@ class Facts:
         return bool(self.cells) and all(row["success"] is None for row in self.cells)
 
     def clean_cells(self, policy: str = "agent") -> Rows:
-        """Return the evaluation of a policy without perturbation."""
+        """Return the cells of a policy that are without a perturbation."""
         return [
             row for row in self.cells if (row["policy"], row["perturbation"]) == (policy, "none")
         ]
 
 
 def gather(path: Path) -> Facts:
-    """Read a run.
+    """Read the facts of a run, its panel, its panel's store and its gap.
 
     Raises:
-        RunError: no run at `path`, or one without a single logged update.
+        RunError: there is no run at `path`, or it has logged no update yet.
     """
     run = Run.open(path)
     evaluated, shown = shown_evaluation(path)
@@ -113,7 +113,7 @@ def gather(path: Path) -> Facts:
             remedy="let it train past its first logging interval",
         )
     (clocks,) = rows.pop("clocks")
-    latest = run_clocks(run)  # of an interrupted run they are later than its last logged interval
+    latest = run_clocks(run)  # an interrupted run is past its last logged interval
     twin, taught = _has_twin(run.document), run.table("teacher").to_pylist()
     facts = Facts(
         run=path,
@@ -144,7 +144,7 @@ def _has_twin(document: dict[str, Any]) -> bool:
 
 
 def _find_gap(facts: Facts) -> TwinGap | None:
-    """Find the gap of a run: RUN/gap, or the gap folder of its panel's store."""
+    """Read the gap of a run from RUN/gap, or from the gap folder of its panel's store."""
     places = [facts.run]
     if facts.panel is not None and "://" not in str(facts.panel.header.store):
         places.append(Path(facts.panel.header.store))
@@ -156,9 +156,10 @@ def _find_gap(facts: Facts) -> TwinGap | None:
 
 
 def _off_policy(run: Run, twin: bool) -> Rows:
-    """Return estimates on held-out logs, of the kept policy if nothing drove.
+    """Return off-policy estimates on held-out logs, over all conditions.
 
-    For a run in the twin they are of the policy that began to drive there (`off_policy`).
+    With a twin, they are for the policy that began to drive there (table `off_policy`). Without
+    one, they are for the kept policy if `restock eval` estimated it.
     """
     kept = run.path / "eval" / "off_policy.parquet"
     table = run.table("off_policy") if twin or not kept.is_file() else read_table(kept)
@@ -188,9 +189,9 @@ def _add_panel(facts: Facts) -> None:
 
 
 def _floors(facts: Facts) -> tuple[Warehouse, ...]:
-    """Return the run's floors; none if it drove on none, or they cannot be read."""
+    """Return the run's floors; empty if it has none, or if they cannot be read."""
     layouts = facts.config.get("config", {}).get("env", {}).get("layouts", DEFAULT)
-    if not facts.twin and layouts == DEFAULT:  # the logs are of another floor
+    if not facts.twin and layouts == DEFAULT:  # the logs are from another floor
         return ()
     try:
         return open_floors(layouts)
@@ -200,17 +201,16 @@ def _floors(facts: Facts) -> tuple[Warehouse, ...]:
 
 
 def mean_success(cells: Rows) -> float:
-    """Average success over conditions, partly and wholly blocked counting half each.
+    """Average success over conditions; a partly and a wholly blocked aisle count half each.
 
-    It is the one average of success that there is: a study's `rare` and a run's kept policy are
-    judged by the same.
+    A study's `rare` and the choice of a run's kept policy use the same average.
     """
     by_condition = _by_condition(cells)
     return sum(by_condition.values()) / len(by_condition)
 
 
 def _by_condition(cells: Rows) -> dict[str, float]:
-    """Return success by condition, over its cells."""
+    """Average success by condition, over the condition's cells."""
     found: dict[str, list[float]] = {}
     for row in cells:
         found.setdefault(row["condition"].split(" (")[0], []).append(row["success"])

@@ -1,6 +1,6 @@
-"""The first sentences of a run's page: what changed against the baseline, and how certain that is.
+"""The first sentences of a run's page: the difference from the baseline, and how certain it is.
 
-There is no bare average: differences are paired by episode, by condition, with their intervals.
+Differences are given by condition, paired by episode and with intervals, not as one average.
 A run without a twin is judged by logs that it did not learn from.
 """
 
@@ -32,7 +32,7 @@ _WITHOUT = "evaluate it together with one: `restock eval --policies agent,planne
 
 
 def headline(facts: Facts) -> str:
-    """Say the result in one sentence, and which step of the policy it is of."""
+    """State the result in one sentence, and the training step of the policy if it matters."""
     if not facts.twin:
         return _headline_of_logs(facts)
     if not facts.clean_cells():
@@ -60,7 +60,7 @@ def _result(facts: Facts) -> str:
 
 
 def _policy_step(facts: Facts) -> str:
-    """Say which policy was driven; nothing if it is that of the run's end."""
+    """State which policy drove; empty if it is the best one and from the end of the run."""
     step, policy = facts.driven_step, facts.policy
     if step is None or policy is None:
         return ""
@@ -74,14 +74,14 @@ def _policy_step(facts: Facts) -> str:
 
 
 def baseline(facts: Facts) -> str | None:
-    """Return whom the run is compared with, of those that drove the same episodes."""
+    """Return the baseline to compare with: the first of `BASELINES` that was evaluated."""
     return next((name for name in BASELINES if facts.clean_cells(name)), None)
 
 
 def compared(facts: Facts, name: str | None) -> Rows:
-    """Return the rows of `paired` against another policy, by perturbation and condition.
+    """Compare the agent with another policy by perturbation and condition, as rows of `paired`.
 
-    There are none if it did not drive the same episodes, or if these have no success to compare.
+    Empty if there is no other policy, if it was not evaluated, or if the task has no goal.
     """
     if name is None or facts.no_goal:
         return []
@@ -91,7 +91,7 @@ def compared(facts: Facts, name: str | None) -> Rows:
 
 
 def losses(facts: Facts) -> list[str]:
-    """Find where the policy is worse than the planner or the clone of the logs' drivers."""
+    """Describe where the agent is worse than the planner or the clone of the logs' drivers."""
     return [
         f"Worse than {BASELINES[name]} in {words(row['condition'])}"
         + ("" if row["perturbation"] == "none" else f" under {row['perturbation']}")
@@ -131,7 +131,7 @@ def _against_baseline(facts: Facts) -> str:
 
 
 def _distrust(facts: Facts) -> str:
-    """Say why success in the twin may mean little: its gap to these logs."""
+    """Warn that success in the twin may mean little, if its gap in nominal driving is large."""
     verdicts = () if facts.gap is None else facts.gap.verdicts
     nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)
     if nominal == TRUSTED:
@@ -140,7 +140,7 @@ def _distrust(facts: Facts) -> str:
 
 
 def lead(facts: Facts) -> str:
-    """Say what the headline's numbers are of, and what they cost."""
+    """Say what the headline's numbers mean, and what training cost."""
     took = facts.clocks
     updates = f"{took['gradient_steps']:,} updates in {span(took['wall_s'])}"
     if not facts.twin:
@@ -168,7 +168,7 @@ NOTHING_DROVE = (
 
 
 def _headline_of_logs(facts: Facts) -> str:
-    """Say the most that can honestly be said."""
+    """State the result of a run without a twin, from estimates on held-out logs."""
     rows = {(row["measure"], row["estimator"]): row for row in facts.off_policy}
     if not rows and not holds_out(facts):
         return "Trained on the logs alone, which are too short to evaluate it"
@@ -192,7 +192,7 @@ def holds_out(facts: Facts) -> bool:
 
 
 def judged_section(facts: Facts) -> Section:
-    """Show the estimates, or how to get them."""
+    """Show the off-policy estimates, or say how to get them."""
     if facts.off_policy:
         how = (
             "These are estimates for episodes of the logs that it did not learn from, beside what"

@@ -1,4 +1,4 @@
-"""The page of a run: facts to a headline and sections. The template only lays them out."""
+"""The page of a run: turns facts into a headline and sections, which the template lays out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from restock.report.run.headline import headline, judged_section, lead, losses, 
 from restock.report.run.twin_gap import run_section
 from restock.train.run.kept_evaluations import cell_name, measured_row
 
-# Columns of tables and their titles, on the page and on the replay card.
+# Column -> title, for the tables on the page and on the replay card.
 FED = {
     "stratum": "stratum",
     **{f"{name}_share": name for name in ("natural", "wanted", "drawn")},
@@ -37,7 +37,7 @@ SHARE_COLOURS = {"natural": "#cbd5e1", "wanted": "#94a3b8", "drawn": "#0f766e"}
 
 
 def page(facts: Facts) -> dict[str, Any]:
-    """Return everything that the page's template needs."""
+    """Return the content of the page, for `write_page`."""
     return {
         "kicker": "run report",
         "title": facts.run.name,
@@ -58,7 +58,7 @@ def page(facts: Facts) -> dict[str, Any]:
 
 
 def success(facts: Facts) -> Section | None:
-    """Show each policy's success by kind of episode."""
+    """Show each policy's success by kind of episode; None if nothing was evaluated."""
     if not facts.cells:
         return None
     cells = _evaluated(facts.cells)
@@ -90,7 +90,7 @@ def success(facts: Facts) -> Section | None:
 
 
 def _evaluated(cells: Rows) -> Rows:
-    """Return the cells of an evaluation in the page's order and words."""
+    """Return the cells of an evaluation in the page's order, with names as words."""
     names = policy_words(row["policy"] for row in cells)
     ordered = sorted(
         cells,
@@ -153,7 +153,7 @@ def sampled(facts: Facts) -> Section:
 
 
 def feed_rules(facts: Facts) -> dict[str, Any]:
-    """Return capacity, sampling rule and target rule, with null for what the run does not say."""
+    """Return capacity, sampling rule and target rule; None for a value that the run lacks."""
     settings, panel = facts.config.get("config", {}), facts.panel
     replay = settings.get("replay", {})
     mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None
@@ -179,7 +179,7 @@ def feed_rules(facts: Facts) -> dict[str, Any]:
 
 
 def _rule(mixture: dict[str, Any] | None) -> str | None:
-    """Say how the logged part of a batch is drawn."""
+    """Describe how the logged part of a batch is drawn; None without a panel."""
     if mixture is None:
         return None
     name = str(mixture.get("within", "uniform"))
@@ -190,7 +190,7 @@ def _rule(mixture: dict[str, Any] | None) -> str | None:
 
 
 def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
-    """Say how the fresh part of a batch was drawn; None if there was none."""
+    """Describe how the fresh part of a batch was drawn; None if no fresh row was drawn."""
     if not _drawn_share(facts, "fresh"):
         return None
     rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
@@ -205,7 +205,7 @@ def _drawn_share(facts: Facts, source: str) -> float | None:
 
 
 def in_words(value: Any, name: str = "", *, inside: bool = False) -> str:
-    """Write a small document for people."""
+    """Format a JSON document as one line of text."""
     if isinstance(value, dict):
         between, after = (", ", " ") if inside else ("; ", ": ")
         parts = [f"{words(key)}{after}{in_words(v, key, inside=True)}" for key, v in value.items()]
@@ -218,7 +218,7 @@ def in_words(value: Any, name: str = "", *, inside: bool = False) -> str:
 
 
 def _newest(facts: Facts) -> str:
-    """Return the age of the panel's newest row: what is only as old is not stale."""
+    """Describe the age of the panel's newest row: no logged row can be more recent."""
     began_ns = facts.config.get("created_ns")
     if facts.panel is None or began_ns is None:
         return ""
@@ -344,9 +344,9 @@ def provenance(facts: Facts) -> Section:
 
 
 def floor_section(facts: Facts) -> Section | None:
-    """Show on the floor where the agent failed; on the one of most failures, if there are several.
+    """Show where the agent failed without a perturbation, on the floor with the most failures.
 
-    None if it did not fail.
+    None if it did not fail on a known floor.
     """
     clean = [row for row in facts.failures if row["perturbation"] == "none"]
     names = {floor.name for floor in facts.floors}
@@ -377,7 +377,7 @@ FILMS, FILMS_FILE = "eval/films", "films.json"
 
 
 def films_section(facts: Facts) -> Section | None:
-    """Return the section of films; None if none are of this policy (`--video` makes them)."""
+    """Return the section of films; None if there are none (`restock eval --video` makes them)."""
     folder = facts.run / FILMS
     if not (folder / FILMS_FILE).is_file():
         return None

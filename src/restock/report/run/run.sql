@@ -1,9 +1,10 @@
--- What the report shows of a run, one statement a fact, named by the comment before it.
--- The run's tables are views of the same names; `panel_strata` is the panel's.
+-- The queries of a run's report, each named by the comment before it. They read the run's tables;
+-- `evaluated` has the episodes of `restock eval`.
 
 -- name: sampled
--- Over the whole run, per source and stratum: what was there, intended, drawn.
--- Shares after weights are of an interval: each counts by all that its source drew in it.
+-- Rows available, quota and rows drawn per source and stratum, over the whole run.
+-- effective_share is a share after weights in one logging interval. Intervals are averaged with
+-- the rows that the source drew in each as weights.
 WITH drawn AS (
     SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows FROM strata
 ), totals AS (
@@ -24,7 +25,7 @@ GROUP BY source, stratum
 ORDER BY source DESC, available_share DESC NULLS LAST, stratum;
 
 -- name: conditions
--- What batches held of each condition, whatever the strata are.
+-- Rows of each condition in the batches, whatever the strata are.
 WITH drawn AS (
     SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows
     FROM conditions
@@ -59,7 +60,7 @@ GROUP BY source, unit
 ORDER BY source DESC;
 
 -- name: policies
--- Whose experience was drawn.
+-- Drawn rows by behaviour policy.
 SELECT source, behaviour_policy, CAST(sum(rows) AS BIGINT) AS rows,
        sum(rows) / sum(sum(rows)) OVER (PARTITION BY source) AS share
 FROM policies
@@ -67,7 +68,7 @@ GROUP BY source, behaviour_policy
 ORDER BY source DESC, rows DESC;
 
 -- name: practice
--- The missions that the twin gave: the shares of each arm at first, at last and of all missions that ended.
+-- Share of each arm among the twin's missions: wanted at first and at last, and of the missions that ended.
 SELECT any_value(rule) AS rule, arm, any_value(natural_share) AS natural_share,
        first(wanted_share ORDER BY env_steps) AS first_share,
        last(wanted_share ORDER BY env_steps) AS last_share,
@@ -112,7 +113,7 @@ SELECT max(env_steps) AS env_steps, max(gradient_steps) AS gradient_steps, max(w
 FROM progress;
 
 -- name: failures
--- Where the agent's episodes ended that did not reach the goal.
+-- Where the agent's failed episodes ended.
 SELECT condition, perturbation, coalesce(layout, 'default') AS layout, end_x_m, end_y_m, failure
 FROM evaluated
 WHERE policy = 'agent' AND NOT success;

@@ -1,8 +1,8 @@
--- What the report shows of the store that the run's panel came from.
+-- The query of a run's report on the store that the run's panel was mixed from.
 
 -- name: logged
--- The conditions that logged episodes met: the nearest thing to deployment that there is. An
--- episode that met several counts for each; one that met none is nominal.
+-- Logged episodes by condition, the best available estimate of deployment. An episode with several
+-- conditions counts for each of them; an episode without any counts as nominal.
 WITH met AS (
     SELECT episode_id, list_distinct(flatten(list(conditions))) AS met FROM transitions GROUP BY ALL
 ), each AS (

@@ -1,4 +1,4 @@
-"""The gap between twin and logs: a section of a run's report, and a page by itself."""
+"""The gap between twin and logs, as a section of a run's report and as a page of its own."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COLOURS = {
 
 
 def source_name(source: str) -> str:
-    """Name a source for people: nominal is the name of a condition, too."""
+    """Add "twin" to the name of a twin: "nominal" alone is also a condition."""
     return f"{source} twin" if source in (BEFORE, AFTER) else source
 
 
@@ -48,7 +48,7 @@ def run_section(facts: Facts) -> Section | None:
 
 
 def gap_page(gap: TwinGap) -> dict[str, Any]:
-    """Return everything that the template needs for a page about a gap alone."""
+    """Return the content of a page about a gap alone, for `write_page`."""
     about = gap.about
     return {
         "kicker": "gap between twin and logs",
