@@ -208,7 +208,6 @@ def _read_verified(place: Location, stamps: Mapping[str, list[int]]) -> dict[str
 
 
 def _find_damaged(place: Location, paths: Sequence[str]) -> list[str]:
-    """Return the damaged files among these."""
     with ThreadPoolExecutor(READ_AT_ONCE) as pool:
         broken = pool.map(lambda path: is_damaged(place, path), paths)
         return [path for path, one in zip(paths, broken, strict=True) if one]

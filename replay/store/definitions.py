@@ -346,7 +346,6 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 
 def _views_to_hold(connection: duckdb.DuckDBPyConnection, owner: Definitions) -> list[str]:
-    """Return the views to keep in memory for a store of this size."""
     rows = stored_rows(connection)
     return [
         *(HELD_SUMMARIES if owner.summaries and rows <= FEW_SUMMARISED_ROWS else ()),

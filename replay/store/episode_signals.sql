@@ -1,6 +1,5 @@
--- The values in which drift is searched: one per episode and signal (episode_signals), and how often each
--- condition began (episode_conditions). drift.sql compares them week by week. docs/coverage.md explains the
--- signals.
+-- The values in which drift is searched: one per episode and signal (episode_signals), and how often each condition
+-- began (episode_conditions). drift.sql compares them week by week. docs/coverage.md explains the signals.
 
 -- The names of the profiles' own signals.
 CREATE OR REPLACE VIEW custom_signals AS

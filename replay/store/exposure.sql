@@ -1,5 +1,4 @@
--- Exposures: the situations of rows, whatever the outcome. Views over `recordings`, `transitions` and
--- `episodes`.
+-- Exposures: the situations of rows, whatever the outcome. Views over `recordings`, `transitions` and `episodes`.
 
 -- The exposures of the newest ingest.
 CREATE OR REPLACE VIEW exposures AS

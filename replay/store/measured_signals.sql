@@ -1,5 +1,4 @@
--- The values in which drift is searched, by a scan of all rows. summaries.sql reads them from manifests
--- instead.
+-- Values in which drift is searched, by a scan of all rows. summaries.sql reads them from manifests instead.
 
 -- One value per episode and signal.
 CREATE OR REPLACE VIEW measured_signals AS

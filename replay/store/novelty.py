@@ -218,7 +218,6 @@ def explain_novel_rows(found: Mapping[str, Any]) -> str:
 
 
 def _read_references(connection: duckdb.DuckDBPyConnection) -> dict[str, Reference]:
-    """Return the reference of each task."""
     rows = connection.sql(_REFERENCE).to_arrow_table()
     tasks = rows["task_hash"].unique().to_pylist()
     return {task: Reference.of(_of_task(rows, task)) for task in tasks}

@@ -131,8 +131,7 @@ def _joins_by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
 def _with_all_views(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
     """Run the job; if a table is not found, create all views of the store and run it again.
 
-    This serves queries that build a view's name from parts, and DuckDB's suggestions for misspelt
-    names.
+    This serves queries that build view names from parts, and DuckDB's hints for misspelt names.
     """
     try:
         return job()
@@ -217,8 +216,7 @@ def found(
 ) -> tuple[list[str], list[tuple[Any, ...]]]:
     """Return column names and rows of a query with `$name` parameters; times as in `values`.
 
-    The query is bound only once: for many views, binding takes longer than running it on a small
-    store.
+    The query is bound only once: with many views, binding takes longer than running it.
     """
     connection.execute(text, given)
     columns = connection.description or []

@@ -190,8 +190,7 @@ class Store:
     def verify(self) -> None:
         """Verify the page checksums of the files that queries read, as DuckDB does not.
 
-        Each file is read whole once, and again if its size or write time changes: `verified.json`
-        in the store lists the files that passed.
+        Each file is read whole once, and again if its size or write time changes (verified.json).
 
         Raises:
             StoreError: a file is damaged or missing, or the place cannot be reached.
