@@ -1,17 +1,16 @@
-"""Scripted drivers, each with a name and a version that go into the log.
+"""Scripted drivers, each with a name and a version that are logged.
 
-A policy's `act(env, observation)` gives the actions (N,) and the probability (N,) that it gives
-to each: a small share of its actions is random, so that the log covers more than its habits.
-`acting` (N,) names who chose the last actions, which differs from `name` where control is handed
-over. Policies draw from their own seeded generator.
+A policy's `act(env, observation)` returns actions (N,) and their probabilities (N,). A small share
+of its actions is random, so that the log covers more than its habits. `acting` (N,) are the names
+of the drivers that chose the last actions; they differ from `name` after a handover. Policies draw
+from their own seeded generator.
 
-The operator is privileged: it knows where pallets, people and wet floor are. At every step each
-action is simulated for the next 1.2 s: where the robot would be, how near to racks, pallets and
-people that comes (who are assumed to keep walking as they do), and how far along a plan that knows
-the pallets. Near pallets, and where the robot was stuck, it simulates pairs of actions and chooses
-by the remaining time to the goal in a state lattice, which knows how the robot must turn to fit
-through a gap. On and before slippery floor only gentle actions are allowed. A few percent of the
-actions are random.
+The operator is privileged: it reads the true places of pallets, people and wet floor. At every step
+it simulates each action for the next 1.2 s. It scores how near the robot comes to racks, pallets
+and people (assumed to keep walking), and how far it gets along a plan around the pallets. Near
+pallets, and where the robot was stuck, it simulates pairs of actions and chooses by the remaining
+time to the goal in a state lattice, which accounts for the heading that a gap takes. On and before
+slippery floor, all but gentle actions score less. A few percent of the actions are random.
 """
 
 from __future__ import annotations
@@ -64,15 +63,15 @@ class SoftPolicy:
         self.acting_version = np.array([], "U16")
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """Return the actions (N,) it would take without exploration."""
+        """Return the actions (N,) without exploration."""
         raise NotImplementedError
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Return where (N,) it does not explore: nowhere by default."""
+        """Return the robots (N,) for which it does not explore; none by default."""
         return np.zeros(env.num_envs, np.bool_)
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
-        """Return the actions of each robot's current driver, and their probabilities."""
+        """Return actions (N,), some of them random, and their probabilities (N,)."""
         chosen = self.choose(env)
         count = len(env.task.actions)
         epsilon = np.where(self.certain(env), 0.0, self.epsilon)
@@ -100,7 +99,7 @@ class RandomPolicy(SoftPolicy):
 class PlannerFollower(SoftPolicy):
     """A driver that follows the plan, slows for turns and obstacles, and stops before them.
 
-    Apart from random actions it does what the navigation stack proposes (the signals `nav_*`).
+    Apart from random actions, it drives what the navigation stack proposes (the signals `nav_*`).
     """
 
     name = "planner"
@@ -115,7 +114,7 @@ class PlannerFollower(SoftPolicy):
         return self._follower(env).choose(env.signals)
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Return where (N,) it does not explore: near anything, where it may have to stop."""
+        """Return the robots (N,) for which it does not explore: those near an obstacle."""
         return self._follower(env).near(env.signals)
 
     def _follower(self, env: WarehouseVectorEnv) -> PathFollower:
@@ -126,7 +125,7 @@ class Handover:
     """A pair of drivers: the operator takes over from the planner in trouble, then hands back.
 
     Trouble is what the robot itself can detect: no movement for 3 s, the bumper, or wheels that
-    disagree with the localisation.
+    disagree with the localisation or the gyroscope.
     """
 
     version = "1"
@@ -141,7 +140,7 @@ class Handover:
     def _prepare(self, count: int) -> None:
         self._by_operator = np.zeros(count, np.bool_)
         self._since_handover = np.zeros(count, np.int64)  # steps
-        self._still = np.zeros(count, np.int64)  # steps without way made
+        self._still = np.zeros(count, np.int64)  # steps without movement
         self._slipping = np.zeros(count, np.int64)
         self._anchor = np.zeros((count, 3))
 
@@ -191,16 +190,16 @@ class Handover:
         self._pass(clear & self._by_operator, to_operator=False)
 
     def _pass(self, robots: Bools, *, to_operator: bool) -> None:
-        """Hand robots (N,) over to one of the two."""
+        """Hand robots (N,) over to the operator or to the planner."""
         self._by_operator[robots] = to_operator
         self._since_handover[robots] = self._still[robots] = 0
 
 
-# Nearer than this to anything is too near, and less room than that is a squeeze, for a robot of
-# WIDTH_M or more; of a smaller one's, in proportion.
+# Less room than TOUCH_M counts as a hit, and less than ROOMY_M costs. Both are for robots at least
+# WIDTH_M wide, and are scaled down for narrower ones.
 TOUCH_M, ROOMY_M, WIDTH_M = 0.05, 0.12, 0.5
-PERSON_MARGIN_M = 0.4
-STANDING_MARGIN_M = 0.2
+PERSON_MARGIN_M = 0.4  # to people who move
+STANDING_MARGIN_M = 0.2  # to people who stand
 
 
 def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> tuple[F64, F64]:
@@ -235,10 +234,10 @@ def _outlines(poses: F64, outline: F64) -> tuple[F64, F64]:
 def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     """Return clearances (n, A, T) to racks, walls and pallets, and to people's future places.
 
-    Clearances are exact below `ROOMY_M`; larger ones all count the same.
+    The first are exact below `ROOMY_M`; larger ones all count the same.
     """
     outline = outline_of(env, points=3)
-    beyond_m = float(np.hypot(*outline.T).max()) + ROOMY_M  # of a middle: all of it has room
+    beyond_m = float(np.hypot(*outline.T).max()) + ROOMY_M  # this far from a centre, all have room
     room = np.full(ends.shape[:3], ROOMY_M)
     on, pallets = env.layout[ids], env.simulation.pallets[ids]
     boxes = np.concatenate([pallets[..., :2], pallet_half_m(pallets[..., 2])], axis=-1)
@@ -267,7 +266,7 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
         x, y = _outlines(ends[rows], outline)
         gap = np.hypot(x[:, None] - px[:, :, None, :, None], y[:, None] - py[:, :, None, :, None])
         gap = gap.min(axis=4) - traffic.radius_m[None, :, None, None]
-        standing = sign == 0.0  # one may pass nearer to who stands
+        standing = sign == 0.0  # robots may pass nearer to people who stand
         gap += np.where(standing, PERSON_MARGIN_M - STANDING_MARGIN_M, 0.0)[:, :, None, None]
         people[rows] = gap.min(axis=1)
     return room, people
@@ -290,27 +289,29 @@ def outline_of(env: WarehouseVectorEnv, points: int) -> F64:
     return rectangle(body.length_m, body.width_m, env.simulation.robot.axle_x_m, points)
 
 
-BACK_S = (2.4, 3.2)
+BACK_S = (2.4, 3.2)  # shortest and longest time of backing off
 _LOOK_M = tuple(0.3 * step for step in range(14))
 HORIZON_S = 1.2
-CAREFUL_M = 1.8  # from the robot's middle to a person's
+CAREFUL_M = 1.8  # from the robot's centre to a person's
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0
 STANDING_MPS = 0.12
-STILL_S = 1.0  # without having moved: it is stuck
-PATIENCE_S = 4.0  # with somebody in the way; then it moves about, to be let pass
-MOVED = np.array([0.1, 0.2])  # m and rad, of a robot that makes a step of so much or more:
+STILL_S = 1.0  # a robot that has not moved for longer is stuck
+PATIENCE_S = 4.0  # the same with somebody in the way: then it moves about, to be let past
+# Changes of position (m) and heading (rad) that count as movement, for robots that move by at least
+# MOVED_STEP in a control period; less for slower ones.
+MOVED = np.array([0.1, 0.2])
 MOVED_STEP = np.array([1.0, 1.2]) * 0.2
-WINDOW_M = 2.3  # that a lattice spans about pallets' middles
-# Near pallets: one action for FIRST_S, then another. The plan of the step before is kept unless
-# another is better by BETTER_S: otherwise replanning at every step can postpone a turn for ever.
+WINDOW_M = 2.3  # how far a lattice reaches around the centres of pallets
+# Near pallets, a plan is one action for FIRST_S, then another. The previous step's plan is kept
+# unless another is better by BETTER_S: else replanning at every step can postpone a turn for ever.
 PAIR_S, FIRST_S, NEXT_S, BETTER_S = 1.6, 0.6, 0.4, 0.1
 
 
 def harsh_actions(table: F64) -> Bools:
     """Return which actions (A, 2), in m/s and rad/s, are too fast for slippery floor.
 
-    A fast robot's slowest drive ahead and slowest turn are allowed all the same: without them it
-    would never get across.
+    A fast robot's slowest forward speed and slowest turn are always allowed: without them it would
+    never get across.
     """
     speed, turn = np.abs(table).T
     ahead = table[:, 0][table[:, 0] > 0]
@@ -320,11 +321,11 @@ def harsh_actions(table: F64) -> Bools:
 
 
 class Operator(SoftPolicy, Stateful):
-    """A privileged driver that reads the simulation's state and plans its own way per robot."""
+    """A privileged driver that reads the simulation's state and plans a path for each robot."""
 
     name = "operator"
-    # 1 had no lattice, 2 backed off from who had just let it pass, 3 looked ahead and kept clear by
-    # the stand-in's measures, whatever the robot
+    # Version 1 had no lattice, 2 backed off from people who had just let it pass, and 3 used the
+    # stand-in's look-ahead and clearances for every robot.
     version = "4"
     STATE: ClassVar[tuple[str, ...]] = (
         *("_rng", "_ways", "_episode", "_began", "_plan", "_anchor", "_still", "_waiting"),
@@ -338,17 +339,17 @@ class Operator(SoftPolicy, Stateful):
     def _prepare(self, count: int, pair_steps: int) -> None:
         self._ways = np.zeros((count, PLAN_POINTS, 2))
         self._episode = np.full(count, -1)
-        self._began = np.zeros((count, 2))  # where each was as its episode began
-        self._plan = np.zeros((count, pair_steps), np.int64)  # actions to go on with
+        self._began = np.zeros((count, 2))  # where each robot's episode began
+        self._plan = np.zeros((count, pair_steps), np.int64)  # next actions of the kept plan
         self._anchor = np.zeros((count, 3))
         self._still = np.zeros(count, np.int64)
         self._waiting = np.zeros(count, np.bool_)
         self._backing = np.zeros(count, np.int64)
-        self._stuck_m = np.full((count, 2), np.nan)  # where each was stuck last, in its episode
-        self._lattices: dict[int, tuple[int, StateLattice | None]] = {}  # by robot: of an episode
+        self._stuck_m = np.full((count, 2), np.nan)  # where each was last stuck in its episode
+        self._lattices: dict[int, tuple[int, StateLattice | None]] = {}  # robot -> episode, lattice
 
     def restored(self) -> None:
-        """Drop the lattices after a state was restored: they follow from the episodes."""
+        """Drop the lattices after a state was restored; they are rebuilt when needed."""
         self._lattices = {}
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
@@ -363,7 +364,7 @@ class Operator(SoftPolicy, Stateful):
         held = np.broadcast_to(table[:, None], (count, actions, horizon, 2))
         ends, speed = simulated(env, everyone, pose, held)  # (N, A, T, 3), (N, A, T)
         room, people = room_of(env, everyone, ends)  # (N, A, T)
-        people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # they stop before who stands
+        people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # people stop before it
         arrived = self._arrived(env, everyone, ends)
         room[arrived] = people[arrived] = 9.0  # what comes after the goal does not matter
         flat = ends[:, :, -1].reshape(-1, 3)
@@ -384,7 +385,7 @@ class Operator(SoftPolicy, Stateful):
         score += 1.0 * arrived.any(axis=2)
         alone = people.min(axis=(1, 2)) > 0.6
         score[alone, 0] -= 0.2  # nobody to wait for
-        # Whoever has stood for a while backs off, or tries something else that does not touch.
+        # A robot that has stood for a while backs off, or tries another action that hits nothing.
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
         tries[:, 0] -= 1.0
         tries[:, table[:, 0] < 0] += 1.0
@@ -399,9 +400,9 @@ class Operator(SoftPolicy, Stateful):
         return action
 
     def _past_pallets(self, env: WarehouseVectorEnv, ids: Ints, pose: F64, table: F64) -> Ints:
-        """Return the first action of the best pair of actions for robots (n,) guided by a lattice.
+        """Return the first action of the best pair of actions for robots (n,) with a lattice.
 
-        The best pair leaves the least time to the goal and touches nothing.
+        The best pair leaves the least time to the goal and hits nothing.
         """
         first, then = (part.ravel() for part in np.indices((len(table),) * 2))
         horizon, begun = steps_of(env, PAIR_S), steps_of(env, FIRST_S)
@@ -432,7 +433,7 @@ class Operator(SoftPolicy, Stateful):
         return np.asarray(chosen[:, 0], np.int64)
 
     def _near_pallets(self, env: WarehouseVectorEnv, pose: F64) -> Ints:
-        """Return the robots (n,) that a lattice of their episode guides here."""
+        """Return the robots (n,) that are in the window of their episode's lattice."""
         guided = np.zeros(len(pose), np.bool_)
         for index in range(len(pose)):
             lattice = self._lattice(env, index)
@@ -441,9 +442,9 @@ class Operator(SoftPolicy, Stateful):
         return np.flatnonzero(guided)
 
     def _lattice(self, env: WarehouseVectorEnv, index: int) -> StateLattice | None:
-        """Return the lattice of a robot's episode, around its pallets and where it was stuck.
+        """Return the lattice of a robot's episode, around pallets and where it was stuck.
 
-        None if there is neither, and for robots that do not turn on the spot.
+        It is None if there is neither, and for robots that do not turn on the spot.
         """
         episode = int(self._episode[index])
         kept, lattice = self._lattices.get(index, (-1, None))
@@ -473,7 +474,7 @@ class Operator(SoftPolicy, Stateful):
         return lattice
 
     def _note_stuck(self, env: WarehouseVectorEnv, pose: F64, ids: Ints) -> None:
-        """Let a lattice guide robots (n,) from now on around where they are stuck."""
+        """Build new lattices for stuck robots (n,), unless their lattices reach there already."""
         for index in ids.tolist():
             lattice = self._lattice(env, index)
             if lattice is None or not lattice.window.covers(*pose[index, :2]):
@@ -482,11 +483,11 @@ class Operator(SoftPolicy, Stateful):
                 self._ways[index] = self._way(env, index, pose[index])
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Return where (N,) it does not explore: right beside people."""
+        """Return the robots (N,) for which it does not explore: those beside people."""
         return _somebody_near(env, env.simulation.pose())
 
     def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
-        """Return where (N,) pallets, people or slippery floor are still near."""
+        """Return the robots (N,) that have pallets ahead, or people or slippery floor near."""
         pose = env.simulation.pose()
         plans = env.navigation.plans_m
         view = view_route(plans, pose[:, 0], pose[:, 1], np.zeros(len(pose)), _LOOK_M)
@@ -501,13 +502,16 @@ class Operator(SoftPolicy, Stateful):
         return np.asarray(near | self._icy(env, pose), np.bool_)
 
     def _arrived(self, env: WarehouseVectorEnv, ids: Ints, ends: F64) -> Bools:
-        """Return from which step on (n, A, T) the robot has been at its goal."""
+        """Return the steps (n, A, T) at which a robot is at its goal or has been there."""
         gap = ends[..., :2] - env.navigation.goals_m[ids][:, None, None]
         at_goal = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
         return np.asarray(np.logical_or.accumulate(at_goal, axis=2), np.bool_)
 
     def _standing(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
-        """Return who backs off, stuck for a second and not waiting for people, for a few steps."""
+        """Return the robots (N,) that back off: they do so for some time after being stuck.
+
+        Robots that wait for people back off only after `PATIENCE_S`.
+        """
         near = _somebody_near(env, pose)
         let_pass = self._waiting & ~near
         self._waiting = near
@@ -525,7 +529,7 @@ class Operator(SoftPolicy, Stateful):
         return self._backing > 0
 
     def _find_ways(self, env: WarehouseVectorEnv, pose: F64) -> None:
-        """Plan past the pallets at the start of each episode, and again if a robot is off plan."""
+        """Plan past the pallets when an episode starts, and again if a robot is off its plan."""
         if len(self._ways) != env.num_envs:
             self._prepare(env.num_envs, steps_of(env, PAIR_S))
         serial = env.episodes_begun
@@ -538,7 +542,7 @@ class Operator(SoftPolicy, Stateful):
             self._ways[index] = self._way(env, int(index), pose[index])
 
     def _way(self, env: WarehouseVectorEnv, index: int, pose: F64) -> F64:
-        """Return a robot's way (PLAN_POINTS, 2) past the pallets, from a pose (3,)."""
+        """Return a robot's plan (PLAN_POINTS, 2) past the pallets, from a pose (3,)."""
         x, y, yaw = pose.tolist()
         goal_x, goal_y = env.navigation.goals_m[index].tolist()
         planner = env.navigation.planner_of(index)
@@ -575,8 +579,8 @@ def _somebody_near(env: WarehouseVectorEnv, pose: F64) -> Bools:
 def _moved(env: WarehouseVectorEnv) -> F64:
     """Return the changes of x, y (m) and yaw (rad) above which a robot counts as moving.
 
-    They are smaller for slow robots, by their highest speeds: else one that creeps, or that has
-    just been commanded to drive, counts as stuck.
+    They are scaled down for slow robots by their highest speeds: else a robot that creeps, or that
+    has only just started, would count as stuck.
     """
     fastest = np.abs(np.asarray(env.task.actions, np.float64)).max(axis=0)
     slower = np.minimum(fastest * env.task.control_period_s / MOVED_STEP, 1.0)

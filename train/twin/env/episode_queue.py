@@ -1,11 +1,11 @@
 """The queue of episodes: which one each of N environments begins next, and on which floor.
 
-Fixed episodes come in their order, then drawn ones. These may be of ordered missions (a kind, a
-floor and a zone), or of arms, the kinds of missions that practice chooses among: a kind of episode,
-of a blocked aisle one block.
+Fixed episodes come first, in their order; then episodes are drawn. A drawn episode may be of an
+ordered mission (a kind, a floor and a zone). If practice chooses, it is of an arm: a kind of
+episode, one block of a blocked aisle, or an order.
 
-An episode is determined by its kind and its seed. An episode that must come through a zone, or
-belong to an arm, gets the first of its seeds that does: the episode itself is not changed.
+An episode is determined by its kind and its seed. If it must pass through a zone or have an arm's
+block, seeds are tried until one gives such an episode: the episode itself is not changed.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from restock.train.twin.missions import KINDS, MISSIONS
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, refuse_unfit
 from restock.train.twin.physics.perturbation import Schedule
 
-TRIES = 300  # seeds that are tried for a way through a zone
-WAY_POINTS = 24  # along each leg of a plan at which zones are looked up
+TRIES = 300  # seeds that are tried for a route through a zone
+WAY_POINTS = 24  # points on each leg of a plan at which zones are looked up
 
 
 @dataclass(frozen=True)
 class _Floor:
-    """A floor that an order can be driven on, and the order's zone there."""
+    """A floor that an order can be driven on, and the order's zone on it."""
 
-    place: int  # among the floors
+    place: int  # index among the floors
     zone: str | None
 
 
 class MissionOrders:
-    """Orders that the given floors can hold.
+    """Orders of missions that can be driven on the given floors.
 
-    `shares` (K,) are the orders' shares of all missions.
+    `shares` (K,) are the orders' shares of all ordered missions.
 
     Raises:
-        ConfigError: a kind, floor or zone that is not there, a floor without room for a kind, or
-            hours in place of missions; names it.
+        ConfigError: a kind, floor or zone does not exist, a floor has no room for a kind, or an
+            order asks for hours instead of missions.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class MissionOrders:
         """Return an episode of an order: the same for the same seed.
 
         Raises:
-            ConfigError: no way came through its zone.
+            ConfigError: no route passed through its zone.
         """
         order, on = self.orders[number], self._on[number]
         kind = str(order.kind)
@@ -75,7 +75,7 @@ class MissionOrders:
         for _ in range(TRIES):
             floor = on[int(rng.integers(len(on)))]
             drawn = int(rng.integers(1 << 31))
-            # With one floor it goes without saying, and the episode is called as it always was.
+            # A single floor is not named, so that specs are the same as in earlier versions.
             named = self._floors[floor.place].name if len(self._floors) > 1 else None
             spec = EpisodeSpec(kind, drawn, layout=named)
             if floor.zone is None or self._comes_through(spec, floor):
@@ -137,7 +137,7 @@ class MissionOrders:
 
 
 def _zone_on(floor: Warehouse, zone: str) -> str | None:
-    """Return a floor's own name of a zone, also if it is given as `FLOOR/ZONE`; else None."""
+    """Return a zone's name on a floor, also if given as `FLOOR/ZONE`; None without such a zone."""
     bare = zone.removeprefix(f"{floor.name}/")
     return bare if bare in floor.zones else None
 
@@ -152,16 +152,16 @@ _PROBES = 24  # seeds that show which blocks a floor has room for
 
 @dataclass(frozen=True)
 class MissionArm:
-    """A group of missions that can be chosen; "" leaves a choice to the seed."""
+    """A group of missions that practice can choose."""
 
     name: str
     kind: str
-    share: float  # natural: of the missions, where nothing is practised
-    block: str = ""  # partial | full
-    order: int = -1  # of the ordered missions
+    share: float  # natural share: of the missions without practice
+    block: str = ""  # partial | full; "": the seed draws it
+    order: int = -1  # index among the orders; -1: not of an order
 
     def holds(self, kind: str, block: str) -> bool:
-        """Return whether an episode is of this arm."""
+        """Return whether episodes of this kind and block belong to the arm; False for an order."""
         return self.order < 0 and kind == self.kind and self.block in ("", block)
 
 
@@ -186,7 +186,7 @@ class MissionArms:
         arms = [
             arm
             for kind, part in conditions.items()
-            if left * part  # a kind without a share is evaluated, and never practised
+            if left * part  # a kind whose share is 0 is evaluated, but never practised
             for arm in self._by_block(MissionArm(kind, kind, left * part / total))
         ]
         if orders is not None:
@@ -206,7 +206,7 @@ class MissionArms:
         """Return a mission of an arm, with its perturbation: the same for the same seed.
 
         Raises:
-            ConfigError: none of many seeds had the arm's block.
+            ConfigError: none of `BLOCK_TRIES` seeds gave the arm's block.
         """
         arm = self.arms[number]
         if arm.order >= 0 and self._orders is not None:
@@ -243,7 +243,7 @@ class MissionArms:
         for seed in range(_PROBES):
             try:
                 found.add(self._block(EpisodeSpec(kind, seed)))
-            except ConfigError:  # no room at all: the floors are asked about kinds elsewhere
+            except ConfigError:  # no room at all, which `refuse_unfit` reports
                 break
             if len(found) == len(blocks):
                 break
@@ -279,10 +279,10 @@ def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
 
 
 class EpisodeQueue(Stateful):
-    """A queue whose n-th episode of an environment does not depend on the other environments.
+    """A queue of episodes. An environment's n-th drawn episode does not depend on the others.
 
-    `conditions` are shares per kind of episode; a schedule draws a perturbation for each episode.
-    If missions were ordered, a share of the drawn episodes is of those.
+    `conditions` are shares per kind of episode; a schedule draws a perturbation for each drawn
+    episode. If missions are ordered (`follow`), a share of the drawn episodes is of those.
 
     Raises:
         ConfigError: an unknown condition, or shares that are not numbers of at least 0.
@@ -307,8 +307,8 @@ class EpisodeQueue(Stateful):
         self.next_fixed = 0
         self._orders: MissionOrders | None = None
         self._orders_share = 0.0
-        self._asked: MissionArms | None = None  # the last that were asked for
-        self._arms: MissionArms | None = None  # in force
+        self._asked: MissionArms | None = None  # the last that `arms` returned
+        self._arms: MissionArms | None = None  # that episodes are drawn from
         self._arm_shares = np.zeros(0)  # cumulative
         self.set_conditions(conditions)
 
@@ -339,7 +339,7 @@ class EpisodeQueue(Stateful):
         self._arms, self._arm_shares = self._asked, np.cumsum(parts) / parts.sum()
 
     def arms(self, planners: Sequence[Planner]) -> list[MissionArm]:
-        """Return the arms of its drawn episodes."""
+        """Return the arms that its episodes can be drawn from."""
         self._asked = MissionArms(
             self._layouts,
             planners,
@@ -361,7 +361,7 @@ class EpisodeQueue(Stateful):
     def next(self, env: int) -> tuple[EpisodeSpec, int, int]:
         """Return the episode that an environment begins now, its index in `fixed`, and its arm.
 
-        The index is -1 for a drawn episode; the arm is -1 unless arms were requested.
+        The index is -1 for a drawn episode. The arm is -1 unless `practise` was called.
         """
         if self.next_fixed < len(self.fixed):
             self.next_fixed += 1
@@ -384,6 +384,6 @@ class EpisodeQueue(Stateful):
 
 
 def _drawn(cumulative: F64, draw: np.integer[Any]) -> int:
-    """Return the index in cumulative shares that 32 random bits fall into."""
+    """Return the index of the share, of cumulative shares, that 32 random bits fall into."""
     place = int(np.searchsorted(cumulative, draw / 2**32, side="right"))
     return min(place, len(cumulative) - 1)  # their sum may fall short of 1 by rounding

@@ -1,7 +1,7 @@
 """The interface between environments and policies, and exploration.
 
-`Twin` is what training and evaluation need of an environment, `Policy` is what drives in one:
-a trained network, an ONNX file, a script, one of your own.
+`Twin` is the environment that training and evaluation need. `Policy` is a driver: a trained
+network, an ONNX file, a script, or your own.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from restock.arrays import F32, Bools, Ints
 from restock.ingest.task.task import Signals
 from restock.toml import Checked
 
-if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
+if TYPE_CHECKING:  # these import MuJoCo, which a run's config does not need
     from restock.train.twin.env.episode_queue import MissionArm
     from restock.train.twin.physics.episode import EpisodeSpec
 
-AFTER_LOGS = 0.2  # the offline phase has learnt to drive: more exploration would only undo that
+AFTER_LOGS = 0.2  # first epsilon after training on logs: more would only undo what was learnt
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 
@@ -35,8 +35,8 @@ Step = tuple[F32, F32, Bools, Bools, Info]
 class Twin(Protocol):
     """The vectorised environment that training and evaluation need (`WarehouseVectorEnv`).
 
-    Its missions can be chosen by arm, as `[practice]` does: once shares were set,
-    `info["mission_arm"]` (N,) of a step is the arm of each episode.
+    Its missions can be chosen by arm, as `[practice]` does: once shares are set,
+    `info["mission_arm"]` (N,) is the arm of each environment's episode.
     """
 
     num_envs: int
@@ -59,12 +59,12 @@ class Policy(Protocol):
     version: str
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, NDArray[Any]]:
-        """Return actions (N,) for observations (N, D), and the probabilities (N,) they had."""
+        """Return actions (N,) for observations (N, D), and their probabilities (N,)."""
         ...
 
 
 class LinearEpsilon(Checked, frozen=True):
-    """A probability of random actions that goes linearly from `start` to `end` over `steps`."""
+    """A probability of random actions that changes linearly from `start` to `end` over `steps`."""
 
     start: Probability | None = None  # None: 1 without logs, AFTER_LOGS with them
     end: Probability = 0.05
@@ -79,7 +79,10 @@ class LinearEpsilon(Checked, frozen=True):
 def epsilon_greedy(
     greedy: NDArray[Any], actions: int, epsilon: float, rng: np.random.Generator
 ) -> tuple[Ints, F32]:
-    """Explore: return actions (N,) drawn around greedy ones (N,), with their probabilities (N,)."""
+    """Replace greedy actions (N,) by random ones at rate `epsilon`; return them and probabilities.
+
+    The probabilities (N,) are those of the returned actions (N,).
+    """
     explores = rng.random(len(greedy)) < epsilon
     uniform = rng.integers(actions, size=len(greedy))
     action = np.where(explores, uniform, greedy).astype(np.int64)
@@ -88,12 +91,12 @@ def epsilon_greedy(
 
 
 class MadeAgain:
-    """An object pickled by its constructor's arguments, as Gymnasium's EzPickle does.
+    """A base class whose objects are pickled by their constructor's arguments, like EzPickle.
 
     The copy has the same settings and is not reset yet; the state of the original is not copied.
     """
 
-    spec: Any  # of Gymnasium, where `gymnasium.make` made it
+    spec: Any  # Gymnasium's EnvSpec, set by `gymnasium.make`
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
 
     def __new__(cls, *given: Any, **named: Any) -> Self:

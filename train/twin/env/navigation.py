@@ -1,28 +1,26 @@
 """Navigation of N robots, and the truth of their steps: plans, conditions and `info`.
 
-A plan is made again when the robot strays from it, or when its lidar shows an aisle to be wholly
-blocked, which is remembered for the rest of the episode.
+A robot replans when it strays from its plan, or when `BlockFinder` sees in its lidar scans that an
+aisle is wholly blocked. The block is remembered for the rest of the episode.
 
-`BlockFinder` is what the lidar adds: it finds the aisles that are wholly blocked.
-
-`Truth` computes the true conditions of every step from the simulator, separately from labels, to
-score them. A step's conditions are the physical truth over [t, t + 1), by the contract's names:
+`Truth` computes the true conditions of every step from the simulator, so that labels can be scored
+against them. They are the physical truth over [t, t + 1), with the names of the task's conditions:
 
 - wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than the task's
   `slip_limit_mps`;
 - near_collision: at t + 1 something was nearer to the body than the task's `tight_clearance_m`, or
   the bumper was pressed;
-- recovery: after such an event until there was twice that room, or 2 s, known at t;
-- blocked_aisle: at t, pallets lay on the plan within `BLOCK_AHEAD_M` of the robot's middle.
+- recovery: after a near_collision, until there was twice that room or 2 s had passed, as of t;
+- blocked_aisle: at t, pallets lay on the plan within 1.2 m of the robot's middle.
 
-Exposures are what was so at t, whatever came of it:
+Exposures are the situation at t, whatever the outcome:
 
-- closing_traffic: someone within 2 m of the body had come nearer, over the step before, by .1 m/s;
+- closing_traffic: someone within 2 m of the body came nearer, by .1 m/s, in the previous step;
 - plan_blocked: pallets lay on the plan within 2.2 m of the robot's middle;
 - slippery_floor: a wheel stood on a slippery patch.
 
-Several may hold at once: the text of a step names all of them, sorted, with commas between, and is
-"nominal" where none holds. `restock.ingest.store.manifest.primary_of` makes it one.
+Several may hold at once. A step's text lists all that hold, sorted and separated by commas, or is
+"nominal" if none holds. `restock.ingest.task.schema.primary_of` chooses one of them.
 
 `docs/twin.md` lists what `info` holds.
 """
@@ -63,12 +61,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class BlockFinder(Stateful):
-    """A detector of wholly blocked aisles, from lidar scans over time. State for N robots.
+    """A detector of wholly blocked aisles in the lidar scans of N robots over time.
 
-    Within the aisle segment ahead, lidar returns that are neither rack nor wall are gathered up
-    to `reach_m` away. If no free gap across the aisle is as wide as `passable_m`, and that is so
-    for `persistence` steps at the same place, the aisle is blocked there. Robots may be on several
-    floors: `floor` (N,) says on which of `floors` each is.
+    It looks at lidar returns up to `reach_m` ahead, in the aisle segment, that are neither rack nor
+    wall. If they leave no gap of `passable_m` across the aisle for `persistence` successive steps
+    at the same place, the aisle is blocked there. `floor` (N,) is each robot's index in `floors`.
     """
 
     STATE = ("seen", "place")
@@ -80,8 +77,8 @@ class BlockFinder(Stateful):
     persistence: int = 3
 
     def __post_init__(self) -> None:
-        self.seen = np.zeros(self.num, np.int64)  # steps in a row
-        self.place = np.full((self.num, 2), -1, np.int64)  # of the last sighting: a closure
+        self.seen = np.zeros(self.num, np.int64)  # successive steps with a block at one place
+        self.place = np.full((self.num, 2), -1, np.int64)  # closure of the last sighting
         self.floor = np.zeros(self.num, np.int64)
 
     def reset(self, ids: Ints) -> None:
@@ -97,11 +94,11 @@ class BlockFinder(Stateful):
         heading: F64,
         turned: Bools,
     ) -> list[tuple[int, Closure]]:
-        """Look at one scan of each robot in `ids`; returns (robot, closure) of each block.
+        """Process one scan of each robot in `ids`; return (robot, closure) for each block found.
 
-        `pose` (n, 3) is localised, `hits_m` (n, B, 2) are the returns in the map frame, `valid`
-        (n, B) which of them are returns, `heading` (n,) the sign of the way along x, or along y
-        where it mostly runs that way (`turned`, (n,)).
+        `pose` (n, 3) is localised. `hits_m` (n, B, 2) are points in the map frame, of which `valid`
+        (n, B) are returns. `heading` (n,) is the sign of the direction along x, or along y for
+        robots whose plan mostly runs along y (`turned`, (n,)).
         """
         segment, edges = self._segments_ahead(ids, pose, heading, turned)
         x, y, here = hits_m[..., 0], hits_m[..., 1], pose[:, :1]
@@ -141,14 +138,14 @@ class BlockFinder(Stateful):
         heading: F64,
         turned: Bools,
     ) -> tuple[Ints, F64]:
-        """Return the aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
+        """Return the aisle segment (n,) each robot is in, or the one just ahead of it; -1 if none.
 
         Also returns the segments' edges (n, 4), x and y exchanged for robots that are `turned`.
         Only segments along the robot's direction count.
         """
         segment = np.full(len(ids), -1, np.int64)
         edges = np.zeros((len(ids), 4))
-        x, y = np.array([pose[:, :2], pose[:, :2]]).transpose(2, 0, 1)  # (2, n): then, and now
+        x, y = np.array([pose[:, :2], pose[:, :2]]).transpose(2, 0, 1)  # (2, n): ahead, and here
         x[0] += 0.8 * heading * ~turned
         y[0] += 0.8 * heading * turned
         floors = self.floor[ids]
@@ -166,19 +163,19 @@ class BlockFinder(Stateful):
 
 
 STRAYED_M = 0.6
-LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
+LOOK_M = 1.9  # the block finder reads a scan only if something is this near ahead
 
-# Of the stand-in, whose measures the follower's are: its speeds, its outline, and the room that it
-# wants around it to turn on the spot.
+# Speeds and outline of the stand-in, and the room that it needs to turn on the spot. The path
+# follower is tuned for it, and is scaled for other robots.
 FASTEST_MPS, FASTEST_RADPS = 1.0, 1.2
 STAND_IN, PIVOT_M = Body(length_m=0.70, width_m=0.50), 0.14
-STANDING_SHARE = 0.2  # of the distances at which a robot stops and slows, however slow it is
+STANDING_SHARE = 0.2  # share of the stopping and slowing distances that the slowest robot keeps
 
 
 class Navigation(Stateful):
     """Plans and goals of N robots, each on one of `floors`.
 
-    With `proposes`, the stack's next command is among the signals if the task has a route.
+    If `proposes` is true and the task has a route, the signals have the stack's next command.
     """
 
     STATE = ("plans_m", "plan_number", "closures", "finder")
@@ -191,7 +188,7 @@ class Navigation(Stateful):
         self._follower = PathFollower(task) if proposes and task.goal == "route" else None
         self.planners = planners(floors)
         self.finder = BlockFinder(floors, num_envs)
-        self.floor = self.finder.floor  # (N,) on which of the floors
+        self.floor = self.finder.floor  # (N,) index of each robot's floor
         self._any_along_y = any(floor.segment_along_y.any() for floor in floors)
         self.plans_m = np.zeros((num_envs, PLAN_POINTS, 2))
         self.goals_m = np.zeros((num_envs, 2))
@@ -211,13 +208,13 @@ class Navigation(Stateful):
         self.finder.reset(np.array([env]))
 
     def add_route(self, signals: Signals, ids: Ints | slice = slice(None)) -> F64:
-        """Add what robots see of their plans and goals; returns how far off plan they are."""
+        """Add the signals of the robots' plans and goals; return how far off plan they are."""
         return add_route(self.task, signals, self.plans_m[ids], self.goals_m[ids])
 
     def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> None:
-        """Read the new signals, and replan where it is due; the new plan goes into the signals.
+        """Replan for robots that have strayed or found a block, and put new plans into the signals.
 
-        A new plan counts from this step on, so that it never makes progress jump.
+        The step's progress is computed before this, so that a new plan never makes it jump.
         """
         again = set((offset_m > STRAYED_M).nonzero()[0].tolist())
         again |= self._find_blocks(signals, sensing)
@@ -237,14 +234,14 @@ class Navigation(Stateful):
                 signals[name][ids] = column
 
     def propose(self, signals: Signals) -> None:
-        """Add navigation's next command to the signals, by the current plan and scan."""
+        """Add navigation's next command to the signals; NaN if it proposes none."""
         command: F64 = np.full((len(signals["stamp_ns"]), 2), np.nan)
         if self._follower is not None:
             command = self._follower.table[self._follower.choose(signals)]
         signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
 
     def _find_blocks(self, signals: Signals, sensing: Sensing) -> set[int]:
-        """Look for blocked aisles if something is near ahead; return whose map changed."""
+        """Look for blocked aisles if something is near ahead; return robots with a new block."""
         yaw = signals["pose_yaw_rad"]
         toward_x = (
             np.cos(yaw) * signals["waypoint_near_x_m"] - np.sin(yaw) * signals["waypoint_near_y_m"]
@@ -286,14 +283,14 @@ class Navigation(Stateful):
 class PathFollower:
     """A driver that follows the plan, slows for turns and obstacles, and stops before them.
 
-    It sees what the robot sees: waypoints and lidar clearances. It never leaves its plan, so a
-    pallet that blocks part of the aisle stops it for good. A robot without a lidar follows the plan
-    alone: nothing is known to be near, and it stops for nothing.
+    It uses only what the robot senses: waypoints and lidar clearances. It never leaves its plan, so
+    a pallet that blocks part of the aisle stops it for good. Without a lidar it detects nothing: it
+    follows the plan and never stops for an obstacle.
 
     Args:
-        stop_m: something this near ahead stops it.
-        slow_m: and this near slows it down. Both of a robot that drives 1 m/s; of a slower one,
-            which needs less room to stop, they are less.
+        stop_m: an obstacle this near ahead stops a robot that drives 1 m/s.
+        slow_m: an obstacle this near ahead slows it down. Both distances are scaled down for a
+            slower robot, which needs less room to stop.
     """
 
     def __init__(self, task: Task, *, stop_m: float = 0.30, slow_m: float = 0.80) -> None:
@@ -316,7 +313,7 @@ class PathFollower:
         self._back = np.array([0, self._index(-0.4, 0.6), self._index(-0.4, -0.6)])
 
     def choose(self, signals: Signals) -> Ints:
-        """Return the actions (N,) whose velocity is nearest to what the plan requires."""
+        """Return the actions (N,) whose velocities are nearest to those that the plan requires."""
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
         far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
         front, bend = self.front(signals), np.abs(near)
@@ -337,12 +334,12 @@ class PathFollower:
     ) -> Ints:
         """Return the actions (N,) of steered robots that turn by driving forward and back.
 
-        They do so if the plan leads elsewhere than they are heading; others keep `action`.
+        They turn if the plan leads away from their heading; other robots keep `action`.
         """
-        backs = signals["wheel_speed_mps"] < -0.05  # what it began it goes on with
+        backs = signals["wheel_speed_mps"] < -0.05  # continue a move that has begun
         behind = self._nearest(signals, self._behind)
         turns = (bend > 0.9) | ((bend > 0.3) & (backs | (front < self.stop_m)))
-        room = np.where(backs, self.slow_m, self.stop_m)  # ahead, to drive on forward
+        room = np.where(backs, self.slow_m, self.stop_m)  # needed ahead to drive forward
         back = (front < room) & (behind > self.stop_m / 2)
         forward = np.where(front < self.stop_m / 2, 0, self._drive[1, side])
         return np.where(turns, np.where(back, self._back[side], forward), action)
@@ -358,19 +355,19 @@ class PathFollower:
         return nearest
 
     def near(self, signals: Signals) -> Bools:
-        """Return where (N,) anything is near."""
+        """Return the robots (N,) with an obstacle near."""
         return np.asarray(
             (signals["clearance_m"] < self.stop_m) | (self.front(signals) < 2 * self.stop_m)
         )
 
     def _index(self, speed_mps: float, yaw_rate_radps: float) -> int:
-        """Return the action nearest to the stand-in's velocity, scaled to this robot's pace."""
+        """Return the action nearest to a velocity of the stand-in, scaled to this robot."""
         wanted = self._pace * (speed_mps, yaw_rate_radps)
         return int(np.abs(self.table - wanted).sum(axis=1).argmin())
 
 
 def _corner_m(body: Body) -> float:
-    """Return how far the corners stand out beyond the nearer sides, if it turns on the spot."""
+    """Return how much farther from the centre the corners are than the nearest sides."""
     return math.hypot(body.length_m, body.width_m) / 2 - min(body.length_m, body.width_m) / 2
 
 
@@ -381,7 +378,7 @@ EXPOSURES = ("closing_traffic", "plan_blocked", "slippery_floor")
 
 
 def _texts(names: tuple[str, ...]) -> NDArray[np.str_]:
-    """Return the text of every set of names: bit i of a set's index is names[i]."""
+    """Return the text of every subset of names: bit i of a subset's index is for names[i]."""
     sets = range(1 << len(names))
     return np.array([truth_text(n for bit, n in enumerate(names) if s >> bit & 1) for s in sets])
 
@@ -389,14 +386,14 @@ def _texts(names: tuple[str, ...]) -> NDArray[np.str_]:
 _TEXTS, _EXPOSED = _texts(NAMES), _texts(EXPOSURES)
 AFTERMATH_S = 2.0
 CLOSING_WITHIN_M, CLOSING_MPS = 2.0, 0.1
-VIEW_M = tuple(0.2 * step for step in range(1, 12))  # of the plan; the look-ahead's far end
-BLOCK_AHEAD = 6  # of them are just ahead: to 1.2 m
-REACH_M = VIEW_M[-1] + 1.5  # a pallet farther off than this is not in view
-MARGIN = 0.4  # of the body's width: how far beside the plan a pallet is still in the way
+VIEW_M = tuple(0.2 * step for step in range(1, 12))  # distances ahead at which pallets are sought
+BLOCK_AHEAD = 6  # the first so many, to 1.2 m, decide blocked_aisle
+REACH_M = VIEW_M[-1] + 1.5  # a pallet farther away than this is not in view
+MARGIN = 0.4  # how far beside the plan a pallet is in the way, as a share of the body's width
 
 
 class Truth(Stateful):
-    """State that true conditions depend on, for N environments."""
+    """The true conditions and exposures of N environments, and the state that they depend on."""
 
     STATE = ("aftermath_s", "blocked", "traffic_gap_m", "exposed")
 
@@ -404,9 +401,9 @@ class Truth(Stateful):
         self._period_s = task.control_period_s
         self._near_m = task.rewards.tight_clearance_m
         self._margin_m = MARGIN * task.body.width_m
-        self.aftermath_s = np.zeros(num_envs)  # left of it; 0: none
+        self.aftermath_s = np.zeros(num_envs)  # time left of the recovery; 0: none
         self.blocked = np.zeros(num_envs, np.bool_)  # at t
-        self.traffic_gap_m = np.full((num_envs, AGENTS), np.inf)  # to each, at t; inf: not there
+        self.traffic_gap_m = np.full((num_envs, AGENTS), np.inf)  # to each, at t; inf if absent
         self.exposed = np.zeros((num_envs, len(EXPOSURES)), np.bool_)  # at t
 
     def reset(self, ids: Ints) -> None:
@@ -416,7 +413,7 @@ class Truth(Stateful):
         self.exposed[ids] = False
 
     def note_situation(self, simulation: Simulation, plans_m: F64) -> None:
-        """Note what every robot was exposed to at the start of the step that was driven."""
+        """Note every robot's exposures at the start of the step that was just driven."""
         pose, pallets, gaps_m = simulation.start, simulation.pallets, simulation.traffic_gap_m
         ahead = np.zeros((len(pose), len(VIEW_M)), np.bool_)
         apart = np.abs(pallets[:, :, :2] - pose[:, None, :2])
@@ -427,7 +424,7 @@ class Truth(Stateful):
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets], self._margin_m
             )
         self.blocked[:] = ahead[:, :BLOCK_AHEAD].any(axis=1)
-        with np.errstate(invalid="ignore"):  # who was not there, or is not, is at infinity
+        with np.errstate(invalid="ignore"):  # the gap of an absent agent is infinite
             came_m = self.traffic_gap_m - gaps_m
         came = np.isfinite(came_m) & (came_m > CLOSING_MPS * self._period_s)
         self.exposed[:, 0] = (came & (gaps_m < CLOSING_WITHIN_M)).any(axis=1)
@@ -446,7 +443,7 @@ class Truth(Stateful):
         near = bumped | (clearance_m < self._near_m)
         now = Situation(self.blocked, near, slipped, clearance_m, self.traffic_gap_m)
         missions = [is_true(now) for is_true in SCORED.values()]
-        held = np.array([*missions, self.aftermath_s > 0])  # as NAMES
+        held = np.array([*missions, self.aftermath_s > 0])  # in the order of NAMES
         which = (1 << np.arange(len(NAMES))) @ held
         left = np.maximum(self.aftermath_s - self._period_s, 0.0)
         left[(clearance_m > 2 * self._near_m) & ~near] = 0.0
@@ -456,7 +453,7 @@ class Truth(Stateful):
 
 
 def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
-    """Return whether a pallet is within the robot's breadth of the plan at VIEW_M, (n, VIEW_M)."""
+    """Return whether a pallet is within `margin_m` of the plan at each of VIEW_M, (n, VIEW_M)."""
     view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), VIEW_M)
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
@@ -465,7 +462,7 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
 
 
 def info_now(env: WarehouseVectorEnv, signals: Signals | None = None) -> Info:
-    """Return the episodes now running and their signals; None: a copy of the current ones."""
+    """Return the `info` of running episodes; `signals` None is a copy of the current signals."""
     return {
         "signals": signals or {name: column.copy() for name, column in env.signals.items()},
         "episode_condition": env.episode_condition.copy(),
@@ -499,6 +496,6 @@ def info_after(
         "success": ended & reached_goal(env.task, after) & (env.bumps == 0),
         "invalid": sim.diverged.copy(),
         "travelled_m": sim.travelled_m,
-        # Not NaN, which Gymnasium's checker takes for two different values.
+        # inf, because Gymnasium's checker finds that NaN differs from NaN.
         "closest_person_m": np.where(np.isnan(closest_m), np.inf, closest_m),
     }

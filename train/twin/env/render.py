@@ -35,7 +35,7 @@ FORKLIFT, ICE, ROUTE, ROBOT, MAP_GOAL = (
     *((240, 130, 30), (30, 150, 60)),
 )
 AISLE, DOCK, ONE_WAY, MAP_WALL = (222, 232, 220), (250, 214, 150), (205, 70, 60), (70, 74, 80)
-FLOOR_PIXELS, MAP_PIXELS_PER_M = 960, 40  # of a floor's longer side
+FLOOR_PIXELS, MAP_PIXELS_PER_M = 960, 40  # the first is for a floor's longer side
 
 
 def draw_floor(
@@ -43,8 +43,8 @@ def draw_floor(
 ) -> NDArray[np.uint8]:
     """Draw racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, with walls.
 
-    Of a floor that was made from a `grid` its occupied cells are drawn too, and the places that the
-    robot drove through, `driven_m` (N, 2) in the map's frame.
+    For a floor made from a `grid`, this also draws the grid's occupied cells, and the places
+    `driven_m` (N, 2), in the map's frame, where the robot drove.
     """
     canvas = _Canvas(floor, int(FLOOR_PIXELS / max(floor.width_m, floor.depth_m)))
     for color, areas in (
@@ -97,7 +97,7 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
 
 
 class _Canvas:
-    """The pixels of a floor, with rows from the south."""
+    """The pixels of a floor; the first row is the southernmost."""
 
     def __init__(self, floor: Warehouse, pixels_per_m: int) -> None:
         height, width = round(floor.depth_m * pixels_per_m), round(floor.width_m * pixels_per_m)

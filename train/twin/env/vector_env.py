@@ -4,15 +4,15 @@
     observation, info = env.reset(seed=1)
     observation, reward, terminated, truncated, info = env.step(actions)
 
-Actions index the task's table; with `action="continuous"` they are (N, 2) speeds in m/s and yaw
-rates in rad/s over the same task. In the continuous space the base gets the very command of the
-action, while the observation's previous action and the reward's change of action are those of the
-nearest action of the table: what `restock ingest` does to the continuous commands of a log. The
-same holds if a limiter in front changes a command.
+Actions are indices into the task's table of actions. With `action="continuous"` they are (N, 2)
+speeds in m/s and yaw rates in rad/s for the same task. The base then gets exactly that command,
+but the observation's previous action and the reward's change of action use the nearest action of
+the table, as `restock ingest` does with the continuous commands of a log. The same holds for
+commands that a limiter has changed.
 
-Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
-episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
-termination.
+Autoreset is SAME_STEP (in the metadata): when an episode ends, `observation` is already the first
+of the next episode, and the last of the ended episode is in `info["final_obs"]`. Bootstrap on
+truncation, never on termination.
 
 `docs/twin.md` lists what `info` holds. `WarehouseEnv` is one warehouse as a plain Gymnasium
 environment, without autoreset.
@@ -93,8 +93,8 @@ class DiscreteActions:
 class ContinuousActions:
     """An action space of speeds in m/s and yaw rates in rad/s, (N, 2), clipped to its range.
 
-    The space is what the table's actions span. `info["action"]` (N,) is the nearest of them, and
-    `info["action_residual"]` (N,) how far away it was, as the store's column of that name.
+    The range is the one that the table's actions span. `info["action"]` (N,) is the table's nearest
+    action, and `info["action_residual"]` (N,) its distance, as in the store's column of that name.
     """
 
     def __init__(self, task: Task, num_envs: int) -> None:
@@ -124,9 +124,9 @@ ACTIONS: Mapping[str, type[DiscreteActions | ContinuousActions]] = {
 
 
 def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
-    """Limit the chosen actions; `info["limiter"]` has the rule that held each back.
+    """Limit the chosen actions; `info["limiter"]` is the rule that limited each.
 
-    A command that was held back gets the action nearest to it, as ingest would label its log.
+    A limited command gets the table's nearest action, as ingest would label its log.
     """
     action, command, reported = chosen
     before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
@@ -138,13 +138,13 @@ def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> 
     return action, command, {"action": action, "action_residual": residual, "limiter": limited.rule}
 
 
-OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
+OBSERVATION_LIMIT = 20.0  # bounds of the space, which clip observations; sensors give less
 
 
 class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, MadeAgain):
     """N warehouses as a Gymnasium vector environment; `docs/twin.md` explains `info`."""
 
-    # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
+    # What changes while episodes run; the rest (layout, noise, traffic's paths) follows from specs.
     STATE = (
         *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
         *("episode_seed", "episode_condition", "block", "episodes_begun"),
@@ -178,19 +178,19 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     ) -> None:
         """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
 
-        A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
-        one for each such episode (fixed episodes get its base). `env.specs` tells them. It may be
-        the name of a shipped one, a TOML file, or a table.
+        A `perturbation` applies to every episode whose spec has none of its own. A schedule draws
+        one for each such episode (fixed episodes get its base), which is then in `env.specs`. Both
+        may be the name of a built-in perturbation, a TOML file, or a table.
 
-        `robot` is a profile's, in the task's outline; None: the twin's own.
+        `robot` is a profile's, with the task's outline; None is the twin's own.
 
         `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
-        `generated:train`: an episode whose spec names none of them is on one that its seed draws.
+        `generated:train`. If an episode's spec names no floor, its seed draws one.
 
-        `nav_command`: the navigation stack's proposal is among the signals, as on a robot whose
-        profile has that input; where the task has no route it is unknown in any case.
+        With `nav_command`, the signals contain the navigation stack's proposal, as on a robot whose
+        profile has that input. In a task without a route the proposal is always unknown.
 
-        Of the drawn episodes `missions_share` are of the ordered `missions`, where there are some.
+        If `missions` are ordered, they are `missions_share` of the drawn episodes.
 
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
@@ -247,7 +247,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
             self.queue.follow(orders, missions_share)
         own: tuple[Table, ...] = ("reward_terms", OBSERVED)
         self.past = {t: Past(self.task, t, num_envs) for t in own if getattr(self.task, t)}
-        self.limits: Limits | None = None  # a limiter in front of whoever drives; None: none
+        self.limits: Limits | None = None  # a limiter that every command passes
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
@@ -262,7 +262,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.episode_condition = np.full(num_envs, "nominal", f"U{max(16, *map(len, KINDS))}")
         self.block = np.full(num_envs, "none", "U16")
         self.perturbation_name = np.full(num_envs, "nominal", object)  # of any length
-        self.perturbation_values = np.full(num_envs, "{}", object)  # JSON, what is not nominal
+        self.perturbation_values = np.full(num_envs, "{}", object)  # JSON of values not nominal
 
     # -- floors ---------------------------------------------------------------------------------
 
@@ -273,21 +273,17 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     # -- episodes -------------------------------------------------------------------------------
 
     def mission_arms(self) -> list[MissionArm]:
-        """Return the arms that drawn episodes can be chosen by, each with its natural share."""
+        """Return the arms that practice can choose among, each with its natural share."""
         return self.queue.arms(self.navigation.planners)
 
     def set_mission_shares(self, shares: Sequence[float]) -> None:
-        """Set the shares of the last `mission_arms`, for episodes that begin from now on.
-
-        Raises:
-            ConfigError: they are not one share an arm.
-        """
+        """Set one share per arm of the last `mission_arms`, for episodes that begin from now on."""
         self.queue.practise(shares)
 
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
-        """Run these episodes, in order, from the next reset on; then episodes drawn as usual.
+        """Run these episodes, in order, from the next reset on; then draw episodes as usual.
 
-        `info["episode_number"]` names them by their place; -1 is an episode beyond their end.
+        `info["episode_number"]` is an episode's index among them, or -1 if it was drawn.
         """
         self.queue.set_fixed(specs)
 
@@ -296,7 +292,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         for env in ids.tolist():
             spec, self.episode_number[env], self.mission_arm[env] = self.queue.next(env)
             self._lay_out(env, spec)
-            if self.episode_number[env] >= 0:  # asked for: how near it comes to people matters
+            if self.episode_number[env] >= 0:  # measure `closest_m` only in fixed episodes
                 self.simulation.traffic.closest_m[env] = np.inf
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
@@ -344,7 +340,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[F32, Info]:
-        """Begin an episode everywhere, or only in `options["reset_mask"]` (N,)."""
+        """Begin an episode in all environments, or only in `options["reset_mask"]` (N,)."""
         super().reset(seed=seed)
         ids = np.arange(self.num_envs)
         mask = (options or {}).get("reset_mask")
@@ -361,7 +357,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         return self.observation.copy(), info_now(self)
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Step one control period. `actions` (N,) index the task's actions, or are (N, 2)."""
+        """Step one control period; `actions` are indices (N,) of the task's, or commands (N, 2)."""
         if not self.signals:
             raise gymnasium.error.ResetNeeded("call env.reset() before env.step()")
         now, sim, task = self.signals, self.simulation, self.task
@@ -419,10 +415,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     def set_block_callback(
         self, callback: Callable[[BodyState], None] | None, period_s: float = 0.02
     ) -> None:
-        """Call back every `period_s` of simulated time within steps, with the true state.
+        """Call `callback` with the true state every `period_s` of simulated time; None: no calls.
 
-        The physics is the same with and without. `period_s` is rounded to whole substeps and
-        must divide .1 s to be evenly spaced. Called before any autoreset of the step.
+        The physics is the same with and without it. `period_s` is rounded to whole substeps, and
+        calls are evenly spaced only if it divides .1 s. They come before the step's autoreset.
         """
         self.simulation.callback = callback
         self.simulation.callback_period_s = period_s
@@ -430,7 +426,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     # -- state ----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a bit-exact continuation needs, and what it must be continued on."""
+        """Return the state for a bit-exact continuation, and the task and floors that it needs."""
         floors = names_and_hashes(self.floors)
         own = {"past": saved(self.past)} if self.past else {}
         return {"task_hash": self.task.hash, "floors": floors, **own, **super().state_dict()}
@@ -439,8 +435,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         """Continue from the state of an environment with the same arguments.
 
         Raises:
-            RunError: it was of another number of environments, another task, or other floors, or is
-                no such state.
+            RunError: the state is from another number of environments, another task or other
+                floors, or is not such a state.
         """
         self.expect_state(state, ("task_hash", "floors", *self.STATE))
         specs = msgspec.convert(state["specs"], list[EpisodeSpec])
@@ -467,7 +463,7 @@ def _bounded(observation: F32) -> F32:
 class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
     """The vector environment with N = 1; `info` holds its values without the leading axis.
 
-    Takes the vector environment's keyword arguments. The one inside is `self.vector`.
+    It takes the vector environment's keyword arguments. The vector environment is `self.vector`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
@@ -498,7 +494,7 @@ class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
         return observation[0], _first(info)
 
     def step(self, action: Any) -> tuple[F32, float, bool, bool, dict[str, Any]]:
-        """Step one control period. `info["signals_before"]` is what `action` was chosen by."""
+        """Step one control period; `action` was chosen from `info["signals_before"]`."""
         before = self.vector.signals
         observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
         info["signals_before"] = before
