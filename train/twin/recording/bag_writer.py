@@ -1,14 +1,14 @@
-"""Recordings as bytes: an MCAP file or a rosbag2 folder, and the messages in them.
+"""Write recordings, as an MCAP file or a rosbag2 folder, and serialise their messages.
 
-Both are written whole or not at all: under a temporary name beside the target, renamed at the
-end, removed when anything (Ctrl-C included) stops the writing. The same messages give the same
+Both are written whole or not at all: under a temporary name beside the target, which is renamed at
+the end, or removed if anything (Ctrl-C included) stops the writing. The same messages give the same
 bytes, wherever and whenever they are written.
 
-rosbags serialises one exemplar of a message; every further message of the same shape differs
-from it only in numbers at fixed places. `MessageLayout` finds those places by CDR's alignment
-rules and writes columns straight into copies of the exemplar's bytes, tens of times faster
-than building and serialising the messages one by one. Messages whose shape changes (a plan, a
-text) go through rosbags one by one.
+rosbags serialises one exemplar of a message. Further messages of the same shape differ from it only
+in numbers at fixed places. `MessageLayout` finds these places by CDR's alignment rules and writes
+columns directly into copies of the exemplar's bytes, tens of times faster than building and
+serialising messages one by one. Messages whose shape changes (texts, markers) go through rosbags
+one by one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from restock.errors import RecordingError
 
 Format = Literal["mcap", "rosbag2"]
 TAGS_RECORD = "tags"  # name of the metadata record of an MCAP file
-CHUNK_BYTES = 2 << 20  # some twenty seconds of one robot: still cheap to seek, and compresses well
+CHUNK_BYTES = 2 << 20  # about twenty seconds of one robot: cheap to seek, and compresses well
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def recording_sink(
 ) -> Iterator[Sink]:
     """Open a sink that becomes `path` if the block ends well, and leaves nothing if it fails.
 
-    `tags` say whose drive it is, in an MCAP file's metadata or a rosbag2 folder's custom_data.
+    `tags` (robot, site, …) go into an MCAP file's metadata or a rosbag2 folder's custom_data.
 
     Raises:
         RecordingError: `path` exists, or its folder cannot be written to.
@@ -99,7 +99,7 @@ def recording_sink(
             remedy="choose another --out",
         ) from error
     try:
-        # The bag's folder gives its database its name, so the temporary one has the final name.
+        # A bag's database is named after its folder, so the temporary folder has the final name.
         partial = scratch / path.name
         sink: Sink = (McapSink if file_format == "mcap" else Rosbag2Sink)(
             partial, topics, tags or {}
@@ -135,7 +135,7 @@ class McapSink:
             self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
         self._writer.start(profile="ros2", library="restock")
-        if tags:  # first, where a file that is cut short has it too
+        if tags:  # first, so that a file that is cut short has them too
             self._writer.add_metadata(TAGS_RECORD, dict(sorted(tags.items())))
         schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -178,7 +178,7 @@ class McapSink:
 class Rosbag2Sink:
     """A rosbag2 folder: metadata.yaml (version 9) and one sqlite3 file with its definitions.
 
-    This storage keeps one time a message, when it was received: `publish_ns` is not kept.
+    This storage keeps only the time at which a message was received, not `publish_ns`.
     """
 
     def __init__(self, path: Path, topics: Sequence[Topic], tags: Mapping[str, str]) -> None:
@@ -210,10 +210,10 @@ class Rosbag2Sink:
 
 
 def _forget_sqlite_version(database: Path) -> None:
-    """Fix the header's "version of the library that wrote last", so that bytes are reproducible.
+    """Set the header's version of the SQLite library to a constant, for reproducible bytes.
 
-    SQLite only shows it to people (https://sqlite.org/fileformat2.html#the_database_header); it
-    would make the same bag differ from one machine to the next.
+    SQLite itself does not use it (https://sqlite.org/fileformat2.html#the_database_header), but
+    because of it the same bag would differ from one machine to the next.
     """
     with database.open("r+b") as stream:
         stream.seek(96)
@@ -261,7 +261,7 @@ def _qos_yaml(topic: Topic) -> str:
     return "\n".join(lines) + "\n"
 
 
-ENCAPSULATION_BYTES = 4  # before the first byte that alignment counts from
+ENCAPSULATION_BYTES = 4  # a header; alignment counts from the byte after it
 _BASIC = {
     "bool": "u1", "byte": "u1", "octet": "u1", "char": "u1", "uint8": "u1", "int8": "i1",
     "uint16": "<u2", "int16": "<i2", "uint32": "<u4", "int32": "<i4", "uint64": "<u8",
@@ -308,8 +308,8 @@ class MessageLayout:
     """The layout of a message: an exemplar's bytes, and the place of every number in them.
 
     Places are named by path: `pose.pose.position.x`, `ranges` (the whole run),
-    `transforms[0].header.stamp` (a time is one place: int64 nanoseconds). When packing, `[]`
-    names that number of every item: `poses[].pose.position.x`.
+    `transforms[0].header.stamp` (a time is one place: int64 nanoseconds). When packing, `[]` stands
+    for every item: `poses[].pose.position.x`.
     """
 
     type_name: str
@@ -398,7 +398,7 @@ def stamp(stamp_ns: int) -> Any:
 
 
 def _walk(message: Any, prefix: str, at: int, places: dict[str, Place]) -> int:
-    """Note the places in a message that starts at or after byte `at`; return its end."""
+    """Add to `places` those of a message that starts at or after byte `at`; return its end."""
     if message.__msgtype__ == _TIME:
         at = _align(at, 4)
         places[prefix.removesuffix(".")] = Place(at, _STAMP, 1)

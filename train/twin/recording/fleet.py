@@ -1,11 +1,11 @@
 """A fleet that drives missions in the twin, several robots at a time, for a recorder.
 
-Missions have conditions and drivers at their shares. They come out in the order they were given,
-each as a `Drive`, however long each took.
+The kinds and drivers of missions are drawn by their shares. Driven missions are returned in the
+order in which they were drawn, however long each took.
 
 A driver is a script of `restock.train.twin.env.drivers`, or any policy that acts on observations.
-Each is tagged with a name, a version and the probability of every action, so that what it drove is
-its own behaviour policy in the store.
+Steps are tagged with their driver's name, version and probability of the action, so that each
+driver is a behaviour policy of its own in the store.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from restock.train.twin.recording.robot_topics import Drive, Motion, Scene
 
 HANDOVER = "handover"  # the fleet: planners, and an operator who takes over from them
 SCRIPTED = (HANDOVER, "planner", "operator", "random")
-# How the fleet is driven: the planner (and its next release, on a few robots), whom an operator
-# helps out, and missions that an operator drives throughout.
+# Shares of drivers in the fleet: the planner, its next release on a few robots (an operator takes
+# over from both), and an operator who drives whole missions.
 FLEET = {"planner 1": 0.70, "planner 2": 0.18, f"operator {Operator.version}": 0.12}
 VERSIONS = {one.name: one.version for one in (PlannerFollower, Operator, RandomPolicy)}
-BLOCK = 20  # missions dealt at a time, so that every condition comes up in a short recording too
+BLOCK = 20  # missions drawn at a time, so that a short recording has every condition, too
 
 PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
-MAX_DRIVEN = 3  # missions for each that was ordered, where some do not meet what they should
+MAX_DRIVEN = 3  # maximum missions driven per ordered one, if some do not meet their kind
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Mission:
     version: str
     handover: bool  # whether the operator takes over when the driver is stuck
     pause_s: float  # before the next mission
-    order: int | None = None  # the one it is of, where missions were ordered
+    order: int | None = None  # index of its order, if missions were ordered
 
 
 def schedule(
@@ -78,7 +78,7 @@ def schedule(
 ) -> Iterator[Mission]:
     """Yield the missions of a recording, endlessly; the same for the same arguments.
 
-    `driver` is `handover` (the fleet) or the name of whoever drives all of them.
+    `driver` is `handover` (the fleet), or the name of a driver for all missions.
     """
     rng = np.random.Generator(np.random.PCG64([seed, 0x6D697373]))
     kinds = _deal(conditions, rng)
@@ -96,10 +96,10 @@ def schedule(
 
 
 class OrderedMissions:
-    """The missions of a file, in rounds until the ordered number met their kind.
+    """The missions of a file, in rounds until the ordered number of missions has met its kind.
 
-    A mission with pallets in an aisle may never pass them. So each round drives what is still
-    owed, shuffled, and at most MAX_DRIVEN times what was ordered.
+    A mission with pallets in an aisle may never pass them. So each round drives the missions that
+    are still owed, shuffled; all rounds together drive at most MAX_DRIVEN times the ordered number.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class OrderedMissions:
         version: str = "1",
     ) -> None:
         self.orders, self._hardware = orders, hardware
-        # Another list is driven with other seeds: its missions are not the ones of the last.
+        # Seeds depend on the file, so that another file gives other missions.
         self._rng = np.random.Generator(np.random.PCG64([seed, zlib.crc32(as_toml(file).encode())]))
         self._drivers = _deal(FLEET, self._rng)
         self._driver, self._version = driver, version
@@ -121,7 +121,7 @@ class OrderedMissions:
         self.observed: Counter[int] = Counter()
 
     def rounds(self) -> Iterator[Iterator[Mission]]:
-        """Yield rounds: drive each to its end, and `note` its missions, before the next."""
+        """Yield rounds. Before the next one, drive all missions of a round and `note` them."""
         while owed := self.owed():
             numbers = np.repeat(list(owed), list(owed.values()))
             yield iter([self._mission(int(number)) for number in self._rng.permutation(numbers)])
@@ -172,14 +172,14 @@ def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbat
 
 
 def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
-    """Yield names at their shares, block by block, carrying over what rounding leaves."""
+    """Yield names by their shares, in shuffled blocks; rounding carries over to the next block."""
     names = [name for name, share in shares.items() if share > 0]
     share = np.array([shares[name] for name in names])
     owed = np.zeros(len(names))
     while True:
         owed += share / share.sum() * BLOCK
         count = np.zeros(len(names), int)
-        for _ in range(BLOCK):  # to whom most is owed; what came early is owed less than nothing
+        for _ in range(BLOCK):  # take the name that is owed most; debts may become negative
             index = int(owed.argmax())
             count[index] += 1
             owed[index] -= 1
@@ -192,7 +192,7 @@ def parse_shares(text: str) -> dict[str, float]:
     """Parse `nominal=0.8,wheel_slip=0.2` to shares; omitted conditions get none.
 
     Raises:
-        ConfigError: no such condition, no number, or nothing above 0.
+        ConfigError: a condition is unknown, a share is not a number of at least 0, or all are 0.
     """
     shares = parse_numbers(text, "--conditions", KINDS)
     for name, share in shares.items():
@@ -209,8 +209,7 @@ def parse_numbers(text: str, flag: str, names: Sequence[str]) -> dict[str, float
     """Parse a flag's `name=number,name=number`.
 
     Raises:
-        ConfigError: a name that is none of `names` or is given twice, or a value that is not a
-            number.
+        ConfigError: a name is not in `names` or is given twice, or a value is not a number.
     """
     numbers: dict[str, float] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
@@ -250,7 +249,7 @@ class ExternalPolicy:
         self.acting_version = np.array([], np.str_)
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
-        """Return actions (N,) and the probabilities (N,) they had.
+        """Return actions (N,) and their probabilities (N,).
 
         Raises:
             ConfigError: epsilon is set for a policy that is itself stochastic.
@@ -278,7 +277,7 @@ class BehaviourPolicies:
 
     Args:
         epsilon: share of random actions of the scripted drivers; None: each one's default.
-        external: drives all missions in place of the scripts.
+        external: a policy that drives all missions instead of the scripts.
     """
 
     def __init__(
@@ -316,7 +315,7 @@ class BehaviourPolicies:
     def _make(self, name: str, version: str, handover: bool) -> BehaviourPolicy:
         if self._external is not None:
             return self._external
-        seed = self._seed * 16 + len(self._drivers)  # every driver draws from its own
+        seed = self._seed * 16 + len(self._drivers)  # another one for every driver
         if name == "random":
             return RandomPolicy(seed=seed)
         if name == "operator":
@@ -332,7 +331,7 @@ MOTION_PERIOD_S = 0.02
 
 @dataclass(frozen=True)
 class DrivenMission:
-    """A driven mission, with its T steps as the twin has them."""
+    """A driven mission, with the twin's own data of its T steps."""
 
     mission: Mission
     drive: Drive
@@ -340,18 +339,18 @@ class DrivenMission:
     action: Ints  # (T,)
     reward: F32  # (T,)
     success: bool
-    terminated: bool  # at its last step; else it was truncated there
+    terminated: bool  # at its last step; False: truncated
     floor: Warehouse
 
 
 @dataclass
 class _Log:
-    """The log of one robot's mission under way."""
+    """The log of one robot's current mission."""
 
-    place: int  # among the missions
+    place: int  # index among the missions
     mission: Mission
     hardware: Perturbation
-    rng: np.random.Generator  # of the scans between ticks
+    rng: np.random.Generator  # for the noise of scans between ticks
     pallets: F64  # (P, 3)
     patches: F64  # (K, 5)
     motion: list[BodyState]  # of all robots
@@ -373,13 +372,13 @@ class Fleet:
     """N robots that drive missions in the twin, under one set of effective parameters.
 
     Args:
-        hardware: those parameters, where a mission names none of its own.
-        layouts: the floors, as `restock.train.twin.floors.floors.open_floors` reads them; a mission
-            that names none is on one that its seed draws.
-        conditions: the kinds of the missions to come (keys), which must fit on the floors.
-        stops: a bump is a protective stop and ends the mission. Else the mission goes on: for
-            an operator who stands by, and drives the robot out.
-        scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
+        hardware: these parameters; a mission may have its own.
+        layouts: the floors, as `restock.train.twin.floors.floors.open_floors` reads them. If a
+            mission names no floor, its seed draws one.
+        conditions: its keys are the kinds of the missions to come, which must fit on the floors.
+        stops: a bump is a protective stop and ends the mission. Otherwise the mission goes on, so
+            that an operator can drive the robot out.
+        scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two ticks.
     """
 
     def __init__(
@@ -404,14 +403,14 @@ class Fleet:
         self.period_s = self.env.task.control_period_s
         self._scans_between = scan_hz * self.period_s > 1
         self._logs: list[_Log | None] = [None] * robots
-        self._motion: list[BodyState] = []  # of the step at hand
-        self._scan: F64 | None = None  # true ranges half-way through it
+        self._motion: list[BodyState] = []  # of the current step
+        self._scan: F64 | None = None  # true ranges half-way through the current step
         self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)
 
     def drive(
         self, missions: Iterator[Mission], policies: BehaviourPolicies
     ) -> Iterator[DrivenMission]:
-        """Drive missions as long as there are more and the caller wants them."""
+        """Drive missions and yield them in their order, until they or the caller stop."""
         env, numbered = self.env, enumerate(missions)
         finished: dict[int, DrivenMission] = {}
         delivered = 0
@@ -446,7 +445,7 @@ class Fleet:
         missions: Iterator[tuple[int, Mission]],
         policies: BehaviourPolicies,
     ) -> None:
-        """Give each of these robots its next mission; one without any drives on unrecorded."""
+        """Give each of these robots its next mission; without one, it drives on unrecorded."""
         env = self.env
         entries = [next(missions, None) for _ in robots]
         idle = EpisodeSpec("nominal", 0)
@@ -493,7 +492,7 @@ class Fleet:
         log.signals.append({name: column[robot] for name, column in signals.items()})
         log.observation.append(env.observation[robot].copy())
         every = max(round(log.hardware.lidar_period_s / self.period_s), 1)
-        if tick % every == 0:  # else the robot keeps the scan before
+        if tick % every == 0:  # otherwise the robot keeps its previous scan
             log.scan_s.append(round(tick * self.period_s, 6))
             log.ranges_m.append(env.sensing.ranges_m[robot].copy())
         traffic = env.simulation.traffic

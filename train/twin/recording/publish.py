@@ -1,15 +1,15 @@
-"""Conversion of a drive to a robot's log messages: rates, stamps, delays and resolution.
+"""Convert a drive to a robot's log messages: rates, timestamps, delays and resolution.
 
-Three times belong to a message. The header's stamp is when the thing was measured; the publish
-time is when the driver sent it; the log time is when the recorder received it. Sensors run on
+A message has three times. The header's timestamp is when the value was measured, the publish time
+is when the sensor's driver sent it, and the log time is when the recorder received it. Sensors have
 their own rates, and one of their samples falls on every control tick (the navigation stack waits
-for the scan, then commands), so that what the policy saw is what the recording says at the tick.
-A command is sent some milliseconds after its tick: the planner has to think. What the navigation
-stack proposes is there before whoever drives decides.
+for the scan, then commands), so the recording has at each tick what the policy saw. A command is
+sent some milliseconds after its tick, because planning takes time. The navigation stack's proposal
+is sent before that.
 
-At a tick a sensor's value is the twin's own measurement; between ticks it is the true motion plus
-noise of the same size. All values then take the resolution of the hardware, which also is what
-lets real recordings compress.
+At a tick, a sensor's value is the twin's own measurement. Between ticks, it is the true motion plus
+noise of the same size. Values then get the resolution of the hardware, which is also why real
+recordings compress well.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from restock.train.twin.recording.robot_topics import Drive, Lidar, Odometer
 
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
-LIDAR_LSB_M = 2.0**-9  # some 2 mm
-PLANNING_S = (0.005, 0.007)  # from a tick to what the navigation stack proposes
-THINKING_S = (0.012, 0.016)  # and to its command; longer than any other topic's delay
+LIDAR_LSB_M = 2.0**-9  # about 2 mm
+PLANNING_S = (0.005, 0.007)  # from a tick to the navigation stack's proposal
+THINKING_S = (0.012, 0.016)  # from a tick to its command; longer than any other topic's delay
 BUMPER_POLL_S = 0.02
 JITTER_S = 4e-4  # of a sensor's timer
 TICK_TOLERANCE_S = 1e-6
@@ -96,14 +96,14 @@ class Rates(Checked, frozen=True):
 
 @dataclass
 class Robot:
-    """The robot that logs: its generator, and the state it carries from mission to mission."""
+    """The recorded robot: its random generator, and the state it keeps between missions."""
 
     rng: np.random.Generator
     lidar: Lidar
     rates: Rates
     odometer: Odometer
     driven_s: float = 0.0
-    _start_ns: int = 0  # of the mission at hand
+    _start_ns: int = 0  # of the current mission
 
     def publish(self, drive: Drive, start_ns: int) -> list[Message]:
         """Return all messages of a mission that starts at `start_ns`, in order of log time."""
@@ -133,7 +133,7 @@ class Robot:
         cell_m: float,
         origin_m: tuple[float, float] = (0.0, 0.0),
     ) -> list[Message]:
-        """Return what is sent when a recording or floor begins: sensor transforms and the map."""
+        """Return the messages that begin a recording or floor: sensor transforms and the map."""
         self._start_ns = start_ns
         at = np.zeros(1)
         return [
@@ -142,14 +142,14 @@ class Robot:
         ]
 
     def _announcements(self, drive: Drive) -> list[Message]:
-        """Return the goal, the plans (on change and about once a second), and who drives."""
+        """Return the goal, the plans (on change and about once a second), and the drivers."""
         sent = self._send("/goal_pose", np.zeros(1), [topics.goal(self._stamp(0.0), *drive.goal_m)])
         end_s = float(drive.tick_s[-1])
         starts = [float(drive.tick_s[tick]) for tick, _ in drive.plans]
         for start_s, until_s, (_, points) in zip(
             starts, [*starts[1:], end_s], drive.plans, strict=True
         ):
-            # Not at `until_s` itself, where the next one comes: it may be a last bit too late.
+            # Exclude `until_s`, when the next plan is sent, even if a time is off by a last bit.
             until_s = max(until_s - TICK_TOLERANCE_S, start_s + TICK_TOLERANCE_S)
             times = np.arange(start_s, until_s, 1 / self.rates.plan)
             messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]
@@ -212,7 +212,7 @@ class Robot:
         """Return /amcl_pose, with the /tf by which the localiser corrects `odom` within `map`."""
         times, tick = self._sample(drive, self.rates.amcl_pose)
         age_s = (drive.signals["stamp_ns"] - drive.signals["pose_stamp_ns"]) * 1e-9
-        if drive.scene.perturbation.localisation_period_s:  # slow: nothing new at other times
+        if drive.scene.perturbation.localisation_period_s:  # publish only new poses
             fresh = (tick >= 0) & (age_s[tick] == 0)
             times, tick = times[fresh], tick[fresh]
         seen = np.stack(
@@ -291,13 +291,13 @@ class Robot:
         return self._send("/diagnostics", times, data)
 
     def _scene(self, drive: Drive) -> list[Message]:
-        """Return the perturbation and markers as they are, and traffic on change, at its rate."""
+        """Return the perturbation and fixed markers once, and traffic on change, at its rate."""
         scene, at, start_ns = drive.scene, np.zeros(1), self._stamp(0.0)
         due = np.diff(np.floor(drive.tick_s * TRAFFIC_HZ + 1e-6), prepend=-1) > 0
         due = due[: len(scene.traffic)]
         ticks = np.flatnonzero(due)
         places = scene.traffic[ticks]
-        # The first clears what the mission before has left.
+        # The first message clears the markers of the previous mission.
         moved = np.ones(len(ticks), np.bool_)
         moved[1:] = (places[1:] != places[:-1]).any(axis=(1, 2))
         ticks, places = ticks[moved], places[moved]
@@ -313,9 +313,9 @@ class Robot:
         ]
 
     def _sample(self, drive: Drive, rate_hz: float) -> tuple[F64, NDArray[np.intp]]:
-        """Return when a sensor measures (n,), and the tick of each sample, -1 between ticks.
+        """Return the times (n,) of a sensor's samples, and the tick of each; -1 between ticks.
 
-        Between ticks its timer jitters.
+        Times between ticks jitter.
         """
         end_s = float(drive.tick_s[-1])
         times = np.arange(int(end_s * rate_hz + 1e-6) + 1) / rate_hz
@@ -374,10 +374,10 @@ def _between(inner: F64, outer: F64) -> F64:
 def send(
     topic: str, measured_ns: Ints, data: Sequence[bytes], rng: np.random.Generator
 ) -> list[Message]:
-    """Return messages measured at these times (n,), with the topic's delays.
+    """Return messages measured at these times (n,), with random delays of the topic.
 
-    Networks are mostly quick and now and then slow, but here never slower than a command waits
-    for its measurements: the latest sensor is there before the command is sent.
+    The network is usually quick and sometimes slow, but never so slow that a measurement arrives
+    after the command of its tick is sent.
     """
     delay = DELAYS[topic]
     spread = 0.8 + 0.4 * rng.random((2, len(data)))

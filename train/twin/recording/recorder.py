@@ -1,8 +1,8 @@
 """`restock twin record`: missions driven by simulated hardware, written as logs.
 
-The stand-in is the twin with other effective parameters than training assumes, so that there is a
-gap between logs and simulator to be found, and physics at half the timestep. Missions are driven,
-published and written one after another: memory does not grow with the recording's length.
+The simulated hardware is the twin with half the timestep and other physical parameters than in
+training, so that there is a gap between logs and simulator to find. Missions are driven, published
+and written one after another, so memory does not grow with the recording's length.
 """
 
 from __future__ import annotations
@@ -78,28 +78,28 @@ NOISELESS = Perturbation(
     gyro_noise_radps=0.0,
     accel_noise_mps2=0.0,
 )
-FIRST_NS = 1_772_438_400_000_000_000  # 2026-03-02, 08:00 UTC: a fixed morning, for the same bytes
-LATEST_START_NS = 7_258_118_400 * 10**9  # 2200: stamps are 64 bits, to 2262
+FIRST_NS = 1_772_438_400_000_000_000  # 2026-03-02, 08:00 UTC: fixed, for reproducible bytes
+LATEST_START_NS = 7_258_118_400 * 10**9  # year 2200: 64-bit timestamps end in 2262
 LIDAR_RANGE_M = (0.05, 25.0)
 MAP_CELL_M = 0.1
 
 
 @dataclass(frozen=True)
 class RecordingPlan:
-    """The settings of a recording. `minutes` or `missions` says when to stop."""
+    """The settings of a recording. Either `minutes` or `missions` ends it."""
 
     format: Format = "mcap"
     minutes: float | None = None
     missions: int | MissionsFile | None = None  # a file's are driven until they met their kinds
     seed: int = 0
     conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
-    policy: str = HANDOVER  # or planner, operator, random, or what `record` is given
-    epsilon: float | None = None  # share of random actions; None: what each driver has of its own
+    policy: str = HANDOVER  # or planner, operator, random, or the policy given to `record`
+    epsilon: float | None = None  # share of random actions; None: each driver's default
     rates: Rates = field(default_factory=Rates)
     hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
     layouts: str = DEFAULT  # floors, as `restock.train.twin.floors.floors.open_floors` reads them
     start_ns: int = FIRST_NS  # when the first mission starts
-    tags: Mapping[str, str] = field(default_factory=dict)  # whose drive it is: robot, site, …
+    tags: Mapping[str, str] = field(default_factory=dict)  # robot, site, …
 
     def __post_init__(self) -> None:
         """Raise ConfigError if the recording would have no end, or nothing in it."""
@@ -133,7 +133,7 @@ class RecordingPlan:
 
     @property
     def kinds(self) -> Mapping[str, float]:
-        """Return the kinds of missions to come, by their shares or numbers."""
+        """Return the shares of missions by kind, or their numbers if missions are ordered."""
         if not isinstance(self.missions, MissionsFile):
             return self.conditions
         amounts: Counter[str] = Counter()
@@ -142,10 +142,11 @@ class RecordingPlan:
         return dict(amounts)
 
     def orders(self) -> list[MissionOrder]:
-        """Return the file's missions that are for this robot, or for any.
+        """Return the file's orders for this robot or for any robot; none without a file.
 
         Raises:
-            ConfigError: they are for other robots, or for some and no tag says which this is.
+            ConfigError: all orders are for other robots, or some are for certain robots and no tag
+                says which robot this is.
         """
         if not isinstance(self.missions, MissionsFile):
             return []
@@ -186,17 +187,17 @@ class RecordingPlan:
 
 @dataclass
 class RecordingSummary:
-    """A summary of what was recorded."""
+    """A summary of a recording. Counts are by kind of mission, unless a comment says otherwise."""
 
     path: Path
     plan: RecordingPlan
-    missions: Counter[str] = field(default_factory=Counter)  # by kind
+    missions: Counter[str] = field(default_factory=Counter)
     succeeded: Counter[str] = field(default_factory=Counter)
-    observed: Counter[str] = field(default_factory=Counter)  # those that truly met their kind
+    observed: Counter[str] = field(default_factory=Counter)  # missions that truly met their kind
     steps: Counter[str] = field(default_factory=Counter)  # by true condition
-    policies: Counter[str] = field(default_factory=Counter)  # steps
+    policies: Counter[str] = field(default_factory=Counter)  # steps by driver
     handovers: int = 0
-    topics: Counter[str] = field(default_factory=Counter)  # messages
+    topics: Counter[str] = field(default_factory=Counter)  # messages by topic
     minutes: float = 0.0
     work_s: float = 0.0
 
@@ -233,11 +234,11 @@ def record(
 ) -> RecordingSummary:
     """Drive and write a recording; `on_mission(1, minutes)` is called after each mission.
 
-    A `policy` drives in place of the script that the plan names: a trained one, or whatever of your
-    own has a `name`, a `version` and `act(env, observation)`.
+    A `policy` drives instead of the script that the plan names: a trained one, or any object with a
+    `name`, a `version` and `act(env, observation)`.
 
     Raises:
-        RecordingError: there is something at `path`, or its folder cannot be written to.
+        RecordingError: `path` exists, or its folder cannot be written to.
         ConfigError: the plan names no script, and no policy was given.
     """
     begun, path = time.perf_counter(), Path(path)
@@ -287,7 +288,7 @@ def record(
     with recording_sink(path, plan.format, TOPICS, plan.tags) as sink:
         floor: Warehouse | None = None
         for driven in _drive(fleet, missions, drivers):
-            if driven.floor is not floor:  # the map comes once, and again on another floor
+            if driven.floor is not floor:  # send the map once, and again on another floor
                 floor = driven.floor
                 racks = ~cells_of(floor, MAP_CELL_M).T
                 occupied = np.pad(racks, 1, constant_values=True)  # one cell of wall around
@@ -356,7 +357,7 @@ def parse_rates(text: str) -> Rates:
     """Parse `odom=20,scan=5` to rates; omitted topics keep their default.
 
     Raises:
-        ConfigError: no such topic, or a rate that it cannot have.
+        ConfigError: a topic is unknown, or a rate is out of range.
     """
     rates = parse_numbers(text, "--rates", [field.name for field in msgspec.structs.fields(Rates)])
     return typed(rates, Rates, where="--rates")

@@ -1,14 +1,15 @@
-"""A driven mission, and the topics that the recorded robot makes of it.
+"""A driven mission, and the topics that the recorded robot publishes about it.
 
-They are the topics the `warehouse_amr` profile reads, named and framed as a Nav2 robot names
-them (REP 105: map > odom > base_link), so that Foxglove and RViz show a recording as it is.
-Every packer takes columns of (n,) values and stamps of (n,) int64 nanoseconds.
+They are the topics that the `warehouse_amr` profile reads, with the names and frames of a Nav2
+robot (REP 105: map > odom > base_link), so that Foxglove and RViz show a recording without
+configuration. Every function that packs messages takes columns of (n,) values and timestamps of
+(n,) int64 nanoseconds.
 
 A robot's own topics cannot show why it stopped. Those under `/ground_truth/` can, and no policy may
 see them: pallets, patches, people, forklifts and the goal as `visualization_msgs/MarkerArray`,
-which Foxglove and RViz draw in the `map` frame, and the perturbation in force as JSON. Every array
-begins with a marker that deletes all before it, so that each message is the whole scene: a viewer
-that jumps to any time draws from the last message alone.
+which Foxglove and RViz draw in the `map` frame, and the perturbation as JSON. Every array begins
+with a marker that deletes all earlier ones, so each message is the whole scene: a viewer that jumps
+to any time needs only the last message.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Lidar:
 
 @dataclass(frozen=True)
 class Motion:
-    """The true motion, at every physics step of the mission (M of them, the start included)."""
+    """The true motion, sampled at M times of the mission, the start included."""
 
     time_s: F64  # (M,) from the start of the mission
     pose: F64  # (M, 3) x_m, y_m, yaw_rad (not wrapped) in the map
@@ -66,7 +67,7 @@ class Motion:
     wheel_rate_radps: F64  # (M, 2)
     yaw_rate_radps: F64  # (M,)
     accel_mps2: F64  # (M, 2) of the body, forward and left
-    bumped: Bools  # (M,) the bumper touched something
+    bumped: Bools  # (M,) the bumper touched something since the previous sample
 
     def at(self, values: F64, time_s: F64) -> F64:
         """Return a column, (M,) or (M, 2), interpolated at times (n,)."""
@@ -80,8 +81,8 @@ class Motion:
 class Scene:
     """The obstacles, patches and traffic of one mission of T steps."""
 
-    pallets: F64  # (P, 3) x_m, y_m, yaw_rad; parked off the floor where there is none
-    patches: F64  # (K, 5) x_m, y_m, half sizes, friction; no size where there is none
+    pallets: F64  # (P, 3) x_m, y_m, yaw_rad; unused pallets are parked off the floor
+    patches: F64  # (K, 5) x_m, y_m, half sizes, friction; the size of unused patches is 0
     traffic: F64  # (T + 1, A, 3) x_m, y_m, yaw_rad, the people first; parked while out of sight
     perturbation: Perturbation
     goal_radius_m: float
@@ -100,22 +101,22 @@ class Drive:
     tick_s: F64  # (T + 1,) from the start of the mission
     signals: Signals  # each (T + 1, …): what the policy saw
     scan_s: F64  # (K,) when the lidar scanned; the first tick is among them
-    ranges_m: F64  # (K, B) as measured; inf where nothing came back
+    ranges_m: F64  # (K, B) as measured; inf if nothing came back
     command: F64  # (T, 2) speed_mps, yaw_rate_radps
     true_condition: list[str]  # T
     true_exposure: list[str]  # T
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
-    plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
+    plans: list[tuple[int, F64]]  # (tick from which the plan holds, (P, 2) points)
     scene: Scene
 
 
 @dataclass
 class Odometer:
-    """The pose in `odom`, from the encoders alone."""
+    """Wheel odometry: the pose in `odom`, from the encoders alone."""
 
-    wheel_radius_m: float  # as the odometry believes it
+    wheel_radius_m: float  # that the odometry assumes
     track_m: float
-    pose: F64 = field(default_factory=lambda: np.zeros(3))  # x, y, yaw where the robot stands
+    pose: F64 = field(default_factory=lambda: np.zeros(3))  # x, y, yaw as the mission starts
     wheel_angle_rad: F64 = field(default_factory=lambda: np.zeros(2))
 
     def dead_reckoning(self, motion: Motion) -> F64:
@@ -143,7 +144,7 @@ class Odometer:
         return speed, turn
 
     def wheel_angles(self, motion: Motion, time_s: F64) -> F64:
-        """Return what the encoders read at these times, (n, 2)."""
+        """Return the encoders' readings at these times, (n, 2)."""
         angle = self.wheel_angle_rad + motion.at(motion.wheel_angle_rad, time_s)
         return np.floor(angle / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
 
@@ -229,7 +230,7 @@ _TWIST, _BOOL = Exemplar("geometry_msgs/msg/Twist"), Exemplar("std_msgs/msg/Bool
 def odometry(
     stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
 ) -> list[bytes]:
-    """Return dead reckoning in `odom`, twist in `base_link`."""
+    """Return odometry messages: the pose in `odom`, the twist in `base_link`."""
     return _ODOMETRY.pack(
         {
             "header.stamp": stamp_ns,
@@ -243,7 +244,7 @@ def odometry(
 
 
 def imu(stamp_ns: Ints, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
-    """Return rates and accelerations; no orientation (covariance[0] = -1, by sensor_msgs/Imu)."""
+    """Return IMU messages without orientation (covariance[0] = -1, as in sensor_msgs/Imu)."""
     return _IMU.pack(
         {
             "header.stamp": stamp_ns,
@@ -255,7 +256,7 @@ def imu(stamp_ns: Ints, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F6
 
 
 def joint_states(stamp_ns: Ints, angle_rad: F64, rate_radps: F64) -> list[bytes]:
-    """Return wheel angles and rates, each (n, 2): left, right."""
+    """Return joint states with wheel angles and rates, each (n, 2): left, right."""
     return _JOINTS.pack({"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps})
 
 
@@ -296,7 +297,7 @@ def localised_poses(stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> list[by
 def transforms(
     stamp_ns: Ints, map_to_odom: tuple[F64, F64, F64], odom_to_base: tuple[F64, F64, F64]
 ) -> list[bytes]:
-    """Return map > odom > base_link, each (x, y, yaw) of (n,) values."""
+    """Return transforms map > odom > base_link; each is (x, y, yaw) of (n,) values."""
     columns: dict[str, NDArray[Any]] = {}
     for index, (x_m, y_m, yaw_rad) in enumerate((map_to_odom, odom_to_base)):
         at = f"transforms[{index}]"
@@ -310,7 +311,7 @@ def transforms(
 
 
 def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -> bytes:
-    """Return the places of the lidar and the IMU on the robot."""
+    """Return the transforms of the lidar and the IMU on the robot."""
     return serialise(
         build(
             "tf2_msgs/msg/TFMessage",
@@ -338,7 +339,7 @@ def text(content: str) -> bytes:
 
 
 def behaviour_policy(name: str, version: str, probability: float) -> bytes:
-    """Return who drives from here on, and the probability of each of its commands."""
+    """Return the policy that drives from here on, and the probability of each of its commands."""
     content = {"policy": name, "version": version, "probability": round(probability, 4)}
     return text(json.dumps(content))
 
@@ -382,7 +383,7 @@ def occupancy_map(
     resolution_m: float,
     origin_m: tuple[float, float] = (0.0, 0.0),
 ) -> bytes:
-    """Return the known map of cells (rows north, columns east from `origin_m`)."""
+    """Return the known map; cells are rows to the north and columns to the east of `origin_m`."""
     return serialise(
         build(
             "nav_msgs/msg/OccupancyGrid",
@@ -425,7 +426,7 @@ def _orientation(path: str, yaw_rad: F64) -> dict[str, F64]:
     return {f"{path}.z": np.sin(yaw_rad / 2), f"{path}.w": np.cos(yaw_rad / 2)}
 
 
-# The colours of the drawn map, as shares of 1, and opacity.
+# Red, green, blue and opacity, each 0 to 1: the colours of `restock.train.twin.env.render`.
 GOAL, PALLET, PATCH, ROBOT = (
     (0.12, 0.60, 0.25, 0.45),
     (0.69, 0.51, 0.31, 1.0),
