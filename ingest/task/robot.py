@@ -1,22 +1,22 @@
-"""The robot: its `[robot]` table, and the limiter of what it may be commanded.
+"""The robot's `[robot]` table, and the limiter of its commands.
 
-Its outline, and where its lidar is on it, stand in `[task.body]`, which logs need too; the table
-has what only the twin needs. A value that is left out is unknown: the twin takes one from the
-outline's size (`restock.train.twin.physics.robot_model`), and says so. `[robot.origin]` says where
-each value is from.
+The outline and the lidar's position are in `[task.body]`, as ingest needs them too; `[robot]` holds
+what only the twin needs. A value that is left out is unknown: the twin derives it from the
+outline's size (`restock.train.twin.physics.robot_model`) and reports that it did. `[robot.origin]`
+records the source of each value.
 
-The limiter stands in front of whatever drives, as Nav2's collision monitor does, for robot and twin
-alike. It only ever takes speed away:
+The limiter filters the commands of any driver, as Nav2's collision monitor does, on the robot and
+in the twin. It only ever reduces speed, by these rules:
 
-- `unknown`: an input is stale or not a number: stop;
-- `stop`, `slow`: along the arc that the command drives, the outline must be able to come to a stand
-  `stop_m` short of the first lidar return, after `reaction_s` at the speed that is left;
-- `speed`, `acceleration`: beyond what the robot may do. Braking is never limited.
+- `unknown`: an input is stale or not a number, so the robot stops;
+- `stop`, `slow`: on the arc of the command, the outline must be able to stop `stop_m` short of the
+  first lidar return, after `reaction_s` at the reduced speed;
+- `speed`, `acceleration`: the command exceeds the robot's limits. Braking is never limited.
 
-A command is slowed along its own arc: speed and yaw rate by one factor, so that slowing does not
-steer. Returns are the nearest of each sector, at its middle bearing. What is behind a return is not
-seen, and counts as occupied; what moves is taken to stand still. A robot without a lidar sees
-nothing: of it only `unknown`, `speed` and `acceleration` hold.
+Slowing scales speed and yaw rate by one factor, so that the robot stays on the arc of the command.
+The limiter uses the nearest return of each sector, at the sector's middle bearing. Space behind a
+return counts as occupied; moving things are assumed to stand still. For a robot without a lidar,
+only `unknown`, `speed` and `acceleration` apply.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ from restock.ingest.task.task import Body, Task
 from restock.toml import Checked
 
 Drive = Literal["differential", "skid_steer", "omnidirectional", "ackermann"]
-# Where a value is from: written by hand, a recording's description, a URDF file, a fit of the twin,
-# what logs show, or the outline's size.
+# Source of a value: written by hand, a recording's description, a URDF file, a fit of the twin,
+# estimates from logs, or the outline's size.
 Origin = Literal["profile", "robot_description", "urdf", "fit", "logs", "default"]
 Metres = Annotated[float, Meta(gt=0, le=10)]
 Limit = Annotated[float, Meta(gt=0, le=100)]
-OUTLINE = "outline"  # in [robot.origin]: of [task.body]
-USUAL_STEERING_RAD = 0.6  # of a robot that steers, where nothing says
+OUTLINE = "outline"  # key in [robot.origin] for the outline in [task.body]
+USUAL_STEERING_RAD = 0.6  # default of max_steering_rad
 
 
 class Lidar(Checked, frozen=True):
-    """The `[robot.lidar]` of a profile: its beams, in the lidar's own frame.
+    """The `[robot.lidar]` of a profile: height and beams, in the lidar's own frame.
 
-    Where it is ahead of the outline's middle, and how it is turned, stand in `[task.body]`.
+    Its position on the outline and its yaw are in `[task.body]`.
     """
 
     z_m: Annotated[float, Meta(gt=0, le=5)] | None = None  # height above the floor
     beams: Annotated[int, Meta(ge=4, le=720)] | None = None  # evenly spaced, from angle_min_rad on
     angle_min_rad: Annotated[float, Meta(ge=-7, le=7)] = -math.pi
-    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # full circle: less by one beam
+    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # full circle: no beam at the end
 
     def check(self) -> None:
         if not 0 < self.angle_max_rad - self.angle_min_rad <= 2 * math.pi + 1e-3:
@@ -67,14 +67,14 @@ class Lidar(Checked, frozen=True):
 
 
 class Robot(Checked, frozen=True):
-    """The `[robot]` of a profile. None: unknown."""
+    """The `[robot]` of a profile; None is unknown."""
 
     drive: Drive = "differential"
     wheel_radius_m: Metres | None = None
-    track_m: Metres | None = None  # distance of left and right wheels' contact points
-    wheelbase_m: Metres | None = None  # distance of the axles, if there are two
-    axle_x_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # x of the axle (of two: their middle)
-    # ahead of the outline's middle: poses are the axle's
+    track_m: Metres | None = None  # distance between left and right wheels' contact points
+    wheelbase_m: Metres | None = None  # distance between the axles, if there are two
+    # x of the axle (or the middle of two), ahead of the outline's middle; poses are the axle's.
+    axle_x_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0
     mass_kg: Annotated[float, Meta(gt=0, le=5000)] | None = None  # total, with wheels
     height_m: Metres | None = None
     casters_m: tuple[tuple[float, float], ...] | None = None  # x ahead of the axle, y to the left
@@ -82,12 +82,12 @@ class Robot(Checked, frozen=True):
     max_yaw_rate_radps: Limit | None = None
     max_accel_mps2: Limit | None = None
     max_yaw_accel_radps2: Limit | None = None
-    # Of a robot that steers (ackermann): the angle of the wheel that would stand in the middle of
-    # its front axle, to either side, and how fast it changes.
+    # For ackermann: largest angle, to either side, of a virtual wheel in the middle of the front
+    # axle, and how fast the angle changes.
     max_steering_rad: Annotated[float, Meta(gt=0.01, le=1.4)] | None = None
     max_steering_rate_radps: Limit | None = None
-    # How far the driven wheels are apart for the controller and its odometry, by the track: a skid-
-    # steer robot turns less than its wheels say. None: what the twin's own robot does.
+    # Wheel separation that controller and odometry assume, divided by the track: a skid-steer robot
+    # turns less than its wheels. None: the twin's own value.
     track_ratio: Annotated[float, Meta(ge=0.5, le=10)] | None = None
     lidar: Lidar = Lidar()
     origin: dict[str, Origin] = msgspec.field(default_factory=dict)
@@ -107,18 +107,18 @@ class Robot(Checked, frozen=True):
 
     @property
     def outline_guessed(self) -> bool:
-        """Return whether nobody measured the outline."""
+        """Return whether the outline is a guess that nobody measured."""
         return self.origin.get(OUTLINE) == "default"
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Return the radius of the pose's circle at full steering; 0 if it turns on the spot."""
+        """Return the radius of the pose's circle at full steering; 0 if it can turn in place."""
         if self.drive != "ackermann" or self.wheelbase_m is None:
             return 0.0
         return self.wheelbase_m / math.tan(self.max_steering_rad or USUAL_STEERING_RAD)
 
     def origin_of(self, name: str) -> Origin:
-        """Return the source of a value, by its key, such as `mass_kg` or `lidar.beams`."""
+        """Return the source of the value of a key, such as `mass_kg` or `lidar.beams`."""
         if name in self.origin:
             return self.origin[name]
         value = getattr(self.lidar, name[6:]) if name.startswith("lidar.") else getattr(self, name)
@@ -126,7 +126,7 @@ class Robot(Checked, frozen=True):
 
 
 def beyond_limits(robot: Robot, actions: tuple[tuple[float, float], ...]) -> str | None:
-    """Describe the first action (m/s, rad/s) that this robot cannot drive."""
+    """Describe the first action (m/s, rad/s) that is too fast for this robot; None if none is."""
     for speed, turn in actions:
         for value, most, name, unit in (
             (speed, robot.max_speed_mps, "max_speed_mps", "m/s"),
@@ -166,21 +166,21 @@ def _beyond_steering(robot: Robot, actions: tuple[tuple[float, float], ...]) -> 
     return None
 
 
-# Which rule held, by its number: the strongest of those that did.
+# The rules by number, weakest first; a command reports the strongest rule that limited it.
 RULES = ("none", "speed", "acceleration", "slow", "stop", "unknown")
 NONE, SPEED, ACCELERATION, SLOW, STOP, UNKNOWN = range(6)
-STANDSTILL_S = 1.0  # from the fastest action, where nothing says how the robot brakes
-CREEP_MPS = 0.02  # of the outline's fastest point: slower than that is a stop
-_STEP_M = 0.025  # of the outline's fastest point along the arc
+STANDSTILL_S = 1.0  # time to brake from the fastest action, if no braking limit is known
+CREEP_MPS = 0.02  # speed of the outline's fastest point below which the command is a stop
+_STEP_M = 0.025  # distance of the outline's fastest point between two places checked on the arc
 _TOUCH_M = 1e-6
 
 
 class Limiter(Checked, frozen=True):
-    """The `[limiter]` of a profile. None: by its outline, its actions and its control period."""
+    """The `[limiter]` of a profile; None is derived from outline, actions and control period."""
 
-    stop_m: Annotated[float, Meta(ge=0, le=10)] | None = None  # to keep; None: .2 of the width
+    stop_m: Annotated[float, Meta(ge=0, le=10)] | None = None  # room to keep; None: .2 of the width
     reaction_s: Annotated[float, Meta(ge=0, le=5)] | None = None  # None: two control periods
-    brake_mps2: Limit | None = None  # None: half of robot.max_accel_mps2, or max. to 0 in 1 s
+    brake_mps2: Limit | None = None  # None: robot.max_accel_mps2 / 2, or top speed to 0 in 1 s
     brake_radps2: Limit | None = None  # None: likewise for the yaw rate
     max_speed_mps: Limit | None = None  # None: robot.max_speed_mps, or the fastest action
     max_yaw_rate_radps: Limit | None = None
@@ -190,7 +190,7 @@ class Limiter(Checked, frozen=True):
 
 @dataclass(frozen=True)
 class Limits:
-    """A limiter with every value known."""
+    """A limiter's values, with all defaults filled in."""
 
     stop_m: float
     reaction_s: float
@@ -199,12 +199,12 @@ class Limits:
     accel: tuple[float, float]  # m/s2, rad/s2; inf: no limit
     period_s: float
     body: Body
-    axle_x_m: float  # of what the robot turns about, ahead of the outline's middle
+    axle_x_m: float  # turning point ahead of the outline's middle
     sectors: int
 
     @classmethod
     def of(cls, task: Task, robot: Robot | None = None, given: Limiter | None = None) -> Limits:
-        """Return a robot's limits: what is `given`, and the rest from its task and `[robot]`."""
+        """Build a robot's limits from `given`, and defaults from its task and `[robot]`."""
         given, robot = given or Limiter(), robot or Robot()
         largest = np.abs(np.asarray(task.actions)).max(axis=0).tolist()
         accel = robot.max_accel_mps2, robot.max_yaw_accel_radps2
@@ -220,7 +220,7 @@ class Limits:
         return cls(
             stop_m=0.2 * task.body.width_m if given.stop_m is None else given.stop_m,
             reaction_s=2 * period_s if given.reaction_s is None else given.reaction_s,
-            brake=(max(brake[0], 1e-3), max(brake[1], 1e-3)),  # actions may all be turns, or none
+            brake=(max(brake[0], 1e-3), max(brake[1], 1e-3)),  # 0 if no action drives, or turns
             fastest=fastest,
             accel=(
                 given.max_accel_mps2 or accel[0] or np.inf,
@@ -234,7 +234,7 @@ class Limits:
 
     @property
     def hash(self) -> str:
-        """Return 8 hex digits that name the limits."""
+        """Return a hash of the limits, 8 hex digits."""
         return hashlib.blake2b(msgspec.json.encode(self), digest_size=4).hexdigest()
 
     @property
@@ -245,7 +245,7 @@ class Limits:
 
     @property
     def way_m(self) -> float:
-        """Return how far it looks along an arc, as the outline's fastest point drives."""
+        """Return the distance checked along an arc, measured at the outline's fastest point."""
         fast = self.fastest[0] + self.fastest[1] * self.reach_m
         stand_s = max(self.fastest[0] / self.brake[0], self.fastest[1] / self.brake[1])
         return self.stop_m + fast * (self.reaction_s + stand_s / 2)
@@ -256,7 +256,7 @@ class Limited:
     """Allowed commands, and the rule that limited each."""
 
     command: F64  # (N, 2): speed m/s, yaw rate rad/s
-    rule: Ints  # (N,) of RULES
+    rule: Ints  # (N,) indices into RULES
 
     @property
     def intervened(self) -> Bools:
@@ -267,16 +267,16 @@ class Limited:
 def limit(
     limits: Limits, proposed: F64, clearance_m: F64, previous: F64, unknown: Bools | None = None
 ) -> Limited:
-    """Limit the proposed commands to what may be driven.
+    """Limit the proposed commands.
 
-    No speed and no yaw rate grows or changes its sign by it. The nearer something is, the slower;
-    what was allowed is allowed again as it is.
+    Limiting never increases a speed or yaw rate, nor changes its sign. The nearer a return, the
+    slower the command. Limiting an allowed command again leaves it unchanged.
 
     Args:
         proposed: (N, 2) speed in m/s and yaw rate in rad/s.
         clearance_m: (N, K) the signal `sector_clearance_m`; K is 0 without a lidar.
         previous: (N, 2) the commands in force until now.
-        unknown: (N,) where an input cannot be relied on; None: nowhere.
+        unknown: (N,) whether an input of the robot is unreliable; None: all are reliable.
     """
     reported = np.isfinite(np.concatenate([proposed, previous], axis=1))  # (N, 4)
     blind: Bools = ~reported.all(axis=1)
@@ -288,7 +288,7 @@ def limit(
 
     within = np.clip(command, -np.array(limits.fastest), limits.fastest)
     command, rule = _lower(command, within, rule, SPEED)
-    before = np.where(blind[:, None], 0.0, previous) * np.sign(command)  # along what is proposed
+    before = np.where(blind[:, None], 0.0, previous) * np.sign(command)  # in proposed direction
     most = np.maximum(before + np.array(limits.accel) * limits.period_s, 0.0)
     command, rule = _lower(command, np.clip(command, -most, most), rule, ACCELERATION)
 
@@ -304,7 +304,7 @@ def _lower(command: F64, allowed: F64, rule: Ints, by: int) -> tuple[F64, Ints]:
 
 
 def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
-    """Return the share (N,) of each command at which the robot can stop in time."""
+    """Return the factor (N,) by which to scale each command so that the robot can stop in time."""
     factor = np.ones(len(command))
     if not limits.sectors:
         return factor
@@ -321,20 +321,20 @@ def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
     reaction = limits.reaction_s
     f = 2 * room_s / (reaction + np.sqrt(reaction**2 + 2 * stand_s * room_s) + 1e-12)
     f = np.minimum(f, 1.0)
-    f[f > 1 - 1e-6] = 1.0  # what was slowed once is not slowed again by a rounding error
+    f[f > 1 - 1e-6] = 1.0  # a rounding error must not slow an allowed command again
     f[(f < 1) & (f * rate < CREEP_MPS)] = 0.0
     factor[ids] = f
     return factor
 
 
 def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
-    """Return how far (N,) the outline's fastest point may go until the outline meets a return, m.
+    """Return how far (N,) the outline's fastest point can go until the outline meets a return, m.
 
-    At most `limits.way_m`, in steps of 2.5 cm. A return is met where the outline, from here to
-    there, reaches farther along its bearing than it is: what lies behind it counts as occupied.
+    At most `limits.way_m`, in steps of 2.5 cm. The outline meets a return if, anywhere on the way,
+    it reaches farther along the return's bearing: space behind a return counts as occupied.
 
     Args:
-        direction: (N, 2) m and rad for each metre of that point.
+        direction: (N, 2) m ahead and rad of turn per metre of that point.
         clearance_m: (N, K).
     """
     free = np.zeros(len(direction))
@@ -353,14 +353,14 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
 def _swept(limits: Limits, ahead: float, turn: float) -> F64:
     """Return the clearance (M, K) that the outline needs in each sector, at each step of an arc.
 
-    `ahead` (m) and `turn` (rad) are for each metre of the outline's fastest point.
+    `ahead` (m) and `turn` (rad) are per metre that the outline's fastest point travels.
     """
     body, count = limits.body, limits.sectors
     bearing: F64 = (np.arange(count, dtype=np.float64) + 0.5) * (2 * np.pi / count) - np.pi
     way_m = np.arange(0.0, limits.way_m + _STEP_M, _STEP_M)
     turned = turn * way_m
-    x, y = ahead * way_m * _sinc(turned), ahead * way_m * _cosc(turned)  # of what it turns about
-    # The lidar of now, and its beams, as the outline sees them from there.
+    x, y = ahead * way_m * _sinc(turned), ahead * way_m * _cosc(turned)  # of the turning point
+    # The lidar's position and beams at the start, in the frame of the outline at each step.
     lidar_x, cos, sin = body.lidar_x_m - limits.axle_x_m, np.cos(turned), np.sin(turned)
     from_x = (cos * (lidar_x - x) - sin * y + limits.axle_x_m)[:, None]
     from_y = (-sin * (lidar_x - x) - cos * y)[:, None]

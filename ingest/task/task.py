@@ -1,13 +1,13 @@
-"""The signals, and the task: from them to observation, discrete action, reward and termination.
+"""Signals, and the task that maps them to observation, discrete action, reward and termination.
 
-Signals are the named columns, with units, that logs and the twin both fill: a profile says how a
-robot's topics do, the twin fills them from MuJoCo. Everything after this point (task, conditions,
+Signals are named columns with units that logs and the twin both fill. A profile maps a robot's
+topics to signals; the twin computes them from MuJoCo. Everything downstream (task, conditions,
 store) sees only signals, and so cannot tell a log from a simulation.
 
 Every function is pure and vectorised over its leading axis: the steps of a recording at ingest,
-the environments of a step in the twin. `now` holds the signals at time t, `before` those of the
-step before (the same as `now` at the start of an episode), `after` those at t + 1. Nothing that
-makes an observation sees `after`; reward and termination are what happened in [t, t + 1).
+the environments of a step in the twin. `now` holds the signals at time t, `before` those at t - 1
+(the same as `now` at the start of an episode), `after` those at t + 1. Observations never depend on
+`after`; reward and termination describe what happened in [t, t + 1).
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Signal:
     dtype: str = "float64"
     per_sector: bool = False  # shape (sectors,) instead of ()
     stored: bool = True  # kept as a column of the transition table
-    optional: bool = False  # NaN where it is not known; null in the table
-    lidar: bool = False  # seen by it alone: not known of a robot without one
+    optional: bool = False  # may be unknown: NaN here, null in the table
+    lidar: bool = False  # measured by the lidar alone: unknown for a robot without one
 
 
 def _of_lidar(name: str, meaning: str) -> Signal:
@@ -76,18 +76,18 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("localised_lateral_mps", "sideways speed (left) from the last two localised poses"),
     _of_lidar(
         "came_nearer_m",
-        "how much nearer something within 2 m is than at the step before and in the last second,"
-        " without the robot's own motion; 0: nothing",
+        "how much nearer something within 2 m is than at every step of the last second, without"
+        " the robot's own motion; 0: nothing came nearer",
     ),
     _of_lidar(
         "plan_return_m",
         "distance along the plan to the first lidar return within half the body's width of it;"
-        " range_max_m: none",
+        " range_max_m if there is none",
     ),
     _of_lidar(
         "plan_gap_m",
-        "distance from the plan just ahead (1.4 of near_m) to the nearest lidar return;"
-        " range_max_m: none",
+        "distance from the plan just ahead (its first 1.4 * near_m) to the nearest lidar return;"
+        " range_max_m if there is none",
     ),
     Signal("bumped", "the bumper was pressed since the step before", "bool"),
     Signal("command_speed_mps", "commanded forward speed in force until the next step"),
@@ -96,17 +96,17 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("nav_yaw_rate_radps", "yaw rate that navigation proposes, or unknown", optional=True),
 )
 
-# Beside them, (K,) per step and not stored, if the task asks for K tracks (NaN: fewer are tracked):
-# places in the body frame, ground velocity along the body's axes, seconds since first seen.
+# Extra signals of a task with K tracks, (K,) per step and not stored; NaN if fewer are tracked:
+# positions in the body frame, ground velocity along the body's axes, seconds since first seen.
 TRACK_SIGNALS = ("track_x_m", "track_y_m", "track_vx_mps", "track_vy_mps", "track_age_s")
 
-OBSERVED: Final = "observed"  # beside them: entries of the task's own, of `task_sql.py`
-OWN_LIMIT = 20.0  # of such an entry, either way
+OBSERVED: Final = "observed"  # key of the task's own observation entries, see `task_sql.py`
+OWN_LIMIT = 20.0  # own entries are clipped to +- this
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
-OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # rest on it
-PLAN_SIGNALS = frozenset({"plan_return_m", "plan_gap_m"})  # what stands on the plan
+OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # depend on it
+PLAN_SIGNALS = frozenset({"plan_return_m", "plan_gap_m"})  # show obstacles on the plan
 LIDAR_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.lidar)
 
 
@@ -115,8 +115,8 @@ def localised_velocity(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return forward and lateral speed (m/s) from two localised poses, in the body frame of `now`.
 
-    Where no new pose has arrived since the step before there is no evidence of motion beyond
-    the wheels', and the wheel speed is returned (so that it never looks like slip).
+    If no new pose has arrived since the step before, the wheels are the only evidence of motion, so
+    the wheel speed is returned: a missing pose must not look like slip.
     """
     elapsed_s = (now["pose_stamp_ns"] - before["pose_stamp_ns"]) * 1e-9
     fresh = elapsed_s > 1e-6
@@ -142,7 +142,7 @@ def yaw_of(
 ) -> NDArray[np.float64]:
     """Return the yaw of quaternions (N,) in (-pi, pi], REP 103: about z, counter-clockwise.
 
-    NaN where one has no length: it was not filled in. Those of other lengths are normalised.
+    Quaternions are normalised. One of length 0 was not filled in: its yaw is NaN.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # NaN stays NaN
         length = np.sqrt(x * x + y * y + z * z + w * w)
@@ -153,19 +153,19 @@ def yaw_of(
 
 
 class Noise(Checked, frozen=True):
-    """The `[noise]` of a profile: what the sensors' readings vary by, for probabilities.
+    """The `[noise]` of a profile: standard deviations of the sensors, for probabilities.
 
-    Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
+    The SQL of conditions names them `lidar_noise_m`, and so on.
     """
 
-    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # standard deviation of a range
+    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # of a range
     localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the distance between two poses, per axis
     wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the wheel speed
     gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # of the yaw rate, including bias
 
     @property
     def constants(self) -> dict[str, float]:
-        """Return each by the name that SQL has for it."""
+        """Return the values by their names in SQL: `lidar_m` is `lidar_noise_m` there."""
         named = msgspec.structs.asdict(self)
         return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
 
@@ -175,20 +175,20 @@ class Body(Checked, frozen=True):
 
     length_m: Annotated[float, Meta(gt=0)]
     width_m: Annotated[float, Meta(gt=0)]
-    lidar_x_m: float = 0.0  # of the lidar, ahead of the outline's centre
+    lidar_x_m: float = 0.0  # position of the lidar ahead of the outline's centre
     lidar_yaw_rad: float = 0.0  # angle of the scan's zero to the robot's forward axis
 
 
-# How observation and reward are computed. Raised when that changes, so that rows made by
-# different code are never mixed unseen.
+# Version of the code that computes observation and reward. Raise it when their values change, so
+# that rows made by different code are never mixed unnoticed.
 TASK_CODE_VERSION = 2
 
 MAX_PERIOD_S = 10.0
-SLIP_MPS = 0.15  # wheels against the world: slip, of a robot of 1 m/s or faster
+SLIP_MPS = 0.15  # wheel minus ground speed that is slip, for a robot that drives 1 m/s or faster
 
 
 class Rewards(Checked, frozen=True):
-    """Reward of each event of a step."""
+    """Reward of each event in a step: the `[task.rewards]` of a profile."""
 
     progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m per step
     step: float = -0.02
@@ -216,13 +216,13 @@ class Task(Checked, frozen=True):
     far_m: Annotated[float, Meta(gt=0)] = 2.2
     goal_radius_m: Annotated[float, Meta(gt=0)] = 0.4
     time_limit_steps: Annotated[int, Meta(ge=1)] = 240
-    # How many of those who move are observed, the nearest ones; left out, a task is as without it.
+    # Number of tracks observed, nearest first. Unset: none, and the task's hash is as without it.
     tracks: Annotated[int, Meta(ge=1, le=16)] | msgspec.UnsetType = msgspec.UNSET
     bump_terminates: bool = False  # a bump ends the episode (protective stop)
     rewards: Rewards = Rewards()
-    # Terms of its own beside them: name -> (weight, SQL); see `restock.ingest.task.task_sql`.
+    # The profile's own reward terms: name -> (weight, SQL); see `restock.ingest.task.task_sql`.
     reward_terms: dict[str, tuple[float, str]] | msgspec.UnsetType = msgspec.UNSET
-    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # entries of its own: name -> SQL
+    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # own entries: name -> SQL
 
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
@@ -251,7 +251,7 @@ class Task(Checked, frozen=True):
 
     @property
     def lidar(self) -> bool:
-        """Return whether the robot has a lidar: else clearance is unknown, and not observed."""
+        """Return whether the robot has a lidar; without one, clearance is not observed."""
         return self.sectors > 0
 
     @property
@@ -284,7 +284,7 @@ class Task(Checked, frozen=True):
 
     @property
     def scaled_actions(self) -> NDArray[np.float64]:
-        """Return the actions (A, 2) divided by the fastest on each axis, as in observations."""
+        """Return the actions (A, 2), each axis divided by its largest value, as in observations."""
         return np.asarray(self.actions, np.float64) / _fastest(self.actions)
 
     @property
@@ -294,7 +294,7 @@ class Task(Checked, frozen=True):
 
     @property
     def slip_limit_mps(self) -> float:
-        """Return the speed over the floor at which wheels count as slipping."""
+        """Return the difference of wheel and ground speed from which wheels count as slipping."""
         return SLIP_MPS * min(self._fastest_mps, 1.0)
 
     @property
@@ -303,7 +303,7 @@ class Task(Checked, frozen=True):
 
     @property
     def condition_limits(self) -> dict[str, float]:
-        """Return the constants of the robot's task that the SQL of conditions may name."""
+        """Return the task's constants that the SQL of conditions may name."""
         return {
             "tight_clearance_m": self.rewards.tight_clearance_m,
             "body_width_m": self.body.width_m,
@@ -314,12 +314,12 @@ class Task(Checked, frozen=True):
 
     @property
     def hash(self) -> str:
-        """Return 12 hex digits of the definition, its parameters and the version of this code."""
+        """Return a hash of the task's values and `TASK_CODE_VERSION`, 12 hex digits."""
         content = msgspec.json.encode([TASK_CODE_VERSION, self])
         return hashlib.blake2b(content, digest_size=6).hexdigest()
 
 
-STAND_IN_LIMITS = {  # `condition_limits` of the stand-in
+STAND_IN_LIMITS = {  # `condition_limits` of the twin's stand-in robot
     "tight_clearance_m": 0.15,
     "body_width_m": 0.5,
     "slip_limit_mps": SLIP_MPS,
@@ -327,7 +327,7 @@ STAND_IN_LIMITS = {  # `condition_limits` of the stand-in
     "control_period_s": 0.2,
 }
 
-# Entries of an observation that change their sign where left and right are exchanged.
+# Entries of an observation whose sign changes when left and right are exchanged.
 _ODD = ("near_sin", "far_sin", "gyro_yaw_rate", "slip_yaw_rate", "lateral_speed", "nav_yaw_rate")
 
 
@@ -335,15 +335,20 @@ _ODD = ("near_sin", "far_sin", "gyro_yaw_rate", "slip_yaw_rate", "lateral_speed"
 class Mirror:
     """Observations and actions of a task with left and right exchanged."""
 
-    source: Ints  # (D,) the entry that takes this one's place
-    sign: F32  # (D,)
-    opposite: Ints  # (A,) the action at the same speed, turning as fast the other way
+    source: Ints  # (D,) index of the entry that each mirrored entry is copied from
+    sign: F32  # (D,) factor of the copied entry: 1 or -1
+    opposite: Ints  # (A,) index of the action at the same speed and the opposite yaw rate
 
     @classmethod
     def of(cls, task: Task) -> Mirror:
-        """Build the mirror image; raise ValueError if an action has no equal turn the other way."""
+        """Build the mirror image of a task.
+
+        Raises:
+            ValueError: an action has no opposite turn, or the task has observation entries of its
+                own, whose mirror image is unknown.
+        """
         if task.observed:
-            raise ValueError("nothing says how its [task.observed] looks in a mirror")
+            raise ValueError("the mirror image of its [task.observed] is unknown")
         table = np.asarray(task.actions, np.float64)
         gap = np.abs(table[:, None] - table[None] * (1, -1)).max(axis=2)
         opposite = gap.argmin(axis=1)
@@ -363,20 +368,19 @@ class Mirror:
         return cls(source, sign, opposite)
 
     def observation(self, observation: F32) -> F32:
-        """Return what would be observed, (..., D), if everything were mirrored."""
+        """Return the mirror image of observations, (..., D)."""
         mirrored: F32 = observation[..., self.source] * self.sign
         return mirrored
 
     def action(self, action: Ints) -> Ints:
-        """Return the mirrored actions (N,); negative ones, which stand for none, stay."""
+        """Return the mirrored actions (N,); negative values mean "no action" and stay."""
         return np.where(action < 0, action, self.opposite[action])
 
 
 def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) -> F32:
-    """Compute the observation at t, (N, D) float32, by signals at t, t - 1 and the last action.
+    """Compute the observation at t, (N, D) float32, from signals at t, t - 1 and the last action.
 
-    Of the signals at t - 1 it takes `sector_clearance_m` alone. The task's own entries (N, E) are
-    `now[OBSERVED]`.
+    `before` needs only `sector_clearance_m`. The task's own entries (N, E) are `now[OBSERVED]`.
     """
     near = np.arctan2(now["waypoint_near_y_m"], now["waypoint_near_x_m"])
     far = np.arctan2(now["waypoint_far_y_m"], now["waypoint_far_x_m"])
@@ -409,9 +413,9 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
 def nearest_action(
     task: Task, speed_mps: NDArray[Any], yaw_rate_radps: NDArray[Any]
 ) -> tuple[Ints, NDArray[np.float64]]:
-    """Return the nearest discrete action (N,) of commands (N,), and their distance to it (N,).
+    """Return the discrete action nearest to each command, (N,), and its distance (N,).
 
-    Distance is measured in units of the fastest action on each axis. Ties go to the first action.
+    Each axis is scaled by the fastest action on it. Ties go to the first action.
     """
     command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / _fastest(task.actions)
     distance = np.linalg.norm(command[:, None, :] - task.scaled_actions[None], axis=-1)
@@ -428,7 +432,7 @@ def reached_goal(task: Task, after: Signals) -> Bools:
 
 
 def terminated(task: Task, after: Signals) -> Bools:
-    """Return whether the episode terminates at t + 1, (N,): no value is bootstrapped there."""
+    """Return whether the episode terminates at t + 1, (N,): do not bootstrap there."""
     terminates = reached_goal(task, after)
     if task.bump_terminates:
         terminates = terminates | after["bumped"].astype(np.bool_)
@@ -460,9 +464,9 @@ def reward_parts(
     action: Ints,
     previous_action: Ints,
 ) -> dict[str, NDArray[Any]]:
-    """Compute the reward of each event of [t, t + 1), (N,) each, by the names of `Rewards`.
+    """Compute the reward of each event in [t, t + 1), (N,) each, by the names of `Rewards`.
 
-    Where clearance is not known (NaN, of a robot without lidar) nothing is `tight`: 0.
+    `tight` is 0 if clearance is unknown (NaN): the robot has no lidar.
     """
     weight = task.rewards
     harsh = np.abs(after["wheel_speed_mps"] - now["wheel_speed_mps"]) / task.control_period_s
@@ -497,14 +501,15 @@ def clearance_ahead(
 
 
 def _entries(*values: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """Yield each of the values (N,) as one entry of an observation, (N, 1)."""
+    """Yield each array (N,) as an entry of an observation, (N, 1)."""
     return (value[..., None] for value in values)
 
 
 def _proposed(task: Task, now: Signals) -> tuple[NDArray[Any], ...]:
-    """Return what the navigation stack proposes: whether it is known, speed, yaw rate, each (N,).
+    """Return the navigation stack's command: whether it is known, speed and yaw rate, each (N,).
 
-    In units of the fastest action on each axis, up to twice that; all 0 where it is not known.
+    Speed and yaw rate are divided by the fastest action on their axis and clipped to +-2; all are
+    0 if the command is unknown.
     """
     speed, yaw_rate = now["nav_speed_mps"], now["nav_yaw_rate_radps"]
     known = np.isfinite(speed) & np.isfinite(yaw_rate)
@@ -516,9 +521,9 @@ def _proposed(task: Task, now: Signals) -> tuple[NDArray[Any], ...]:
 
 
 def _tracked(task: Task, now: Signals) -> NDArray[np.float64]:
-    """Return the tracks' entries (N, 6 K); all 0 where there is none.
+    """Return the observation entries of K tracks (N, 6 K); all 0 for a missing track.
 
-    Places are in units of the lidar's range, up to twice that.
+    Positions are divided by `range_max_m` and clipped to +-2.
     """
     x, y, *rest = (now[name] for name in TRACK_SIGNALS)
     known = np.isfinite(x)
@@ -529,10 +534,10 @@ def _tracked(task: Task, now: Signals) -> NDArray[np.float64]:
 
 
 def proposal_reader(task: Task) -> tuple[F64, F64, F64]:
-    """Return how to read the proposed action from an observation (D,): W (A, D), b (A,), k (D,).
+    """Return W (A, D), b (A,) and k (D,), which read the proposed action from an observation (D,).
 
-    The proposed action, that of `nearest_action`, has the largest value of W @ observation + b;
-    k @ observation is 1 if navigation proposes something, else 0.
+    The action nearest to navigation's command has the largest value of W @ observation + b.
+    k @ observation is 1 if navigation proposes a command, else 0.
     """
     scaled, names = task.scaled_actions, task.observation_names
     near = np.zeros((len(scaled), len(names)))
@@ -556,7 +561,7 @@ def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
 
 
 def nearness_of(task: Task, observation: NDArray[Any]) -> F64:
-    """Return the clearance entries (N, K) of observations (N, D), in [0, 1], by rising bearing."""
+    """Return the clearance entries (N, K) of observations (N, D): in [0, 1], ordered by bearing."""
     names = enumerate(task.observation_names)
     first = next((place for place, name in names if name.startswith("clearance_")), 0)
     nearness: F64 = observation[:, first : first + task.sectors].astype(np.float64)
@@ -564,12 +569,12 @@ def nearness_of(task: Task, observation: NDArray[Any]) -> F64:
 
 
 def clearances_of(task: Task, observation: NDArray[Any]) -> F64:
-    """Return the clearance of each sector (N, K), in metres, by observations (N, D)."""
+    """Return the clearance of each sector (N, K), in metres, from observations (N, D)."""
     return nearness_of(task, observation) ** 2 * task.range_max_m
 
 
 def _action_name(speed_mps: float, yaw_rate_radps: float) -> str:
-    """Name an action as the view `actions` of a store does, in replay/store/views.sql."""
+    """Name an action as the view `actions` of a store does; see replay/store/views.sql."""
     if speed_mps == 0 and yaw_rate_radps == 0:
         return "stop"
     turn = f"{'left' if yaw_rate_radps > 0 else 'right'} {_three_places(yaw_rate_radps)}"

@@ -1,12 +1,13 @@
--- Something stands on the plan just ahead, and stays where it is: what has been driven of the plan and
--- what is free of it add up to the same place along it, now and 1.6 s before; nobody came nearer within
--- 8 s; and a return lies within a fifth of the robot's width of the plan's middle, which the corner of
--- a rack that the plan passes does not. Where the robot has turned away from the plan it sees less of
--- what stands on it. In the first 1.6 s of an episode nothing says that it stays. It takes clear
--- evidence within 1 s, and holds on through gaps.
--- Unknown where the plan is the path that was driven, as goals in hindsight have it.
+-- An obstacle stands on the plan just ahead and does not move. The evidence: the driven plus the free
+-- part of the plan end at the same place now and 1.6 s ago; nobody came nearer within 8 s; and a return
+-- lies within a fifth of the robot's width of the plan's middle, unlike the corner of a rack that the
+-- plan passes. A robot that has turned away from the plan sees less of the obstacle. In the first 1.6 s
+-- of an episode there is no evidence that it does not move. A label needs clear evidence within the
+-- last 1 s, and weak evidence at the step itself, so it bridges gaps.
+-- Unknown if the plan is the path that was driven, as with goals in hindsight.
 -- Weights: a logistic regression; `python benchmarks/labels.py --cache FOLDER --fit blocked_aisle`.
--- That of someone_m was raised by hand, on two logs, when edges and lost beams ceased to count in it.
+-- The weight of someone_m was raised by hand, on two logs, after it stopped counting edges and lost
+-- beams.
 -- timing: pre
 -- priority: 40
 -- uncertain: 0.2 to 0.8

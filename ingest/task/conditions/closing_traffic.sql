@@ -1,6 +1,6 @@
--- Someone comes nearer within 2 m, whatever comes of it: what the lidar saw come nearer over the last
--- .8 s, the robot's own motion taken off, adds up to .1 m beyond the noise of two ranges every .2 s. It
--- holds on for a second, as people do not vanish.
+-- Someone within 2 m comes nearer, whatever the outcome: over the last .8 s, the approach that the lidar
+-- saw, without the robot's own motion, adds up to more than .1 m beyond the noise of two ranges per
+-- .2 s. The label lasts another second, as people do not vanish.
 -- kind: exposure
 -- timing: pre
 -- let came_lately_m:

@@ -1,8 +1,8 @@
--- Something is about to be nearer than `tight_clearance_m` of the robot's rewards (.15 m for a robot
--- that is half a metre wide), or the bumper to be pressed. The smallest of many noisy lidar beams
--- reads short by about half its noise, and one reading is too noisy to tell: so it is weighed with
--- those a step before and after it. A step near the limit holds where one within two steps is clear.
--- Weights: a logistic regression over development logs; `benchmarks/labels.py` measures what they give.
+-- At the next step something is nearer than `tight_clearance_m` of the robot's rewards (.15 m for a
+-- robot that is half a metre wide), or the bumper is pressed. The smallest of many noisy lidar beams
+-- reads short by about half its noise, and one reading is too noisy to decide, so the readings a step
+-- before and after it count too. A step near the limit is labelled if a step within two of it is clear.
+-- Weights: a logistic regression over development logs; `benchmarks/labels.py` measures the labels.
 -- timing: post
 -- priority: 20
 -- uncertain: 0.2 to 0.8

@@ -1,7 +1,6 @@
--- Something lies or stands on the plan within view (2.2 m), whether the robot is stopped by it or finds
--- its way: a lidar return within half the robot's width of the look-ahead points in each step of
--- the last .8 s, and nobody came nearer within 5 s. Who stands still on the plan cannot be told from a
--- pallet.
+-- Something lies or stands on the plan within view (2.2 m), whether it stops the robot or the robot
+-- finds a way round: at each step of the last .8 s a lidar return was within half the robot's width of
+-- the plan, and nobody came nearer within 5 s. A person who stands still on the plan looks like a pallet.
 -- kind: exposure
 -- timing: pre
 -- let came_lately_m:

@@ -1,6 +1,6 @@
--- From a near collision (less than `tight_clearance_m` of room, or a bump) until there is twice that
--- room again, at most 2 s. Whether there was one is told as in near_collision, from this step and
--- those before it only.
+-- From a near collision (clearance below `tight_clearance_m`, or a bump) until the clearance is twice
+-- that limit again, for at most 2 s. Near collisions are detected as in near_collision, but only from
+-- this step and earlier ones.
 -- timing: pre
 -- priority: 10
 -- uncertain: 0.2 to 0.8

@@ -1,7 +1,7 @@
--- A slippery patch is underfoot: up to now, without a look ahead, the wheels turned more than the poses
--- and the gyroscope moved, over the time in which the robot drives .2 m. It holds on for a second. Of a
--- patch that is crossed without slip there is no sign: this sees less than what lies on the floor, and
--- sooner than the outcome `wheel_slip`.
+-- The floor under the robot is slippery: in the time in which the robot drives .2 m, up to this step,
+-- the wheels turned more than the poses and the gyroscope moved. The label lasts about a second longer. A
+-- patch that the robot crosses without slip leaves no evidence, so some patches are missed. Unlike the
+-- outcome `wheel_slip`, the label needs no later step.
 -- kind: exposure
 -- timing: pre
 -- let pose_noise_mps:

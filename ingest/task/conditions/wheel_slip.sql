@@ -1,10 +1,10 @@
--- The wheels and the world disagree by more than the robot's `slip_limit_mps` (.15 m/s, of its
--- fastest action where that is below 1 m/s) and what the localiser's noise adds to it, and by more
--- than that noise makes alone: how far the wheels turned against how far the poses lie apart, in the
--- time in which it drives .2 m, and in that after it; the turn by the wheels against the gyroscope; and
--- the way sideways. A step near the limit holds where one within two steps is clear. Known only after
--- the fact, so it is `post`.
--- Weights: a logistic regression over development logs; `benchmarks/labels.py` measures what they give.
+-- Wheel and ground motion differ by more than the robot's `slip_limit_mps` (.15 m/s, or less in
+-- proportion if its fastest action is below 1 m/s) plus what the localiser's noise adds, and by more
+-- than that noise causes alone. Three differences count: the wheels' distance against that of the poses,
+-- in the time in which the robot drives .2 m and in the same time after it; the turn by the wheels
+-- against the gyroscope; and the sideways motion. A step near the limit is labelled if a step within
+-- two of it is clear. The label looks at later steps, so its timing is `post`.
+-- Weights: a logistic regression over development logs; `benchmarks/labels.py` measures the labels.
 -- timing: post
 -- priority: 30
 -- uncertain: 0.2 to 0.8
